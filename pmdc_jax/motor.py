@@ -1,0 +1,147 @@
+"""The brushed permanent-magnet DC motor: equations (1) to (9) of the wheelchair-motor paper, once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .effects.base import AbstractEffect, Grip, Scalars, State
+
+PARAMETERS = {"R": "ohm", "L": "H", "Kb": "V s/rad", "Kt": "N m/A", "J": "kg m^2", "f": "N m s/rad"}
+
+
+class Drive(NamedTuple):
+    """What drives the motor over one sample: exactly one of the three shares is 1, the others 0.
+
+    A run with recorded voltage drives the whole motor; one with only current or torque drives the
+    mechanical half, and the electrical equation stands still.
+    """
+
+    voltage: Scalars | float = 1.0
+    current: Scalars | float = 0.0
+    torque: Scalars | float = 0.0
+
+
+class Motor(eqx.Module):
+    """Brushed permanent-magnet DC motor.
+
+    L di/dt = v - R i - Kb w                     (1), (3), (5)
+    J dw/dt = Kt i - f w - T_load                (2), (4), (6)
+
+    and what the effects add to either. All fields are scalars, or arrays of one shape for a population.
+
+    **Fields**: `R` armature resistance, ohm; `L` armature inductance, H; `Kb` back-EMF constant, V s/rad;
+    `Kt` torque constant, N m/A; `J` inertia of rotor and what turns with it, kg m^2; `f` viscous friction,
+    N m s/rad; all > 0 (f >= 0). `effects`, a tuple of `pmdc_jax.effects.AbstractEffect`.
+
+    **Source**: "Parameter estimation and speed control of a PMDC motor used in wheelchair", PECCON 2017. Its
+    equation (8) prints +R/L and multiplies the load column by u; here it follows from (5) and (6).
+    """
+
+    R: Scalars
+    L: Scalars
+    Kb: Scalars
+    Kt: Scalars
+    J: Scalars
+    f: Scalars
+    effects: tuple[AbstractEffect, ...] = ()
+
+    def state_space(
+        self, drive: Drive | None = None
+    ) -> tuple[Float[Array, "2 2 *batch"], Float[Array, "2 2 *batch"]]:
+        """Matrices A, B of dx/dt = A x + B u for the linear motor, equations (7) and (8).
+
+        x = (current, speed), u = (drive, load torque). `drive` says whether voltage (the default), current
+        or torque is given; for the latter two the current is not a state and its row is zero.
+        """
+        v, c, t = drive or Drive()
+        zero = jnp.zeros_like(self.R)
+        A = [[-v * self.R / self.L, -v * self.Kb / self.L], [v * self.Kt / self.J, -self.f / self.J]]
+        B = [[v / self.L, zero], [(c * self.Kt + t) / self.J, -1 / self.J]]
+        return _matrix(A), _matrix(B)
+
+    def transfer_function(self) -> tuple[dict[str, Float[Array, "order *batch"]], Float[Array, "3 *batch"]]:
+        """Numerators by "input -> output" and the common denominator, highest power of s first, equation (9).
+
+        voltage -> speed is Kt / (L J s^2 + (R J + L f) s + R f + Kt Kb).
+        """
+        R, L, Kb, Kt, J, f = self.R, self.L, self.Kb, self.Kt, self.J, self.f
+        numerators = {
+            "voltage -> speed": jnp.stack([Kt]),
+            "voltage -> current": jnp.stack([J, f]),
+            "load -> speed": jnp.stack([-L, -R]),
+            "load -> current": jnp.stack([Kb]),
+        }
+        return numerators, jnp.stack([L * J, R * J + L * f, R * f + Kt * Kb])
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states that the effects add."""
+        return tuple(sorted({name for effect in self.effects for name in effect.states}))
+
+    def rest(self, current: Scalars, speed: Scalars) -> State:
+        """State with this current and speed and all of the effects' states at zero."""
+        zero = jnp.zeros(jnp.broadcast_shapes(jnp.shape(current), jnp.shape(self.R)))
+        return State(zero + current, zero + speed, {name: zero for name in self.states})
+
+    def derivative(
+        self,
+        state: State,
+        value: Scalars,
+        load: Scalars,
+        drive: Drive | None = None,
+        moving: tuple[Scalars, Scalars] | None = None,
+    ) -> State:
+        """Time derivative of the state.
+
+        **Arguments**: `value`, what drives the motor, in V, A or N m according to `drive`; `load`, N m, opposes
+        positive motion; `moving`, the directions (-1, 0, 1) of current and speed for which the dry elements
+        act, by default those of the state itself.
+        """
+        v, c, t = drive or Drive()
+        state = state._replace(current=v * state.current + c * value)
+        direction_i, direction_w = moving or (jnp.sign(state.current), jnp.sign(state.speed))
+        motor, voltage = self, value
+        drop = _opposing(self.grip("current", state), direction_i)
+        torque = _opposing(self.grip("speed", state), direction_w)
+        extra = {}
+        for effect in self.effects:
+            motor = effect.parameters(motor, state)
+            voltage = effect.terminal_voltage(voltage)
+            drop = drop + effect.voltage_drop(state)
+            torque = torque + effect.torque(state)
+        for effect in self.effects:
+            extra |= effect.derivative(motor, state)
+        # by the reciprocals: they leave the loop over the samples, and a division would break its fusion
+        armature = voltage - motor.R * state.current - motor.Kb * state.speed - drop
+        current_rate = v * armature * (1 / motor.L)
+        driving = motor.Kt * state.current + t * value
+        speed_rate = (driving - motor.f * state.speed - load - torque) * (1 / motor.J)
+        return State(current_rate, speed_rate, extra)
+
+    def grip(self, holds: str, state: State) -> Grip | None:
+        """What all dry elements on "current" (V) or "speed" (N m) can hold together; None without any."""
+        grips = [effect.grip(state) for effect in self.effects if effect.holds == holds]
+        if not grips:
+            return None
+        return Grip(sum(g.backward for g in grips), sum(g.forward for g in grips))
+
+    def sensors(self, current: Scalars, speed: Scalars) -> tuple[Scalars, Scalars]:
+        """Current in A and speed in rad/s as the sensors report them."""
+        for effect in self.effects:
+            current, speed = effect.sensors(current, speed)
+        return current, speed
+
+
+def _opposing(grip: Grip | None, direction: Scalars) -> Scalars | float:
+    if grip is None:
+        return 0.0
+    return jnp.where(direction > 0, grip.forward, jnp.where(direction < 0, -grip.backward, 0.0))
+
+
+def _matrix(rows: list[list[Scalars]]) -> Float[Array, "2 2 *batch"]:
+    entries = jnp.broadcast_arrays(*(entry for row in rows for entry in row))
+    return jnp.stack(entries).reshape(2, 2, *entries[0].shape)

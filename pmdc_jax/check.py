@@ -1,0 +1,243 @@
+"""What is wrong with the data, said before anything is fitted. In doubt it is silent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from .plausibility import alignment, angle_against_speed, plain_units, sampling, signs
+from .recording import Finding, Recording
+
+GAP = 3.0  # median steps
+JITTER = 0.02  # of a step, root mean square
+FLAT_TOP = 1e-9  # probability that a run of equal extreme values is chance
+
+
+def check(recordings: Sequence[Recording]) -> tuple[Finding, ...]:
+    """Look through recordings for what would spoil an identification.
+
+    **Arguments**: `recordings`, all runs of one motor.
+
+    **Returns**: findings, run by run, what was assumed on reading first. Only what makes a fit
+    meaningless is an "error".
+    """
+    findings: list[Finding] = []
+    for recording in recordings:
+        findings += recording.notes
+        for look in LOOKS:
+            findings += look(recording)
+    findings += plain_units(recordings)
+    findings += excitation(recordings)
+    return tuple(findings)
+
+
+def gaps(run: Recording) -> Iterator[Finding]:
+    """Steps of time much longer than the others."""
+    steps = np.diff(run.time)
+    rows = np.flatnonzero(steps > GAP * np.median(steps))
+    if len(rows):
+        longest = rows[np.argmax(steps[rows])]
+        yield Finding(
+            run.name,
+            "time",
+            "warning",
+            f"{_count(len(rows), 'gap')} in time, the longest {steps[longest]:.4g} s "
+            f"where the step is {np.median(steps):.4g} s",
+            place(run, int(longest)),
+            "Split the run at the gaps: the voltage in between is not known",
+        )
+
+
+def jitter(run: Recording) -> Iterator[Finding]:
+    """Time stamps that scatter about a uniform grid."""
+    steps = np.diff(run.time)
+    steps = steps[steps <= GAP * np.median(steps)]
+    # scatter from step to step, not of the stamps, so that a slowly drifting clock is no jitter
+    scatter = steps / np.mean(steps) - 1
+    deviation = float(np.sqrt(np.mean(scatter**2) / 2))
+    if deviation > JITTER:
+        yield Finding(
+            run.name,
+            "time",
+            "warning",
+            f"time stamps jitter by {deviation:.1%} of a step of {np.mean(steps):.4g} s",
+            f"worst near {place(run, int(np.argmax(np.abs(np.diff(run.time) - np.mean(steps)))))}",
+            "Export more digits, or the time of the sampling clock instead of the logging computer",
+        )
+
+
+def missing(run: Recording) -> Iterator[Finding]:
+    """Samples without a value."""
+    for quantity, values in run.columns().items():
+        absent = np.isnan(values)
+        if absent.any():
+            yield Finding(
+                run.name,
+                quantity,
+                "warning" if absent.mean() > 0.05 else "note",
+                f"{absent.sum()} of {len(values)} values are missing",
+                f"first at {place(run, int(np.argmax(absent)))}",
+                "They are left out of the fit",
+            )
+
+
+def clipped(run: Recording) -> Iterator[Finding]:
+    """A flat top: the extreme value many times in a row in a channel that is otherwise noisy.
+
+    The voltage is left out: a controller may truly hold it at the limit of its supply.
+    """
+    for quantity in ("current", "speed"):
+        values = getattr(run, quantity)
+        if values is None or not _is_noisy(values):
+            continue
+        for extreme in (np.nanmax(values), np.nanmin(values)):
+            start, length, expected = _flat_top(values, extreme)
+            if length > expected:
+                yield Finding(
+                    run.name,
+                    quantity,
+                    "warning",
+                    f"it looks clipped at {extreme:.6g}: {length} equal values in a row",
+                    f"from {place(run, start)}",
+                    "Record with a larger range, or cut these samples out (leave the cells empty)",
+                )
+
+
+def wrapped_angle(run: Recording) -> Iterator[Finding]:
+    """An angle that starts again after each turn."""
+    if run.angle is None:
+        return
+    jumps = np.diff(run.angle)
+    # of the encoders in use, one counts 0 ... 2 pi and the other -pi ... pi
+    wraps = np.flatnonzero(np.abs(np.abs(jumps) - 2 * np.pi) < 0.5)
+    ordinary = np.nanpercentile(np.abs(jumps), 90)
+    if len(wraps) >= 2 and ordinary < 1.0 and np.nanmax(run.angle) - np.nanmin(run.angle) < 6.3:
+        yield Finding(
+            run.name,
+            "angle",
+            "warning",
+            f"it starts again after each turn, {len(wraps)} times",
+            f"first at {place(run, int(wraps[0]) + 1)}",
+            "Unwrap it, for example by numpy.unwrap",
+        )
+
+
+def constant_load(run: Recording) -> Iterator[Finding]:
+    """A load column with one value that is not zero."""
+    if run.load is not None and run.load[0] != 0 and (run.load == run.load[0]).all():
+        yield Finding(
+            run.name,
+            "load",
+            "note",
+            f"the load column is constant: it is taken as known, {run.load[0]:.6g} N m",
+            "whole run",
+            "If it was not measured, leave out the column",
+        )
+
+
+def excitation(runs: Sequence[Recording]) -> Iterator[Finding]:
+    """Runs, or all runs together, in which nothing moves."""
+    still = [run for run in runs if not any(_moves(y) for y in _outputs(run).values())]
+    for run in runs:
+        speed = _outputs(run).get("speed")
+        if run in still:
+            yield Finding(
+                run.name,
+                None,
+                "error" if len(still) == len(runs) else "note",
+                f"nothing moves beyond its noise: {', '.join(_outputs(run))}",
+                "whole run",
+                "Record steps of the voltage, and the motor as it starts and stops",
+            )
+        elif speed is not None and not _moves(speed):
+            yield Finding(
+                run.name,
+                "speed",
+                "note" if any(_moves(_outputs(r).get("speed")) for r in runs) else "warning",
+                "the speed does not change: Kb, Kt, J and f cannot be seen",
+                "whole run",
+                "Record a run in which the motor starts and stops",
+            )
+        elif speed is not None and np.nanstd(speed) < np.sqrt(2) * _noise(speed):
+            yield Finding(
+                run.name,
+                "speed",
+                "warning",
+                f"it swings less than its noise of {_noise(speed):.3g}",
+                "whole run",
+                "Use larger steps of voltage, or a better speed sensor",
+            )
+
+
+LOOKS = (
+    gaps,
+    jitter,
+    missing,
+    clipped,
+    wrapped_angle,
+    constant_load,
+    signs,
+    angle_against_speed,
+    alignment,
+    sampling,
+)
+
+
+def place(run: Recording, row: int) -> str:
+    """Where a sample is, for people."""
+    return f"sample {row + 1} ({run.time[row]:.6g} s)"
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}" + "s" * (number > 1)
+
+
+def _outputs(run: Recording) -> dict[str, np.ndarray]:
+    speed = run.speed
+    if speed is None and run.angle is not None:
+        speed = np.gradient(run.angle, run.time)
+    # without a voltage the current is what drives
+    found = {"current": run.current if run.voltage is not None else None, "speed": speed}
+    return {quantity: values for quantity, values in found.items() if values is not None}
+
+
+def _noise(values: np.ndarray) -> float:
+    """Standard deviation of white noise, from third differences, which motion hardly reaches."""
+    third = np.diff(values, 3)
+    third = third[np.isfinite(third)]
+    return float(np.median(np.abs(third)) / (0.6745 * np.sqrt(20))) if len(third) else 0.0
+
+
+def _moves(values: np.ndarray | None) -> bool:
+    """Whether means over parts of the run differ by more than noise makes them."""
+    if values is None:
+        return False
+    values = values[np.isfinite(values)]
+    size = max(len(values) // 50, 1)
+    means = values[: len(values) // size * size].reshape(-1, size).mean(1)
+    rounding = 1e-9 * float(np.max(np.abs(values), initial=0.0))
+    return bool(np.std(means) > 2 * _noise(values) / np.sqrt(size) + rounding)
+
+
+def _is_noisy(values: np.ndarray) -> bool:
+    """Whether the channel scatters: neither a clean simulation nor one rounded to a few digits."""
+    values = values[np.isfinite(values)]
+    inner = values[(values > values.min()) & (values < values.max())]
+    if len(inner) < 100 or _noise(inner) < 1e-5 * np.ptp(values):
+        return False
+    third = np.diff(inner, 3)
+    return bool(np.mean(third[1:] * third[:-1] < 0) > 0.5)  # 0.77 for white noise, 0 for motion
+
+
+def _flat_top(values: np.ndarray, extreme: float) -> tuple[int, int, float]:
+    """Start and length of the longest run of the extreme value, and the length chance may make."""
+    if extreme == 0:  # a motor at rest, or a sensor that knows one direction
+        return 0, 0, np.inf
+    padded = np.concatenate(([False], values == extreme, [False])).astype(np.int8)
+    starts, ends = (np.flatnonzero(np.diff(padded) == sign) for sign in (1, -1))
+    longest = int(np.argmax(ends - starts))
+    inner = values[(values != extreme) & np.isfinite(values)]
+    repeats = (np.count_nonzero(np.diff(inner) == 0) + 1) / len(inner)
+    expected = 1 + np.log(FLAT_TOP / len(values)) / np.log(min(repeats, 0.999))
+    return int(starts[longest]), int(ends[longest] - starts[longest]), max(float(expected), 5.0)

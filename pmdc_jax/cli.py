@@ -1,0 +1,258 @@
+"""The command line: parse, call one function, print, exit status.
+
+Everything heavy is imported inside the commands, so that help and usage errors come at once.
+"""
+
+# ruff: noqa: B006  typer copies the lists that stand as defaults
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from io import TextIOWrapper
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .errors import InputError
+
+if TYPE_CHECKING:
+    from .identify.identification import Identification
+
+DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
+
+app = typer.Typer(
+    name="pmdc",
+    help="Identify brushed permanent-magnet DC motors from recorded data.",
+    epilog="Start with: pmdc demo",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # plain help is shorter and comes in half the time
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+
+# the options, in the order they are first used
+Runs = Annotated[
+    list[Path],
+    typer.Argument(metavar="RUN", help="Recordings to fit, one run a file: CSV, Parquet or MAT."),
+]
+Holdout = Annotated[
+    list[Path],
+    typer.Option(metavar="RUN", help="A run kept out of the fit to test it. Repeatable."),
+]
+Save = Annotated[
+    Path | None, typer.Option(metavar="MOTOR.json", help="Write the motor, for pmdc simulate.")
+]
+Json = Annotated[
+    str | None,
+    typer.Option(metavar="OUT", help="Write the result as JSON; - is standard output."),
+]
+Report = Annotated[
+    Path | None, typer.Option(metavar="OUT.html", help="Write a report with pictures.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the search.")]
+Column = Annotated[
+    list[str],
+    typer.Option(
+        metavar="QUANTITY=HEADER:UNIT",
+        help="What a column holds, where its header does not say. Repeatable.",
+    ),
+]
+Tie = Annotated[
+    list[str],
+    typer.Option(metavar="A=B", help="Two parameters that are one, such as Kt=Kb. Repeatable."),
+]
+Known = Annotated[
+    list[str],
+    typer.Option(metavar="NAME=VALUE", help="A parameter known from elsewhere, in SI. Repeatable."),
+]
+Unloaded = Annotated[
+    bool, typer.Option("--unloaded", help="Runs without a load column have no load at all.")
+]
+Effects = Annotated[
+    list[str],
+    typer.Option(
+        metavar="NAME", help="An effect to identify too, such as coulomb_friction. Repeatable."
+    ),
+]
+Search = Annotated[str, typer.Option(metavar="NAME", help="The global search.")]
+MotorFile = Annotated[
+    Path, typer.Argument(metavar="MOTOR.json", help="Written by pmdc identify --save.")
+]
+Input = Annotated[
+    Path, typer.Option("--input", metavar="RUN", help="Recording that drives the motor.")
+]
+Output = Annotated[
+    Path, typer.Option("--out", metavar="RUN_OUT", help="Where it goes: .csv, .parquet or .mat.")
+]
+Folder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")]
+
+
+@app.callback()
+def _commands() -> None:
+    """Keeps `pmdc COMMAND` even while there is a single command."""
+
+
+@app.command(
+    epilog="Example: pmdc identify step.csv chirp.csv --holdout drive.csv --report motor.html"
+)
+def identify(
+    runs: Runs,
+    holdout: Holdout = [],
+    save: Save = None,
+    json: Json = None,
+    report: Report = None,
+    seed: Seed = 0,
+    column: Column = [],
+    tie: Tie = [],
+    known: Known = [],
+    unloaded: Unloaded = False,
+    effect: Effects = [],
+    search: Search = "differential_evolution",
+) -> None:
+    """Find the parameters of a motor from recordings.
+
+    R, L, Kb, Kt, J and f are found from voltage, current and speed, each with its standard error
+    and whether the recordings determine it at all. A run without current or voltage is used for
+    what it can say.
+    """
+    from .report.files import check_outputs
+
+    check_outputs({"--save": save, "--json": json, "--report": report}, [*runs, *holdout])
+    columns = dict(_pairs("--column", column))
+    options = {
+        "tie": tuple(_pairs("--tie", tie)),
+        "known": {name: _number("--known", name, text) for name, text in _pairs("--known", known)},
+        "unloaded": unloaded,
+        "effects": tuple(effect),
+        "search": search,
+        "seed": seed,
+    }
+    from .identify import identify
+    from .recording import read_recording
+    from .report.terminal import progress
+
+    with progress() as on_progress:
+        recordings = [read_recording(run, columns) for run in runs]
+        held_out = [read_recording(run, columns) for run in holdout]
+        identification = identify(recordings, holdout=held_out, progress=on_progress, **options)
+    _deliver(identification, save, json, report)
+
+
+@app.command(epilog="Example: pmdc simulate motor.json --input drive.csv --out simulated.csv")
+def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -> None:
+    """Simulate a motor under a recorded voltage.
+
+    Voltage and load come from the recording; current and speed are written to another.
+    """
+    from .report.files import check_outputs
+
+    check_outputs({"--out": out}, [motor, input])
+    columns = dict(_pairs("--column", column))
+    from .motor import load_motor
+    from .recording import read_recording, write_recording
+    from .simulate import simulate
+
+    write_recording(simulate(load_motor(motor), read_recording(input, columns)), out)
+
+
+@app.command(epilog="Example: pmdc demo --out tour")
+def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
+    """Take the tour: identify the packaged sample.
+
+    Four runs are fitted, a fifth tests the motor; results and a report go to a folder.
+    """
+    from .demo import demo
+    from .report.terminal import print_findings, print_identification, progress
+
+    with progress() as on_progress:
+        identification = demo(out, seed=seed, progress=on_progress)
+    print_findings(identification)
+    print_identification(identification)
+    for name in ("report.html", "identification.json", "motor.json"):
+        typer.echo(out / name)
+
+
+def _deliver(
+    identification: Identification, save: Path | None, json: str | None, report: Path | None
+) -> None:
+    """Write what was asked for, and print the tables unless standard output is taken."""
+    from .report.terminal import print_findings, print_identification
+
+    print_findings(identification)
+    if save:
+        from .motor import save_motor
+
+        save_motor(save, identification.motor, identification)
+    if report:
+        from .report.identification import write_report
+
+        write_report(identification, report)
+    if json:
+        from .report.json import identification_json, write_json
+
+        write_json(identification_json(identification), json)
+    if json != "-":
+        print_identification(identification)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit status: 0 done, 2 bad input or arguments, 130 interrupted."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # an Ω must not fail on an old code page
+    try:
+        status = app(args=arguments, prog_name="pmdc", standalone_mode=False) or DONE
+    except typer.TyperException as error:
+        return _refuse(_usage(error))
+    except InputError as error:
+        return _refuse(str(error))
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        return _refuse(f"{place}{error.strerror or error}")
+    except typer.Abort:
+        status = INTERRUPTED
+    if status == INTERRUPTED:
+        print("pmdc: interrupted", file=sys.stderr)
+    return status
+
+
+def _refuse(message: str) -> int:
+    print(f"pmdc: {message}", file=sys.stderr)
+    return BAD_INPUT
+
+
+def _usage(error: typer.TyperException) -> str:
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context else "pmdc"
+    return f"{error.format_message().rstrip('.')}. See {command} --help"
+
+
+def _pairs(option: str, texts: list[str]) -> list[tuple[str, str]]:
+    return [_pair(option, text) for text in texts]
+
+
+def _pair(option: str, text: str) -> tuple[str, str]:
+    """ "Kt=Kb" as ("Kt", "Kb")."""
+    left, equals, right = (part.strip() for part in text.partition("="))
+    if not (left and equals and right):
+        examples = {"--column": "speed=rpm_meas:rpm", "--tie": "Kt=Kb", "--known": "R=0.157"}
+        raise InputError(
+            f"{option} {text}",
+            "this is not a pair",
+            f"Write for example {option} {examples[option]}",
+        )
+    return left, right
+
+
+def _number(option: str, name: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not isfinite(value):
+        mend = f"Write the value in SI units, for example {option} {name}=0.157"
+        raise InputError(f"{option} {name}={text}", f"'{text}' is not a number", mend)
+    return value

@@ -1,0 +1,270 @@
+"""What a column header means: the quantity, and how its unit becomes SI."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+
+from attrs import frozen
+
+from .errors import InputError
+from .units import UnitError, conversion
+
+
+@frozen
+class Quantity:
+    """One canonical column.
+
+    `header` is how it is written to files; `units` are what it is converted to, on a rotating
+    shaft first, on a linear axis second; `names` speak for themselves, `symbols` only together
+    with a unit.
+    """
+
+    header: str
+    units: tuple[str, ...]
+    names: tuple[str, ...]
+    symbols: tuple[str, ...] = ()
+
+
+QUANTITIES = {
+    "time": Quantity("time_s", ("s",), ("time", "t", "zeit", "elapsed_time"), ("t", "timestamp")),
+    "voltage": Quantity(
+        "voltage_V",
+        ("V",),
+        (
+            "voltage",
+            "motor_voltage",
+            "armature_voltage",
+            "terminal_voltage",
+            "spannung",
+            "motorspannung",
+            "ankerspannung",
+            "klemmenspannung",
+        ),
+        ("u", "v", "ua", "u_a", "va", "v_a"),
+    ),
+    "current": Quantity(
+        "current_A",
+        ("A",),
+        ("current", "motor_current", "armature_current", "strom", "motorstrom", "ankerstrom"),
+        ("i", "ia", "i_a"),
+    ),
+    "speed": Quantity(
+        "speed_rad_s",
+        ("rad/s", "m/s"),
+        (
+            "speed",
+            "motor_speed",
+            "shaft_speed",
+            "rotor_speed",
+            "angular_speed",
+            "velocity",
+            "angular_velocity",
+            "omega",
+            "winkelgeschwindigkeit",
+        ),
+        # a bare "Drehzahl" or "n" is nearly always in 1/min, so these need their unit
+        ("w", "n", "v", "drehzahl", "motordrehzahl", "rotational_speed"),
+    ),
+    "load": Quantity(
+        "load_torque_Nm",
+        ("N m", "N"),
+        ("load_torque", "load", "load_force", "lastmoment", "lastdrehmoment"),
+    ),
+    "angle": Quantity(
+        "angle_rad",
+        ("rad", "m"),
+        ("angle", "shaft_angle", "motor_angle", "rotor_angle", "theta", "winkel", "drehwinkel"),
+        ("phi", "pos", "position"),
+    ),
+    "temperature": Quantity(
+        "temperature_C",
+        ("degC",),
+        ("temperature", "temp", "temperatur", "motor_temperature", "winding_temperature"),
+        ("t",),
+    ),
+    "torque": Quantity(
+        "torque_Nm",
+        ("N m", "N"),
+        ("torque", "motor_torque", "motor_force", "motormoment", "antriebsmoment"),
+        ("force",),
+    ),
+}
+
+
+@frozen
+class Column:
+    """A header understood: SI value = scale * number + offset.
+
+    `unit` is None where the header names none and SI was assumed; `base` is the SI unit.
+    """
+
+    header: str
+    quantity: str
+    unit: str | None
+    base: str
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+def match_columns(
+    headers: Sequence[str], columns: Mapping[str, str] | None, where: str
+) -> dict[str, Column]:
+    """Which header holds which quantity.
+
+    **Arguments**: `headers` of the file; `columns`, what the user maps by hand, quantity to
+    "header[:unit]"; `where`, the file, for messages.
+
+    **Returns**: columns by quantity, those mapped by hand before those understood.
+
+    **Raises**: `InputError` on unknown names or units, and where two headers mean the same.
+    """
+    found = {
+        column.quantity: column
+        for column in (
+            _by_hand(name, spec, headers, where) for name, spec in (columns or {}).items()
+        )
+    }
+    _refuse_shared(found, where)
+    taken = {column.header for column in found.values()}
+    refused: dict[str, InputError] = {}
+    understood: dict[str, Column] = {}
+    for header in headers:
+        try:
+            column = understand(header)
+        except UnitError as error:
+            mend = f"Write it as in {QUANTITIES[error.quantity].header}, or map it by --column"
+            refused[error.quantity] = InputError(f"{where}, column {header}", str(error), mend)
+            continue
+        if column is None or column.quantity in found or header in taken:
+            continue
+        if column.quantity in understood:
+            raise _twice(understood[column.quantity], column, where)
+        understood[column.quantity] = column
+    found |= understood
+    for quantity, error in refused.items():
+        if quantity not in found:
+            raise error
+    return found
+
+
+def understand(header: str) -> Column | None:
+    """What a header such as `Speed [rpm]`, `u / V` or `time_ms` means; None if nothing known.
+
+    **Raises**: `UnitError` where the quantity is clear and the unit in brackets is not one of it.
+    """
+    if _key(header) == "rpm":
+        return _column(header, "speed", "rpm")
+    for name, unit, explicit in _readings(header):
+        key = _key(name)
+        named = [q for q, known in QUANTITIES.items() if key in known.names]
+        if unit is None and named:
+            return _column(header, named[0], None)
+        if unit is None:
+            continue
+        meant = [
+            q for q, quantity in QUANTITIES.items() if key in quantity.names + quantity.symbols
+        ]
+        fitting = [q for q in meant if _is_unit_of(unit, q)]
+        if len(fitting) == 1:
+            return _column(header, fitting[0], unit)
+        if explicit and named and len(meant) == 1:
+            return _column(header, named[0], unit)  # raises: the unit is wrong
+    stem, dot, leaf = header.rpartition(".")
+    return understand(leaf) if dot and stem and leaf != header else None
+
+
+def looks_like(header: str) -> str | None:
+    """The quantity an unused header begins with, such as speed for `speed_kg`, if any."""
+    for name, unit, _ in _readings(header):
+        for quantity, known in QUANTITIES.items():
+            if unit is not None and _key(name) in known.names:
+                return quantity
+    return None
+
+
+def mixed_axes(found: Mapping[str, Column]) -> tuple[Column, Column] | None:
+    """A column of a rotating shaft (rad, N m) and one of a linear axis (m, N), if there are both."""
+    sorts: dict[bool, Column] = {}
+    for quantity in ("speed", "angle", "load", "torque"):
+        column = found.get(quantity)
+        if column and column.unit:
+            sorts.setdefault(column.base == QUANTITIES[quantity].units[1], column)
+    return (sorts[False], sorts[True]) if len(sorts) == 2 else None
+
+
+def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column:
+    option = f"{where}, --column {name}={spec}"
+    quantity = "load" if name == "load_torque" else name
+    if quantity not in QUANTITIES:
+        raise InputError(option, f"unknown quantity '{name}'", f"Known are {', '.join(QUANTITIES)}")
+    header, unit = spec, None
+    if spec not in headers:
+        header, _, unit = (part.strip() for part in spec.rpartition(":"))
+        header, unit = (header, unit) if header else (spec.strip(), None)
+    if header not in headers:
+        listed = ", ".join(headers[:20]) or "none"
+        raise InputError(option, f"the file has no column '{header}'", f"Its columns are: {listed}")
+    try:
+        return _column(header, quantity, unit or _own_unit(header, quantity))
+    except UnitError as error:
+        example = f"--column {name}={header}:{QUANTITIES[quantity].units[0]}"
+        raise InputError(option, str(error), f"Write for example {example}") from None
+
+
+def _own_unit(header: str, quantity: str) -> str | None:
+    """The unit inside a header whose name need not be known."""
+    for _, unit, explicit in _readings(header):
+        if unit is not None and (explicit or _is_unit_of(unit, quantity)):
+            return unit
+    return None
+
+
+def _column(header: str, quantity: str, unit: str | None) -> Column:
+    if unit is None:
+        return Column(header, quantity, None, QUANTITIES[quantity].units[0])
+    return Column(header, quantity, unit, *conversion(unit, quantity, QUANTITIES[quantity].units))
+
+
+def _readings(header: str) -> Iterator[tuple[str, str | None, bool]]:
+    """Ways to read a header as name and unit, the surest first; True where it has brackets."""
+    header = header.strip()
+    if brackets := re.fullmatch(r"(.*?)[\s_]*[\[({]\s*(.*?)\s*[\])}]", header):
+        name, unit = brackets.groups()
+        yield name, None if unit in ("", "-") else unit, True
+        return
+    yield header, None, False
+    if marked := re.fullmatch(r"(.*?)\s*(?:/|,|\bin\b)\s*(.+)", header):
+        yield marked[1], marked[2], False
+    for cut in reversed([match.start() for match in re.finditer(r"[_ ]", header)]):
+        yield header[:cut], header[cut + 1 :], False
+
+
+def _key(name: str) -> str:
+    name = name.strip().casefold().replace("ω", "omega").replace("θ", "theta").replace("φ", "phi")
+    return re.sub(r"\W+|_+", "_", name).strip("_")
+
+
+def _is_unit_of(unit: str, quantity: str) -> bool:
+    try:
+        conversion(unit, quantity, QUANTITIES[quantity].units)
+    except UnitError:
+        return False
+    return True
+
+
+def _refuse_shared(found: Mapping[str, Column], where: str) -> None:
+    by_header: dict[str, str] = {}
+    for quantity, column in found.items():
+        other = by_header.setdefault(column.header, quantity)
+        if other != quantity:
+            what = f"--column maps '{column.header}' to both {other} and {quantity}"
+            raise InputError(where, what, "Give each quantity a column of its own")
+
+
+def _twice(first: Column, second: Column, where: str) -> InputError:
+    return InputError(
+        f"{where}, columns {first.header} and {second.header}",
+        f"both mean {first.quantity}",
+        f"Choose one, for example by --column {first.quantity}={second.header}",
+    )

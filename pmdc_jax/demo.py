@@ -1,0 +1,55 @@
+"""The tour: identify the motor of the packaged sample and report on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .errors import InputError
+
+if TYPE_CHECKING:
+    from .identify.identification import Identification
+    from .report.terminal import ReportProgress
+
+SAMPLE = Path(__file__).parent / "sample"
+TRAINING = ("staircase", "prbs", "triangle", "loaded")
+HOLDOUT = ("drive",)
+
+
+def demo(
+    out: str | Path = "demo_out", seed: int = 0, progress: ReportProgress | None = None
+) -> Identification:
+    """Identify the packaged sample; write report.html, motor.json and identification.json to `out`.
+
+    **Arguments**: `out`, a folder, made where it does not exist; `seed` of the search; `progress`,
+    called now and then with what is being done.
+
+    **Returns**: the identification.
+    """
+    folder = _folder(Path(out))
+    from .identify import identify
+    from .motor import save_motor
+    from .recording import read_recording
+    from .report.identification import write_report
+    from .report.json import identification_json, write_json
+
+    training, held_out = (
+        [read_recording(SAMPLE / f"{name}.csv") for name in names] for names in (TRAINING, HOLDOUT)
+    )
+    identification = identify(training, holdout=held_out, seed=seed, progress=progress)
+    save_motor(folder / "motor.json", identification.motor, identification)
+    write_json(identification_json(identification), folder / "identification.json")
+    write_report(identification, folder / "report.html")
+    return identification
+
+
+def _folder(path: Path) -> Path:
+    """Make the folder now: better to fail before the work than after it."""
+    from .report.files import check_writable
+
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise InputError("--out", f"{path} is not a folder", "Name a new folder") from None
+    check_writable("--out", path / "report.html")
+    return path

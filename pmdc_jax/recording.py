@@ -1,0 +1,312 @@
+"""One run of one motor in SI: time, voltage, current, speed, load; reading and writing files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from attrs import field, frozen
+from attrs.converters import optional
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from .columns import QUANTITIES, Column, looks_like, match_columns, mixed_axes
+from .errors import InputError
+from .tables import Table, open_table
+
+Samples = Float[np.ndarray, " samples"]
+Half = Literal["electrical", "mechanical"]
+
+MIN_SAMPLES = 10
+MAX_MISSING = 0.2  # share of an output's samples that may be missing
+OUTPUTS = ("speed", "angle", "current")
+TOO_LITTLE = (
+    "Needed beside time: voltage with current, speed or angle; "
+    "or current or torque with speed or angle"
+)
+
+
+@frozen
+class Finding:
+    """Something about the data that a user should know before a fit.
+
+    `run` and `column` name where it was seen (`column` None for the run as a whole), `where` the
+    place in it; `what` is wrong and how to `mend` it. An "error" makes a fit meaningless, a
+    "warning" may spoil it.
+    """
+
+    run: str
+    column: str | None
+    severity: Literal["error", "warning", "note"]
+    what: str
+    where: str
+    mend: str
+
+
+def _samples(values: ArrayLike) -> np.ndarray:
+    return np.asarray(values, dtype=float)
+
+
+@frozen(eq=False)
+class Recording:
+    """One run of one motor, in SI; on a linear axis m for rad and N for N m.
+
+    The voltage at sample k is held until sample k + 1. `load` opposes positive motion; None is
+    unknown, not zero. `torque` is the known torque of the motor. Missing samples of an output are
+    NaN.
+
+    **Fields**: `name`, shown in results; `time`, s, (samples,), strictly increasing from any start;
+    and, None where not recorded, of the same shape: `voltage` V, `current` A, `speed` rad/s, `load`
+    N m, `angle` rad, `temperature` degrees C, `torque` N m. `source`, the file; `ignored`, headers
+    not used; `notes`, what was assumed while reading.
+
+    **Raises**: `InputError` where nothing could be identified from it.
+    """
+
+    name: str
+    time: Samples = field(converter=_samples)
+    voltage: Samples | None = field(default=None, converter=optional(_samples))
+    current: Samples | None = field(default=None, converter=optional(_samples))
+    speed: Samples | None = field(default=None, converter=optional(_samples))
+    load: Samples | None = field(default=None, converter=optional(_samples))
+    angle: Samples | None = field(default=None, converter=optional(_samples))
+    temperature: Samples | None = field(default=None, converter=optional(_samples))
+    torque: Samples | None = field(default=None, converter=optional(_samples))
+    source: str | None = field(default=None, kw_only=True)
+    ignored: tuple[str, ...] = field(default=(), kw_only=True)
+    notes: tuple[Finding, ...] = field(default=(), kw_only=True)
+
+    def __attrs_post_init__(self):
+        for fault in _faults(self.columns()):
+            sample = "" if fault.row is None else f"sample {fault.row + 1}"
+            column = fault.quantity and f"column {fault.quantity}"
+            where = ", ".join(filter(None, (self.source or self.name, sample, column)))
+            raise InputError(where, fault.what, fault.mend)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def sample_time(self) -> float:
+        """Median step of time, s."""
+        return float(np.median(np.diff(self.time)))
+
+    @property
+    def duration(self) -> float:
+        """From the first to the last sample, s."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def drive(self) -> Literal["voltage", "current", "torque"]:
+        """What drives the motor in a simulation: the first there is of voltage, torque, current."""
+        if self.voltage is not None:
+            return "voltage"
+        return "current" if self.torque is None else "torque"
+
+    @property
+    def halves(self) -> tuple[Half, ...]:
+        """Which halves of the motor this run informs: both with a voltage, else the mechanical."""
+        return ("electrical", "mechanical") if self.drive == "voltage" else ("mechanical",)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The arrays that there are, by quantity."""
+        values = ((quantity, getattr(self, quantity)) for quantity in QUANTITIES)
+        return {quantity: array for quantity, array in values if array is not None}
+
+
+def read_recording(
+    path: str | os.PathLike[str], columns: Mapping[str, str] | None = None
+) -> Recording:
+    """Read one run from a CSV, Parquet or MAT file.
+
+    **Arguments**: `path`; `columns`, what the headers do not say by themselves: quantity (time,
+    voltage, current, speed, load, angle, temperature, torque) to "header" or "header:unit".
+
+    **Returns**: the run in SI, named after the file.
+
+    **Raises**: `InputError` that names the file, the line or column, what is wrong and how to mend
+    it.
+    """
+    path = Path(path)
+    table = open_table(path)
+    found = match_columns(table.headers, columns, str(path))
+    _refuse_too_little(found, table, str(path))
+    numbers = table.read([column.header for column in found.values()])
+    values = {q: numbers[column.header] for q, column in found.items()}
+    values = {q: _to_si(column, values[q]) for q, column in found.items()}
+    empty = [q for q, v in values.items() if q != "time" and len(v) and np.isnan(v).all()]
+    present = {q: v for q, v in values.items() if q not in empty}
+    _refuse_too_little(present, table, str(path))
+    for fault in _faults(present):
+        raise _in_file(fault, found, table, str(path))
+    used = {column.header for column in found.values()}
+    return Recording(
+        path.stem,
+        **present,
+        source=str(path),
+        ignored=tuple(header for header in table.headers if header and header not in used),
+        notes=tuple(_notes(path.stem, table.headers, found, empty)),
+    )
+
+
+def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a run as CSV or Parquet, by suffix, under canonical headers and in full precision.
+
+    The file appears complete or not at all.
+
+    **Raises**: `InputError` on another suffix, or where the file cannot be written.
+    """
+    import polars as pl
+
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".parquet"):
+        what = f"cannot write files of kind '{suffix}'"
+        raise InputError(str(path), what, "Name it .csv or .parquet")
+    data = recording.columns()
+    frame = pl.DataFrame({QUANTITIES[quantity].header: array for quantity, array in data.items()})
+    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with draft.open("wb") as file:
+            frame.write_csv(file) if suffix == ".csv" else frame.write_parquet(file)
+        draft.replace(path)
+    except OSError as error:
+        what = f"it cannot be written ({error.strerror or error})"
+        mend = "Choose a folder that exists and that you may write to"
+        raise InputError(str(path), what, mend) from None
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+class _Fault(NamedTuple):
+    """Why a recording cannot be used; `row` counts from 0, None for the whole column."""
+
+    quantity: str | None
+    row: int | None
+    what: str
+    mend: str
+
+
+def _faults(columns: Mapping[str, np.ndarray]) -> Iterator[_Fault]:
+    """All that makes these columns unusable, the most basic first."""
+    if not _drives(columns):
+        what = f"nothing to identify from {', '.join(columns)}"
+        yield _Fault(None, None, what, TOO_LITTLE)
+    time = columns["time"]
+    for quantity, values in columns.items():
+        if values.ndim != 1 or len(values) != len(time):
+            what = f"shape {values.shape} where time has {time.shape}"
+            yield _Fault(quantity, None, what, "Give every column one value a sample")
+            return
+    if len(time) < MIN_SAMPLES:
+        what = f"{len(time)} samples, at least {MIN_SAMPLES} are needed"
+        yield _Fault(None, None, what if len(time) else "it holds no rows", "Record a longer run")
+        return
+    for quantity, values in columns.items():
+        yield from _not_finite(quantity, values, columns)
+    yield from _time_order(time)
+
+
+def _drives(columns: Mapping[str, object]) -> bool:
+    moves = "speed" in columns or "angle" in columns
+    if "voltage" in columns:
+        return moves or "current" in columns
+    return moves and ("current" in columns or "torque" in columns)
+
+
+def _not_finite(
+    quantity: str, values: np.ndarray, columns: Mapping[str, np.ndarray]
+) -> Iterator[_Fault]:
+    bad = ~np.isfinite(values)
+    if not bad.any():
+        return
+    first, count = int(np.argmax(bad)), int(bad.sum())
+    infinite = np.isinf(values)
+    if infinite.any():
+        first = int(np.argmax(infinite))
+        what = f"{infinite.sum()} infinite values, the first here"
+        yield _Fault(quantity, first, what, "Leave cells without a measurement empty")
+    # current is an input where nothing else drives the motor
+    output = quantity in OUTPUTS and (
+        quantity != "current" or "voltage" in columns or "torque" in columns
+    )
+    if not output and quantity != "temperature":
+        what = f"{count} of {len(values)} values are missing (empty or NaN), the first here"
+        yield _Fault(quantity, first, what, "An input must be complete: fill it, or cut the run")
+    elif output and count > MAX_MISSING * len(values):
+        what = f"{count} of {len(values)} values are missing (empty or NaN), the first here"
+        mend = f"Up to {MAX_MISSING:.0%} may be missing: cut the run, or leave out the column"
+        yield _Fault(quantity, first, what, mend)
+
+
+def _time_order(time: np.ndarray) -> Iterator[_Fault]:
+    steps = np.diff(time)
+    if (steps > 0).all():
+        return
+    row = int(np.argmax(~(steps > 0))) + 1
+    before, now = (f"{value:.9g}" for value in time[row - 1 : row + 1])
+    if steps[row - 1] < 0:
+        what = f"time goes backwards, from {before} s to {now} s"
+        mend = "One file is one run: split it, or sort the lines"
+    else:
+        what = f"the time stamp {now} s is repeated ({(steps == 0).sum()} repetitions in all)"
+        mend = "Export time with more digits, or delete repeated lines"
+    yield _Fault("time", row, what, mend)
+
+
+def _refuse_too_little(found: Mapping[str, object], table: Table, where: str) -> None:
+    headers = ", ".join(filter(None, table.headers[:20])) or "none"
+    seen = f"columns in the file: {headers}"
+    if len(table.headers) == 1:
+        seen += "; if these are several, separate them by comma, semicolon or tab"
+    if "time" not in found:
+        mend = f"Name it time_s, or map it by --column time=HEADER:UNIT; {seen}"
+        raise InputError(where, "there is no time column", mend)
+    if not _drives(found):
+        what = f"nothing to identify from {', '.join(found)}"
+        mend = f"{TOO_LITTLE}. Map others by --column speed=HEADER:UNIT; {seen}"
+        raise InputError(where, what, mend)
+
+
+def _to_si(column: Column, values: np.ndarray) -> np.ndarray:
+    if (column.scale, column.offset) == (1.0, 0.0):
+        return values
+    return values * column.scale + column.offset
+
+
+def _in_file(fault: _Fault, found: Mapping[str, Column], table: Table, where: str) -> InputError:
+    places = [where]
+    if fault.row is not None:
+        places.append(table.place(fault.row))
+    if fault.quantity:
+        places.append(f"column {found[fault.quantity].header}")
+    return InputError(", ".join(places), fault.what, fault.mend)
+
+
+def _notes(
+    run: str, headers: tuple[str, ...], found: Mapping[str, Column], empty: list[str]
+) -> Iterator[Finding]:
+    def note(column: str, what: str, mend: str) -> Finding:
+        return Finding(run, column, "note", what, "header", mend)
+
+    for quantity, column in found.items():
+        if quantity in empty:
+            yield note(column.header, "the column is empty", "It is left out")
+        elif column.unit is None:
+            mend = f"If it is not, write the unit into the header: {QUANTITIES[quantity].header}"
+            yield note(column.header, f"the header has no unit: taken as {column.base}", mend)
+    if mixed := mixed_axes(found):
+        shaft, axis = mixed
+        what = (
+            f"{shaft.base} belongs to a rotating shaft, the {axis.base} of {axis.header} does not"
+        )
+        mend = "Give all columns for the shaft (rad, N m) or all for the linear axis (m, N)"
+        yield Finding(run, shaft.header, "warning", what, "header", mend)
+    for header in headers:
+        quantity = looks_like(header)
+        if quantity and quantity not in found:
+            what = f"not used, though it looks like {quantity}"
+            yield note(header, what, f"Map it by --column {quantity}={header}:UNIT")

@@ -1,0 +1,1 @@
+"""Results made readable as HTML, terminal tables and JSON: presentation, no computing."""

@@ -1,0 +1,232 @@
+"""Plotly figures of results. Long runs are thinned for display, keeping every peak."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from ..identify.identification import RunFit, Search
+from .notation import fixed
+
+MEASURED, SIMULATED, RESIDUAL, INPUT = "#a3b0c0", "#0b5fcc", "#c9702b", "#4b5563"
+INK, GRID, EDGE = "#27313f", "#e6e9ee", "#c3cad4"
+DASHED = {"color": INK, "width": 1, "dash": "4px 3px"}
+FONT = "Inter, system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
+BUTTONS = ["toImage", "zoom2d", "pan2d", "resetScale2d"]
+POINTS_PER_TRACE = 4000
+POINTS_PER_PAGE = 90_000  # about one megabyte as base64: the page stays under 6 MB with plotly.js
+
+
+def points_per_trace(traces: int) -> int:
+    """How many points each of so many traces may have, so that the whole page stays small."""
+    return min(POINTS_PER_TRACE, max(200, POINTS_PER_PAGE // max(traces, 1)))
+
+
+def count_traces(fit: RunFit) -> int:
+    """How many traces the figure of a run will have."""
+    return sum(len(panel.traces) for panel in _panels(fit, {}))
+
+
+def run_figure(fit: RunFit, noise: Mapping[str, float | None], points: int) -> go.Figure:
+    """Measured against simulated with a shared time axis, and the residuals underneath.
+
+    Dashed lines mark two standard deviations of the noise either side of zero residual.
+    """
+    panels = _panels(fit, noise)
+    heights = [panel.height for panel in panels]
+    figure = make_subplots(
+        rows=len(panels), cols=1, shared_xaxes=True, vertical_spacing=0.028, row_heights=heights
+    )
+    for row, panel in enumerate(panels, start=1):
+        for trace in panel.traces:
+            time, values = envelope(fit.time, trace["y"], points)
+            figure.add_trace(go.Scatter(trace, x=time, y=values), row=row, col=1)
+        figure.update_yaxes(title_text=panel.title, row=row, col=1)
+        for level in (-2 * panel.noise, 2 * panel.noise) if panel.noise else ():
+            # plotly's annotation of `row` knows only "all"
+            figure.add_hline(y=level, line=DASHED, row=row)  # pyright: ignore[reportArgumentType]
+    figure.update_xaxes(title_text="time [s]", row=len(panels), col=1)
+    _style(figure, height=90 + int(190 * sum(heights)))
+    figure.update_layout(hovermode="x unified")
+    return figure
+
+
+def search_figure(search: Search) -> go.Figure:
+    """Best and median fitness of each generation, then every refined start, on one log scale."""
+    figure = make_subplots(
+        rows=1, cols=2, shared_yaxes=True, column_widths=[0.72, 0.28], horizontal_spacing=0.03
+    )
+    for name, values, colour in (
+        ("median of the population", search.median, MEASURED),
+        ("best", search.best, SIMULATED),
+    ):
+        trace = go.Scatter(
+            x=np.arange(len(values)), y=_positive(values), name=name, line={"color": colour}
+        )
+        figure.add_trace(trace, row=1, col=1)
+    refined = go.Scatter(
+        x=np.arange(1, len(search.refined) + 1),
+        y=_positive(search.refined),
+        name="refined start",
+        mode="markers",
+        marker={"color": RESIDUAL, "size": 8},
+    )
+    figure.add_trace(refined, row=1, col=2)
+    figure.update_yaxes(type="log", exponentformat="power", dtick=1, tickfont_size=10)
+    figure.update_yaxes(title_text="fitness", row=1, col=1)
+    figure.update_xaxes(title_text="generation", row=1, col=1)
+    figure.update_xaxes(title_text="refined start", row=1, col=2)
+    figure.update_xaxes(dtick=1 if len(search.refined) <= 10 else None, row=1, col=2)
+    _style(figure, height=380)
+    return figure
+
+
+def correlation_figure(correlation: np.ndarray, names: Sequence[str]) -> go.Figure:
+    """The correlation matrix of the estimates as a heat map with its numbers."""
+    text = [[fixed(value, 2) for value in row] for row in correlation]
+    figure = go.Figure(
+        go.Heatmap(
+            z=correlation,
+            x=list(names),
+            y=list(names),
+            text=text,
+            texttemplate="%{text}",
+            textfont={"color": INK},
+            zmin=-1,
+            zmax=1,
+            xgap=2,
+            ygap=2,
+            colorscale=[[0, "#e39a5a"], [0.5, "#ffffff"], [1, "#7eacea"]],
+            colorbar={"thickness": 12, "outlinewidth": 0, "tickvals": [-1, 0, 1]},
+            hovertemplate="%{y} and %{x}: %{z:.3f}<extra></extra>",
+        )
+    )
+    _style(figure, height=60 + 52 * len(names))
+    figure.update_yaxes(autorange="reversed", showgrid=False, showline=False, ticks="")
+    figure.update_xaxes(showgrid=False, showline=False, ticks="", side="top")
+    figure.update_layout(margin={"t": 30, "l": 40, "b": 10}, modebar={"remove": BUTTONS})
+    return figure
+
+
+def correlations(
+    covariance: np.ndarray, names: Sequence[str]
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The correlation matrix of the parameters that are free, and their names."""
+    variance = np.diag(covariance) if np.size(covariance) else np.zeros(0)
+    free = np.flatnonzero(np.isfinite(variance) & (variance > 0))
+    deviation = np.sqrt(variance[free])
+    matrix = covariance[np.ix_(free, free)] / np.outer(deviation, deviation)
+    return np.clip(matrix, -1, 1), tuple(names[int(index)] for index in free)
+
+
+def envelope(time: np.ndarray, values: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """At most `points` samples: the lowest and the highest of each group of neighbours, in order.
+
+    Unlike a stride this keeps every peak, at the price of showing noise at its full width.
+    """
+    if len(values) > points:
+        group = group_size(len(values), points)
+        padding = (0, -len(values) % group)
+        groups = np.pad(values, padding, mode="edge").reshape(-1, group)
+        lowest = np.where(np.isnan(groups), np.inf, groups).argmin(axis=1)
+        highest = np.where(np.isnan(groups), -np.inf, groups).argmax(axis=1)
+        inside = np.sort(np.stack([lowest, highest], axis=1), axis=1)
+        keep = inside + group * np.arange(len(groups))[:, None]
+        keep = np.minimum(keep.ravel(), len(values) - 1)
+        time, values = time[keep], values[keep]
+    exact = np.abs(time).max(initial=0.0) > 1e5  # a clock, not seconds since the start
+    return np.asarray(time, float if exact else np.float32), np.asarray(values, np.float32)
+
+
+def group_size(samples: int, points: int) -> int:
+    """How many neighbours share one lowest and one highest in a thinned trace."""
+    return -(-2 * samples // points)
+
+
+class _Panel(NamedTuple):
+    """One row of a picture: axis title, relative height, traces, noise of a residual."""
+
+    title: str
+    height: float
+    traces: list[dict]
+    noise: float | None = None
+
+
+def _panels(fit: RunFit, noise: Mapping[str, float | None]) -> list[_Panel]:
+    """What is drawn from top to bottom; no empty panels."""
+    speed = [
+        _line("measured", fit.speed, MEASURED, 2.6, legend=True),
+        _line("simulated", fit.speed_simulated, SIMULATED, 1.1, legend=True),
+    ]
+    current = [
+        _line("measured", fit.current, MEASURED, 2.6, legend=fit.speed is None),
+        _line("simulated", fit.current_simulated, SIMULATED, 1.1),
+    ]
+    # the voltage recorded at a sample is held until the next
+    voltage = _line("applied", fit.voltage, INPUT, 1.2, shape="hv")
+    panels = [
+        _Panel("speed<br>[rad/s]", 1.0, speed),
+        _Panel("current<br>[A]", 1.0, current),
+        _Panel("voltage<br>[V]", 0.55, [voltage]),
+        _residual("Δ speed<br>[rad/s]", fit.speed, fit.speed_simulated, noise.get("speed_rad_s")),
+        _residual("Δ current<br>[A]", fit.current, fit.current_simulated, noise.get("current_A")),
+    ]
+    # a quantity the run does not hold is an empty trace
+    panels = [panel._replace(traces=[one for one in panel.traces if one]) for panel in panels]
+    return [panel for panel in panels if panel.traces]
+
+
+def _residual(
+    title: str, measured: np.ndarray | None, simulated: np.ndarray | None, noise: float | None
+) -> _Panel:
+    residual = None
+    if measured is not None and simulated is not None:
+        residual = measured - simulated
+    return _Panel(title, 0.55, [_line("residual", residual, RESIDUAL, 0.7)], noise)
+
+
+def _line(
+    name: str,
+    values: np.ndarray | None,
+    colour: str,
+    width: float,
+    legend: bool = False,
+    shape: str = "linear",
+) -> dict:
+    if values is None:
+        return {}
+    return {
+        "name": name,
+        "y": np.asarray(values, float),
+        "mode": "lines",
+        "line": {"color": colour, "width": width, "shape": shape},
+        "showlegend": legend,
+        "legendgroup": name,
+    }
+
+
+def _positive(values: np.ndarray) -> np.ndarray:
+    """Values a log axis can show; the rest become gaps."""
+    values = np.asarray(values, float)
+    return np.where(np.isfinite(values) & (values > 0), values, np.nan)
+
+
+def _style(figure: go.Figure, height: int) -> None:
+    figure.update_layout(
+        template=go.layout.Template(),  # plotly's own would add 7 kB to every figure
+        height=height,
+        margin={"l": 62, "r": 12, "t": 34, "b": 44},
+        paper_bgcolor="rgba(0,0,0,0)",
+        plot_bgcolor="#ffffff",
+        font={"family": FONT, "size": 12, "color": INK},
+        legend={"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
+        hoverlabel={"font": {"family": FONT}},
+        modebar={"bgcolor": "rgba(0,0,0,0)", "color": "#9aa5b4", "activecolor": INK},
+    )
+    axis = {"gridcolor": GRID, "zeroline": False, "linecolor": EDGE, "title_font_size": 12}
+    figure.update_xaxes(**axis, showline=True, ticks="outside", tickcolor=EDGE, ticklen=4)
+    figure.update_yaxes(**axis, title_standoff=6)

@@ -1,0 +1,55 @@
+"""Result files: checked before the long work begins, written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ..errors import InputError
+
+
+def check_outputs(outputs: dict[str, Path | str | None], inputs: list[Path]) -> None:
+    """Refuse now what could not be written at the end; `outputs` maps each option to its path.
+
+    Two outputs in one file, or an output over an input, would lose data, so they are refused too.
+    """
+    taken = {path.resolve(): "an input" for path in inputs}
+    for option, output in outputs.items():
+        if output is None or (option == "--json" and str(output) == "-"):
+            continue
+        path = Path(output)
+        check_writable(option, path)
+        if path.resolve() in taken:
+            other = taken[path.resolve()]
+            raise InputError(option, f"{path} is also {other}", "Give it a file of its own")
+        if path.is_file() or not path.exists():  # devices such as /dev/null may be shared
+            taken[path.resolve()] = f"where {option} is written"
+
+
+def check_writable(option: str, path: Path) -> None:
+    """Raise an InputError where a file of that name cannot be written."""
+    if str(path) == "-":
+        raise InputError(option, "only --json can go to standard output", "Give the name of a file")
+    if path.is_dir():
+        raise InputError(option, f"{path} is a folder", "Give the name of a file")
+    folder = path.parent
+    if not folder.is_dir():
+        raise InputError(
+            option, f"the folder {folder} does not exist", "Make it first, or choose another"
+        )
+    if not os.access(folder if not path.exists() else path, os.W_OK):
+        raise InputError(option, f"{path} cannot be written", "Choose another place")
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a file atomically: readers see the old one or the new one, never half of it."""
+    path = Path(path).resolve()  # through a link, so that the link stays
+    if path.exists() and not path.is_file():  # a device such as /dev/stdout cannot be replaced
+        path.write_text(text, encoding="utf-8")
+        return
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,156 @@
+"""The report of an identification: one HTML page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from attrs import frozen
+
+from ..identify.identification import Estimate, Identification, RunFit
+from .figures import (
+    correlation_figure,
+    correlations,
+    count_traces,
+    group_size,
+    points_per_trace,
+    run_figure,
+    search_figure,
+)
+from .notation import (
+    PARAMETER_NAMES,
+    Written,
+    fixed,
+    percent,
+    significant,
+    thousands,
+    write_estimate,
+)
+from .page import figure_json, write_page
+from .summary import runs_in_order, status_word, summary
+
+
+def write_report(identification: Identification, path: str | Path) -> None:
+    """Write the report of an identification to one self-contained HTML file."""
+    write_page(
+        path,
+        "identification.html.jinja",
+        summary=summary(identification),
+        tiles=_tiles(identification),
+        parameters=_parameters(identification),
+        directions=identification.unidentified_directions,
+        findings=identification.findings,
+        messages=identification.messages,
+        runs=_runs(identification),
+        show_load_offset=any(fit.load_offset is not None for fit in identification.fit.values()),
+        search=_search(identification),
+        correlation=_correlation(identification),
+        seed=identification.seed,
+        seconds={name: f"{value:.1f} s" for name, value in identification.seconds.items()},
+    )
+
+
+@frozen
+class _Parameter:
+    symbol: str
+    name: str
+    written: Written
+    status: str
+    status_word: str
+
+
+@frozen
+class _Run:
+    name: str
+    anchor: str
+    role: str
+    numbers: dict[str, str]
+    figure: str
+    caption: str
+
+
+def _tiles(identification: Identification) -> list[tuple[str, str, str]]:
+    """Label, number and small print of the figures worth knowing first."""
+    parameters = identification.parameters.values()
+    identified = sum(one.status == "identified" for one in parameters)
+    tiles = [("Parameters identified", f"{identified} of {len(parameters)}", "")]
+    held_out = [fit for fit in identification.fit.values() if fit.role == "holdout"]
+    shown = held_out or list(identification.fit.values())
+    label = "Hold-out fit" if held_out else "Training fit"
+    for quantity in ("speed", "current"):
+        fits = [getattr(fit, f"{quantity}_fit_percent") for fit in shown]
+        fits = [fit for fit in fits if fit is not None]
+        if fits:
+            note = "free-run simulation" if len(fits) == 1 else f"worst of {len(fits)} runs"
+            tiles.append((f"{label}, {quantity}", percent(min(fits)), note))
+    search = identification.search
+    starts = len(search.refined)
+    agree = f"{search.times_found} of {starts} starts agree" if starts else ""
+    tiles.append(("Search", "converged" if identification.converged else "not converged", agree))
+    return tiles
+
+
+def _parameters(identification: Identification) -> list[_Parameter]:
+    def row(symbol: str, estimate: Estimate) -> _Parameter:
+        name = PARAMETER_NAMES.get(symbol, "")
+        word = status_word(estimate.status)
+        return _Parameter(symbol, name, write_estimate(estimate), estimate.status, word)
+
+    return [row(*item) for item in identification.parameters.items()]
+
+
+def _runs(identification: Identification) -> list[_Run]:
+    runs = runs_in_order(identification)
+    points = points_per_trace(sum(count_traces(fit) for _, fit in runs))
+    return [
+        _Run(
+            name=name,
+            anchor=f"run-{number}",
+            role="hold-out" if fit.role == "holdout" else "training",
+            numbers=_numbers(fit),
+            figure=figure_json(run_figure(fit, identification.noise, points)),
+            caption=_caption(fit, points),
+        )
+        for number, (name, fit) in enumerate(runs, start=1)
+    ]
+
+
+def _numbers(fit: RunFit) -> dict[str, str]:
+    duration = fit.time[-1] - fit.time[0] if len(fit.time) else 0.0
+    return {
+        "samples": thousands(len(fit.time)),
+        "duration": f"{fixed(duration, 2)} s",
+        "speed_rmse": significant(fit.speed_rmse),
+        "speed_fit": percent(fit.speed_fit_percent),
+        "current_rmse": significant(fit.current_rmse),
+        "current_fit": percent(fit.current_fit_percent),
+        "load_offset": significant(fit.load_offset),
+    }
+
+
+def _caption(fit: RunFit, points: int) -> str:
+    """The fits of the run, and how its picture was thinned where not every sample is drawn."""
+    shares = (("speed", fit.speed_fit_percent), ("current", fit.current_fit_percent))
+    fits = [f"{quantity} fit {percent(share)}" for quantity, share in shares if share is not None]
+    samples = len(fit.time)
+    if samples > points:
+        group = group_size(samples, points)
+        fits.append(f"drawn thinned to the lowest and highest of every {group} samples")
+    return ", ".join(fits)
+
+
+def _search(identification: Identification) -> dict[str, Any]:
+    search = identification.search
+    drawn = len(search.best) + len(search.refined) > 0
+    return {
+        "method": search.method.replace("_", " "),
+        "evaluations": thousands(search.evaluations),
+        "starts": len(search.refined),
+        "times_found": search.times_found,
+        "figure": figure_json(search_figure(search)) if drawn else None,
+    }
+
+
+def _correlation(identification: Identification) -> str | None:
+    matrix, names = correlations(identification.covariance, identification.covariance_names)
+    return figure_json(correlation_figure(matrix, names)) if len(names) > 1 else None

@@ -1,0 +1,112 @@
+"""Results as JSON after the contract: SI numbers, finite, and null for what is unknown."""
+
+from __future__ import annotations
+
+import json
+import sys
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from ..identify.identification import Estimate, Identification, RunFit, Search
+from ..recording import Finding
+from .files import write_text
+
+
+def identification_json(identification: Identification) -> dict[str, Any]:
+    """An identification as plain dictionaries, lists, finite numbers and None."""
+    parameters = identification.parameters.items()
+    return _plain(
+        {
+            "parameters": {name: _estimate(estimate) for name, estimate in parameters},
+            "unidentified_directions": [
+                {"parameters": list(one.parameters), "why": one.why, "mend": one.mend}
+                for one in identification.unidentified_directions
+            ],
+            "fit": {run: _run_fit(fit) for run, fit in identification.fit.items()},
+            "noise": dict(identification.noise),
+            "converged": identification.converged,
+            "seed": identification.seed,
+            "seconds": dict(identification.seconds),
+            "search": _search(identification.search),
+            "covariance_of_logarithms": {
+                "parameters": list(identification.covariance_names),
+                "matrix": identification.covariance,
+            },
+            "findings": [_finding(finding) for finding in identification.findings],
+            "messages": list(identification.messages),
+        }
+    )
+
+
+def write_json(obj: Any, path: str | Path) -> None:
+    """Write `obj` to a file, whole or not at all, or to standard output where the path is "-"."""
+    to_stdout = str(path) == "-"  # whose encoding is anybody's guess, hence plain ASCII
+    text = json.dumps(obj, indent=2, ensure_ascii=to_stdout, allow_nan=False) + "\n"
+    if to_stdout:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    else:
+        write_text(path, text)
+
+
+def _estimate(estimate: Estimate) -> dict[str, Any]:
+    return {
+        "value": estimate.value,
+        "stderr": estimate.stderr,
+        "ci95": estimate.ci95,
+        "unit": estimate.unit,
+        "status": estimate.status,
+    }
+
+
+def _run_fit(fit: RunFit) -> dict[str, Any]:
+    return {
+        "role": fit.role,
+        "current_rmse": fit.current_rmse,
+        "speed_rmse": fit.speed_rmse,
+        "current_fit_percent": fit.current_fit_percent,
+        "speed_fit_percent": fit.speed_fit_percent,
+        "load_offset": fit.load_offset,
+        "samples": len(fit.time),
+    }
+
+
+def _search(search: Search) -> dict[str, Any]:
+    return {
+        "method": search.method,
+        "evaluations": search.evaluations,
+        "generations": len(search.best),
+        "refined": search.refined,
+        "times_found": search.times_found,
+    }
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    names = ("run", "column", "severity", "what", "where", "mend")
+    return {name: getattr(finding, name) for name in names}
+
+
+def _plain(value: Any) -> Any:
+    """Tuples and arrays as lists, NumPy and JAX scalars as Python's, NaN and infinity as None.
+
+    An interval with an unknown end is unknown as a whole.
+    """
+    if isinstance(value, dict):
+        return {
+            str(key): None if key == "ci95" and _open(item) else _plain(item)
+            for key, item in value.items()
+        }
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, bool | int | str) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if isfinite(value) else None
+    return str(value)
+
+
+def _open(interval: Any) -> bool:
+    return interval is not None and not all(isfinite(float(end)) for end in interval)

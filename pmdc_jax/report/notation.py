@@ -1,0 +1,125 @@
+"""Numbers and units as an engineer writes them: 157.3 mΩ, not 0.157312 ohm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import floor, isfinite, log10
+
+from attrs import frozen
+
+from ..identify.identification import Estimate
+
+UNKNOWN = "–"
+NARROW = "\u202f"  # narrow space where no line may break
+PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+PARAMETER_NAMES = {
+    "R": "armature resistance",
+    "L": "armature inductance",
+    "Kb": "back-EMF constant",
+    "Kt": "torque constant",
+    "J": "inertia",
+    "f": "viscous friction",
+}
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@frozen
+class Written:
+    """An estimate in words: value, error and interval share one scaled unit and its decimals."""
+
+    value: str
+    stderr: str
+    interval: str
+    relative: str  # standard error in per cent of the value
+    unit: str
+
+
+def write_estimate(estimate: Estimate) -> Written:
+    """Write an estimate with as many decimals as its standard error deserves (two digits of it)."""
+    exponent = engineering_exponent(estimate.value)
+    scale = 10.0**exponent
+    decimals = _decimals(estimate.value / scale, (estimate.stderr or 0.0) / scale)
+
+    def write(number: float | None) -> str:
+        return fixed(None if number is None else number / scale, decimals)
+
+    interval = UNKNOWN
+    if estimate.ci95 is not None:
+        interval = f"{write(estimate.ci95[0])} … {write(estimate.ci95[1])}"
+    relative = UNKNOWN
+    if estimate.stderr is not None and estimate.value:
+        relative = percent(100 * estimate.stderr / abs(estimate.value))
+    unit = scaled_unit(estimate.unit, exponent)
+    return Written(write(estimate.value), write(estimate.stderr), interval, relative, unit)
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """A number with so many significant digits, for columns whose unit stands in the header."""
+    if value is None or not isfinite(value):
+        return UNKNOWN
+    if value and not -5 < _magnitude(value) < 6:
+        return f"{value:.{digits - 1}e}".replace("-", "−")
+    return fixed(value, max(0, digits - 1 - _magnitude(value)))
+
+
+def thousands(count: int) -> str:
+    """Groups of three digits, held together by narrow spaces."""
+    return f"{count:,}".replace(",", NARROW)
+
+
+def engineering_exponent(value: float) -> int:
+    """The multiple of three that leaves 1 to 999 before the decimal point."""
+    if not value or not isfinite(value):
+        return 0
+    return max(-12, min(9, 3 * floor(log10(abs(value)) / 3)))
+
+
+def scaled_unit(unit: str, exponent: int) -> str:
+    """The unit with its prefix, ("N m/A", -3) as "mN·m/A"; kilograms take a power of ten."""
+    unit = pretty_unit(unit)
+    if not exponent:
+        return unit
+    if not unit or unit.startswith("kg"):
+        return f"×10{str(exponent).translate(_SUPERSCRIPT)} {unit}".strip()
+    return PREFIXES[exponent] + unit
+
+
+def pretty_unit(unit: str) -> str:
+    """ "kg m^2" as "kg·m²", "ohm" as "Ω"."""
+    unit = unit.replace("ohm", "Ω").replace("**", "^").replace("*", " ")
+    for power in "23":
+        unit = unit.replace(f"^{power}", power.translate(_SUPERSCRIPT))
+    return "·".join(unit.split())
+
+
+def percent(value: float | None) -> str:
+    """A percentage with two digits, or two decimals near 100 where the differences lie."""
+    if value is None or not isfinite(value):
+        return UNKNOWN
+    if 90 < abs(value) <= 100:
+        return f"{fixed(value, 2)}{NARROW}%"
+    return f"{significant(value, 3 if abs(value) >= 10 else 2)}{NARROW}%"
+
+
+def fixed(value: float | None, decimals: int) -> str:
+    """A number with fixed decimals and a true minus sign; a dash where it is unknown."""
+    if value is None or not isfinite(value):
+        return UNKNOWN
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def enumerate_words(words: Sequence[str]) -> str:
+    """ "R, L and Kb"."""
+    if len(words) < 2:
+        return "".join(words)
+    return f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _decimals(value: float, stderr: float) -> int:
+    if stderr > 0 and isfinite(stderr):
+        return max(0, min(6, 1 - _magnitude(stderr)))
+    return max(0, 3 - _magnitude(value))
+
+
+def _magnitude(value: float) -> int:
+    return floor(log10(abs(value))) if value and isfinite(value) else 0

@@ -1,0 +1,60 @@
+"""One self-contained HTML page: template, plotly.js inlined once, figures as JSON. No network."""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import plotly.graph_objects as go
+from markupsafe import Markup, escape
+from plotly.offline import get_plotlyjs
+
+from .files import write_text
+
+PACKAGES = ("pmdc_jax", "jax", "diffrax", "equinox", "optimistix", "evosax", "numpy", "plotly")
+
+
+def write_page(path: str | Path, template: str, **content: Any) -> None:
+    """Render a template of this folder with `content` and write it, whole or not at all."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,  # run and column names come from files
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["options"] = _options
+    page = environment.get_template(template).render(
+        plotly_js=Markup(get_plotlyjs()),
+        versions=_versions(),
+        written=f"{datetime.now():%Y-%m-%d %H:%M}",
+        **content,
+    )
+    write_text(path, page)
+
+
+def figure_json(figure: go.Figure) -> Markup:
+    """A figure as JSON that may stand inside a script element."""
+    text = figure.to_json()
+    # "<" occurs only inside strings, where the escape means the same and cannot close the element
+    return Markup((text or "{}").replace("<", "\\u003c"))
+
+
+def _options(text: str) -> Markup:
+    """Plain text with every command-line option in it set as code, never broken over two lines."""
+    option = r"(--[a-z][\w-]*(?: \w+=\w+| [A-Z]+\b)?)"
+    return Markup(re.sub(option, r"<code>\1</code>", str(escape(text))))
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found

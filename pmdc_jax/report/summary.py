@@ -1,0 +1,143 @@
+"""The result in plain English: what was found, how well it holds, what the logs cannot tell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from ..identify.identification import Estimate, Identification, RunFit
+from .notation import NARROW, enumerate_words, percent, significant
+
+STATUS_WORDS = {
+    "identified": "identified",
+    "at_bound": "at bound",
+    "tied": "tied",
+    "known": "known",
+    "not_identifiable": "not identifiable",
+}
+# a residual up to this multiple of the noise is called noise: RMS of few samples scatter as much
+NOISE_LEVEL = 1.25
+
+
+def status_word(status: str) -> str:
+    """The status as it is printed everywhere."""
+    return STATUS_WORDS.get(status, status.replace("_", " "))
+
+
+def summary(identification: Identification) -> list[str]:
+    """The sentences at the top of the report, the most important first."""
+    sentences = [_found(identification), _held_out(identification)]
+    sentences += [
+        f"{_sentence(direction.why)} {_sentence(direction.mend)}"
+        for direction in identification.unidentified_directions
+    ]
+    at_bound = _with_status(identification, "at_bound")
+    if at_bound:
+        who = f"{enumerate_words(at_bound)} {'stand' if len(at_bound) > 1 else 'stands'}"
+        sentences.append(f"{who} at the bound of the search: a limit, not an estimate.")
+    if not identification.converged:
+        sentences.append(
+            "The search did not converge: treat every number with care, or try another seed."
+        )
+    return sentences
+
+
+def runs_in_order(identification: Identification) -> list[tuple[str, RunFit]]:
+    """The runs, the hold-outs first: they are the test, the others only the lesson."""
+    return sorted(identification.fit.items(), key=lambda item: item[1].role != "holdout")
+
+
+def _found(identification: Identification) -> str:
+    parameters = identification.parameters
+    identified = _with_status(identification, "identified")
+    open_ones = _with_status(identification, "not_identifiable")
+    training = sum(fit.role == "train" for fit in identification.fit.values())
+    source = f"from {training} training run{'s' * (training != 1)}"
+    if not identified:
+        return f"No parameter could be identified {source}."
+    if len(identified) == len(parameters):
+        found = f"All {len(parameters)} parameters were identified {source}"
+    else:
+        verb = "were" if len(identified) > 1 else "was"
+        found = f"{enumerate_words(identified)} {verb} identified {source}"
+    found += _precision({name: parameters[name] for name in identified})
+    return f"{found}; {enumerate_words(open_ones)} could not be." if open_ones else f"{found}."
+
+
+def _precision(estimates: dict[str, Estimate]) -> str:
+    errors = {
+        name: 100 * estimate.stderr / abs(estimate.value)
+        for name, estimate in estimates.items()
+        if estimate.stderr is not None and estimate.value
+    }
+    if not errors:
+        return ""
+    best, worst = min(errors, key=errors.__getitem__), max(errors, key=errors.__getitem__)
+    if best == worst:
+        return f", with a standard error of {percent(errors[best])}"
+    return (
+        f", with standard errors from {percent(errors[best])} ({best})"
+        f" to {percent(errors[worst])} ({worst})"
+    )
+
+
+def _held_out(identification: Identification) -> str:
+    held_out = {name: fit for name, fit in runs_in_order(identification) if fit.role == "holdout"}
+    if not held_out:
+        return (
+            "No run was held out, so nothing here tests the motor on data the fit has not seen:"
+            " hold one back with --holdout RUN."
+        )
+    worst = max(held_out, key=lambda name: _misfit(held_out[name], identification.noise))
+    fit = held_out[worst]
+    who = f"The held-out run {worst}"
+    if len(held_out) > 1:
+        who = f"Of {len(held_out)} held-out runs the worst, {worst},"
+    channels = _channels(fit, identification.noise)
+    reproduced = [
+        f"{one.quantity} to {significant(one.rmse)}{NARROW}{one.unit} RMS ({percent(one.fit)} fit)"
+        for one in channels
+    ]
+    excess = [
+        f"the {one.quantity} misses by {one.rmse / one.noise:.1f} times the measurement noise"
+        for one in channels
+        if one.noise and one.rmse > NOISE_LEVEL * one.noise
+    ]
+    sentence = f"{who} is reproduced in free-run simulation, {enumerate_words(reproduced)}"
+    if not any(one.noise for one in channels):
+        return f"{sentence}."
+    return f"{sentence}; {enumerate_words(excess) or 'what is left is the measurement noise'}."
+
+
+class _Channel(NamedTuple):
+    quantity: str
+    rmse: float
+    fit: float | None
+    unit: str
+    noise: float | None
+
+
+def _channels(fit: RunFit, noise: Mapping[str, float | None]) -> list[_Channel]:
+    """What the run holds of speed and current."""
+    channels = []
+    if fit.speed_rmse is not None:
+        one = ("speed", fit.speed_rmse, fit.speed_fit_percent, "rad/s", noise.get("speed_rad_s"))
+        channels.append(_Channel(*one))
+    if fit.current_rmse is not None:
+        one = ("current", fit.current_rmse, fit.current_fit_percent, "A", noise.get("current_A"))
+        channels.append(_Channel(*one))
+    return channels
+
+
+def _misfit(fit: RunFit, noise: Mapping[str, float | None]) -> float:
+    """Residuals in units of the noise, added up over the channels, to find the worst run."""
+    return sum(one.rmse / (one.noise or 1.0) for one in _channels(fit, noise))
+
+
+def _with_status(identification: Identification, status: str) -> list[str]:
+    return [name for name, one in identification.parameters.items() if one.status == status]
+
+
+def _sentence(text: str) -> str:
+    text = text.strip()
+    return text if not text or text[-1] in ".!?" else f"{text}."

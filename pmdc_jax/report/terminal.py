@@ -1,0 +1,117 @@
+"""Results and progress in the terminal, with rich."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console, Group, RenderableType
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from ..identify.identification import Identification
+from .notation import percent, significant, write_estimate
+from .summary import runs_in_order, status_word, summary
+
+STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
+SEVERITY_STYLES = {"error": "red", "warning": "yellow"}
+PIPE_WIDTH = 100  # rich would fold tables at 80 columns where there is no terminal
+
+
+class ReportProgress(Protocol):
+    """What long work calls now and then: what it does, how good it is, how far it got (0 to 1)."""
+
+    def __call__(
+        self, doing: str, fitness: float | None = None, fraction: float | None = None
+    ) -> None: ...
+
+
+def print_identification(identification: Identification) -> None:
+    """Summary, parameters and fits on standard output."""
+    _console(stderr=False).print(identification_tables(identification))
+
+
+def print_findings(identification: Identification) -> None:
+    """What the data checks found, and remarks of the identification, on standard error."""
+    console = _console(stderr=True)
+    for finding in identification.findings:
+        line = Text(f"{finding.severity}: ", SEVERITY_STYLES.get(finding.severity, ""))
+        place = ", ".join(str(part) for part in (finding.run, finding.column) if part)
+        where = f", {finding.where}" if finding.where else ""
+        line.append(f"{place}: {finding.what}{where}. {finding.mend or ''}", "default")
+        console.print(line, soft_wrap=True)
+    for message in identification.messages:
+        console.print(Text(f"note: {message}"), soft_wrap=True)
+
+
+def identification_tables(identification: Identification) -> RenderableType:
+    """Summary, parameter table and fit table, one under the other."""
+    sentences = [Text(sentence) for sentence in summary(identification)]
+    return Group(_parameter_table(identification), "", _fit_table(identification), "", *sentences)
+
+
+@contextmanager
+def progress() -> Iterator[ReportProgress | None]:
+    """A live line on standard error saying what goes on; None where that is no terminal."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield None
+        return
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as display:
+        task = display.add_task("starting", total=None)
+
+        def report(doing: str, fitness: float | None = None, fraction: float | None = None) -> None:
+            so_far = "" if fitness is None else f", best fitness {significant(fitness, 4)}"
+            done, total = (None, None) if fraction is None else (fraction, 1.0)
+            display.update(task, description=doing + so_far, completed=done, total=total)
+
+        yield report
+
+
+def _parameter_table(identification: Identification) -> Table:
+    table = _table("Parameters")
+    for header in ("Parameter", "Value", "Unit", "Std. error", "95 % interval", "Status"):
+        left = header in ("Parameter", "Unit", "Status")
+        table.add_column(header, justify="left" if left else "right", no_wrap=True)
+    for name, estimate in identification.parameters.items():
+        written = write_estimate(estimate)
+        status = Text(status_word(estimate.status), STATUS_STYLES.get(estimate.status, ""))
+        row = (written.value, written.unit, written.stderr, written.interval)
+        table.add_row(Text(name), *row, status)
+    return table
+
+
+def _fit_table(identification: Identification) -> Table:
+    table = _table("Free-run simulation")
+    table.add_column("Run", overflow="fold")
+    table.add_column("Role", no_wrap=True)
+    for header in ("Speed RMSE\n[rad/s]", "Speed fit", "Current RMSE\n[A]", "Current fit"):
+        table.add_column(Text(header), justify="right", no_wrap=True)
+    for name, fit in runs_in_order(identification):
+        table.add_row(
+            Text(name),
+            "hold-out" if fit.role == "holdout" else "training",
+            significant(fit.speed_rmse),
+            percent(fit.speed_fit_percent),
+            significant(fit.current_rmse),
+            percent(fit.current_fit_percent),
+        )
+    return table
+
+
+def _table(title: str) -> Table:
+    return Table(
+        title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0)
+    )
+
+
+def _console(stderr: bool) -> Console:
+    console = Console(stderr=stderr, highlight=False)
+    return (
+        console
+        if console.is_terminal
+        else Console(stderr=stderr, highlight=False, width=PIPE_WIDTH)
+    )

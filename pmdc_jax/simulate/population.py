@@ -1,0 +1,59 @@
+"""How well each of many candidate motors reproduces the runs: the hot loop of the genetic search."""
+
+from __future__ import annotations
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..motor import Motor
+from .solver import HeldInput, Walk, along_grids, held_step, pick_grid, walk
+from .tape import Tape
+
+# Samples whose arithmetic XLA fuses into one kernel, measured: small populations gain from fewer kernels,
+# large ones lose by recomputation.
+UNROLL = {True: 8, False: 4}
+SMALL = 64
+
+
+@eqx.filter_jit
+def squared_errors(
+    motors: Motor, tape: Tape
+) -> tuple[Float[Array, " population"], Float[Array, " population"]]:
+    """Sums of squared errors of current (A^2) and speed (rad^2/s^2) for a population, in free run.
+
+    Blocks are walked one after another with the whole population in the state.
+
+    **Arguments**: `motors`, whose fields have the shape (population,). Every run starts at the tape's initial
+    state; unknown loads are taken as zero. A motor whose simulation fails gets infinity, never NaN.
+    """
+    grids = along_grids(motors, tape)
+    unroll = UNROLL[motors.R.shape[0] <= SMALL]
+
+    def advance(carry, block):
+        along, drive = pick_grid(grids, tape, tape.grid[block])
+
+        def sample(carry, samples):
+            state, errors = carry
+            value, load, measured, weight = samples
+            seen = motors.sensors(state.current, state.speed)
+            errors = tuple(
+                e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
+            )
+            return (held_step(motors, along, drive, state, value, load), errors), None
+
+        initial = motors.rest(*tape.initial[tape.run[block]])
+        begins = tape.begins[block]
+        state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
+        samples = (tape.value[block], tape.load[block], tape.measured[block].T, tape.weight[block].T)
+        (state, errors), _ = jax.lax.scan(sample, (state, carry.seen), samples, unroll=unroll)
+        return Walk(state, errors)
+
+    zero = jnp.zeros_like(motors.R)
+    start = Walk(motors.rest(zero, zero), (zero, zero))
+    saveat = diffrax.SaveAt(t1=True)
+    errors = walk(HeldInput(advance), start, tape.value.shape[0], saveat).seen
+    current, speed = (jnp.where(jnp.isfinite(e[0]), e[0], jnp.inf) for e in errors)
+    return current, speed

@@ -1,0 +1,129 @@
+"""Several runs laid end to end in blocks of samples: one array shape, one solve, whatever the runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..motor import Drive
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..recording import Recording
+
+# Samples in a block. Blocks are walked one after another for a population, side by side for one motor: long
+# enough that a block forgets most of how it began, short enough that filling up the last one costs little.
+BLOCK = 128
+
+
+class Tape(eqx.Module):
+    """Runs laid end to end; a run begins with a new block, and its last block is filled up with weight 0.
+
+    A sample time and a drive (voltage, current or torque) make a *grid*; blocks of one grid share the exact
+    step. The drive and the load of sample k hold until sample k + 1.
+    """
+
+    value: Float[Array, "blocks samples"]  # what drives: V, A or N m
+    load: Float[Array, "blocks samples"]  # N m, zero where unknown
+    measured: Float[Array, "blocks 2 samples"]  # current A, speed rad/s; zero where missing
+    weight: Float[Array, "blocks 2 samples"]  # 1 where measured, else 0
+    run: Int[Array, " blocks"]
+    begins: Bool[Array, " blocks"]
+    grid: Int[Array, " blocks"]
+    sample_time: Float[Array, " grids"]  # s
+    drive: Drive  # each Float[Array, " grids"]
+    initial: Float[Array, "runs 2"]  # first guess of current A and speed rad/s at the first sample
+    load_unknown: Bool[Array, " runs"]
+
+    @classmethod
+    def from_recordings(cls, recordings: Sequence[Recording], unloaded: bool = False) -> Tape:
+        """Lay recordings end to end.
+
+        **Arguments**: `recordings`, each with a uniform sample time (see `pmdc_jax.simulate.uniform`);
+        `unloaded` declares the load of runs without a load column to be zero instead of unknown.
+        """
+        runs = [_Run(recording) for recording in recordings]
+        grids = list(dict.fromkeys(run.grid for run in runs))
+        # few distinct lengths, so that few shapes are ever compiled
+        blocks = _round_up(sum(run.blocks for run in runs))
+        tape = {
+            "value": np.zeros((blocks, BLOCK)),
+            "load": np.zeros((blocks, BLOCK)),
+            "measured": np.zeros((blocks, 2, BLOCK)),
+            "weight": np.zeros((blocks, 2, BLOCK)),
+            "run": np.full(blocks, len(runs) - 1),
+            "begins": np.zeros(blocks, bool),
+            "grid": np.full(blocks, grids.index(runs[-1].grid)),
+        }
+        first = 0
+        for index, run in enumerate(runs):
+            part = slice(first, first + run.blocks)
+            tape["value"][part] = run.fill(run.value, hold=True)
+            tape["load"][part] = run.fill(run.load, hold=True)
+            for channel, samples in enumerate((run.current, run.speed)):
+                missing = np.isnan(samples)
+                tape["measured"][part, channel] = run.fill(np.where(missing, 0.0, samples))
+                tape["weight"][part, channel] = run.fill(np.where(missing, 0.0, 1.0))
+            tape["run"][part], tape["grid"][part] = index, grids.index(run.grid)
+            tape["begins"][first] = True
+            first += run.blocks
+        kinds = np.array([drive for _, drive in grids])
+        return cls(
+            **tape,
+            sample_time=np.array([sample_time for sample_time, _ in grids]),
+            drive=Drive(*(np.where(kinds == kind, 1.0, 0.0) for kind in Drive._fields)),
+            initial=np.array([run.initial for run in runs]),
+            load_unknown=np.array([r.load is None and not unloaded for r in recordings]),
+        )
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return self.initial.shape[0]
+
+    def samples_of(self, run: int, signal: Float[Array, "blocks samples"], length: int) -> np.ndarray:
+        """The `length` samples of one run, cut out of a signal laid out like the tape."""
+        return np.asarray(signal)[np.asarray(self.run) == run].reshape(-1)[:length]
+
+
+class _Run:
+    """One recording as the tape needs it: what drives it, what was measured, how it starts."""
+
+    def __init__(self, recording: Recording):
+        self.length = len(recording.time)
+        self.blocks = -(-self.length // BLOCK)
+        missing = np.full(self.length, np.nan)
+        self.load = np.zeros(self.length) if recording.load is None else recording.load
+        self.current, self.speed = missing, missing
+        if recording.speed is not None:
+            self.speed = recording.speed
+        if recording.torque is not None:
+            drive, self.value = "torque", recording.torque
+        elif recording.voltage is not None:
+            drive, self.value = "voltage", recording.voltage
+            if recording.current is not None:
+                self.current = recording.current
+        else:
+            # the measured current flows on between its samples: its mean over each interval drives
+            drive, i = "current", recording.current
+            assert i is not None, "Recording guarantees something that drives"
+            self.value = np.append((i[:-1] + i[1:]) / 2, i[-1])
+        self.grid = (float(recording.sample_time), drive)
+        self.initial = (_first(self.current), _first(self.speed))
+
+    def fill(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
+        spare = self.blocks * BLOCK - self.length
+        return np.pad(samples, (0, spare), mode="edge" if hold else "constant").reshape(-1, BLOCK)
+
+
+def _first(samples: np.ndarray) -> float:
+    known = samples[~np.isnan(samples)]
+    return float(known[0]) if len(known) else 0.0
+
+
+def _round_up(blocks: int) -> int:
+    step = max(4, 2 ** (blocks.bit_length() - 4))
+    return -(-blocks // step) * step

@@ -1,0 +1,70 @@
+"""A recording as the solver needs it: one sample time, and speed even where only the angle was measured."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+
+from ..recording import Recording
+
+# Largest distance of a time stamp from a uniform grid, in steps, that is taken for rounding of the stamps.
+ROUNDING = 0.02
+# An interval longer than this many steps is a gap: outputs inside it count as missing.
+GAP = 3.0
+
+
+def uniform(recording: Recording) -> Recording:
+    """The recording on a uniform grid of time, with speed in place of angle.
+
+    Evenly sampled recordings keep their samples. Otherwise whatever drives and the load, which hold between
+    samples, are averaged over each interval of the grid, so that no volt-second is lost, and the outputs are
+    interpolated linearly; inside gaps they are missing (NaN).
+    """
+    if recording.speed is None and recording.angle is not None:
+        recording = attrs.evolve(recording, speed=_speed_of(recording.angle, recording.time))
+    time = recording.time
+    steps = np.arange(len(time))
+    step = (time[-1] - time[0]) / (len(time) - 1)
+    if np.max(np.abs(time - (time[0] + steps * step))) <= ROUNDING * step:
+        return attrs.evolve(recording, time=time[0] + steps * step)
+    step = float(np.median(np.diff(time)))
+    grid = time[0] + step * np.arange(int((time[-1] - time[0]) / step + 1e-9) + 1)
+    held = {"voltage": recording.voltage, "load": recording.load, "torque": recording.torque}
+    seen = {"current": recording.current, "speed": recording.speed}
+    return attrs.evolve(
+        recording,
+        time=grid,
+        angle=None,
+        temperature=None,
+        **{k: _average(time, x, grid) for k, x in held.items() if x is not None},
+        **{k: _interpolate(time, x, grid) for k, x in seen.items() if x is not None},
+    )
+
+
+def _average(time: np.ndarray, held: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    integral = np.concatenate([[0.0], np.cumsum(held[:-1] * np.diff(time))])
+    ends = np.append(grid, 2 * grid[-1] - grid[-2])
+    total = np.interp(ends, time, integral) + held[-1] * np.maximum(ends - time[-1], 0.0)
+    return np.diff(total) / np.diff(ends)
+
+
+def _interpolate(time: np.ndarray, samples: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    known = ~np.isnan(samples)
+    values = np.interp(grid, time[known], samples[known])
+    # the known samples on either side of each grid point must not be too far apart
+    right = np.clip(np.searchsorted(time[known], grid), 1, known.sum() - 1)
+    apart = time[known][right] - time[known][right - 1]
+    values[apart > GAP * (grid[1] - grid[0])] = np.nan
+    return values
+
+
+def _speed_of(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Central difference: the mean speed over two steps, whose noise is that of the angle."""
+    known = ~np.isnan(angle)
+    unwrapped = np.full_like(angle, np.nan)
+    jumps = np.abs(np.diff(angle[known]))
+    # a wrapped angle jumps by most of a turn between samples; a travel in metres or turns never does
+    wraps = len(jumps) > 0 and np.nanmax(angle) - np.nanmin(angle) <= 2 * np.pi * 1.01 and np.max(jumps) > np.pi
+    unwrapped[known] = np.unwrap(angle[known]) if wraps else angle[known]
+    speed = np.gradient(unwrapped, time)
+    return np.asarray(speed)

@@ -1,0 +1,308 @@
+"""Named columns of numbers in CSV, Parquet and MAT files, before anyone asks what they mean."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from .errors import InputError
+
+if TYPE_CHECKING:
+    import polars as pl
+
+MISSING = ["NA", "N/A", "n/a", "null", "NULL", "None"]
+NUMBERS_ONLY = "Recordings hold plain numbers; leave a cell empty where a sample is missing"
+
+
+class Table(Protocol):
+    """A file with named columns."""
+
+    headers: tuple[str, ...]
+
+    def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
+        """These columns as float64 of shape (rows,); NaN where a cell is empty."""
+        ...
+
+    def place(self, row: int) -> str:
+        """Where an editor shows this row (counted from 0), such as "line 17"."""
+        ...
+
+
+def open_table(path: Path) -> Table:
+    """Open a CSV, Parquet or MAT file by its suffix.
+
+    **Raises**: `InputError` if it cannot be read as such.
+    """
+    kinds = {".csv": CsvTable, ".tsv": CsvTable, ".txt": CsvTable}
+    kinds |= {".parquet": ParquetTable, ".pq": ParquetTable, ".mat": MatTable}
+    if path.is_dir():
+        raise InputError(str(path), "this is a folder", "Name the files in it, one run each")
+    if not path.exists():
+        raise InputError(str(path), "no such file", "Check the spelling and the folder")
+    if path.suffix.lower() not in kinds:
+        what = f"unknown kind of file '{path.suffix}'"
+        raise InputError(str(path), what, f"Export it as one of {', '.join(kinds)}")
+    try:
+        with path.open("rb") as file:
+            empty = not file.read(1)
+        if empty:
+            raise InputError(str(path), "the file is empty", "Export the recording again")
+        return kinds[path.suffix.lower()](path)
+    except PermissionError:
+        raise InputError(
+            str(path), "no permission to read it", "Ask its owner, or copy it to your folder"
+        ) from None
+    except OSError as error:
+        what = f"it cannot be read ({error.strerror or error})"
+        raise InputError(str(path), what, "Copy it to a local disk and try again") from None
+
+
+class CsvTable:
+    """Text with a header line; separated by comma, semicolon or tab.
+
+    Lines that begin with # and empty lines are skipped. Numbers may have a decimal comma unless the
+    comma separates.
+    """
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._raw = _text(path)
+        header, self._header_line, self._start = _find_header(self._raw, path)
+        self._separator = next((s for s in "\t;" if s in header), ",")
+        self.headers = tuple(name.strip() for name in _fields(header, self._separator))
+        _refuse_duplicates(self.headers, path)
+        self._kept: np.ndarray | None = None
+
+    def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
+        """See `Table`."""
+        wanted = [str(self.headers.index(header)) for header in headers]
+        frame = self._frame(wanted)
+        if frame[str(len(self.headers) - 1)].null_count():
+            self._refuse_ragged()  # polars fills short lines without a word
+        if frame.height and all(frame[i].null_count() for i in wanted):
+            self._kept = np.array([bool(line.strip()) for _, line in self._lines()])
+            frame = frame.filter(self._kept)
+        columns = (frame[i].to_numpy().astype(float) for i in wanted)
+        return dict(zip(headers, columns, strict=True))
+
+    def place(self, row: int) -> str:
+        """See `Table`."""
+        if self._kept is not None:
+            row = int(np.flatnonzero(self._kept)[row])
+        numbers = (number for number, _ in self._lines())
+        return f"line {next(n for i, n in enumerate(numbers) if i == row)}"
+
+    @cached_property
+    def _body(self) -> bytes:
+        return self._raw[self._start :].rstrip(b"\r\n")
+
+    def _frame(self, wanted: Sequence[str]) -> pl.DataFrame:
+        """Wanted columns as numbers and the last one of any kind, empty cells null."""
+        import polars as pl
+
+        last = str(len(self.headers) - 1)
+        if not self._body:
+            return pl.DataFrame(schema=dict.fromkeys({*wanted, last}, pl.Float64))
+        try:
+            return self._parse(dict.fromkeys(wanted, pl.Float64), last)
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
+            self._refuse_ragged()
+        try:  # padded numbers and other texts, more slowly
+            text = self._parse({}, last)
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+            what = f"it cannot be read as a table ({str(error).splitlines()[0]})"
+            raise InputError(str(self._path), what, "Export it as plain CSV") from None
+        return text.with_columns(self._numbers(text[i], self.headers[int(i)]) for i in wanted)
+
+    def _parse(self, kinds: Mapping[str, Any], last: str) -> pl.DataFrame:
+        import polars as pl
+
+        schema = {str(i): kinds.get(str(i), pl.String) for i in range(len(self.headers))}
+        frame = pl.read_csv(
+            self._body,
+            has_header=False,
+            schema=schema,
+            separator=self._separator,
+            comment_prefix="#",
+            null_values=MISSING,
+            decimal_comma=self._separator != "," and b"," in self._body,
+        )
+        return frame.select(i for i in schema if i in kinds or i == last or not kinds)
+
+    def _numbers(self, text: pl.Series, header: str) -> pl.Series:
+        import polars as pl
+
+        text = text.str.strip_chars().replace("", None)
+        comma = self._separator != ","
+        plain = text.str.replace(",", ".", literal=True) if comma else text
+        numbers = plain.cast(pl.Float64, strict=False)
+        wrong = (numbers.is_null() & text.is_not_null()).arg_true()
+        if len(wrong):
+            row = int(wrong[0])
+            mend = NUMBERS_ONLY
+            if row == 0:
+                mend += ". A second line of units belongs into the header, as in Speed [rpm]"
+            where = f"{self._path}, {self.place(row)}, column {header}"
+            raise InputError(where, f"'{text[row]}' is not a number", mend)
+        return numbers
+
+    def _lines(self) -> Iterator[tuple[int, bytes]]:
+        """Number and text of each line that polars makes a row of."""
+        first = self._raw.count(b"\n", 0, self._start) + 1
+        for number, line in enumerate(self._body.split(b"\n"), first):
+            if not line.startswith(b"#"):
+                yield number, line
+
+    def _refuse_ragged(self) -> None:
+        for number, line in self._lines():
+            fields = len(_fields(line.decode(), self._separator)) if line.strip() else None
+            if fields not in (None, len(self.headers)):
+                raise InputError(
+                    f"{self._path}, line {number}",
+                    f"it has {fields} fields where the header (line {self._header_line}) "
+                    f"has {len(self.headers)}",
+                    "Mend or delete this line",
+                )
+
+
+class ParquetTable:
+    """Columns of a Parquet file."""
+
+    def __init__(self, path: Path):
+        import polars as pl
+
+        self._path = path
+        try:
+            self.headers = tuple(pl.read_parquet_schema(path))
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
+            raise InputError(str(path), "it is no Parquet file", "Export it again") from None
+
+    def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
+        """See `Table`."""
+        import polars as pl
+
+        try:
+            frame = pl.read_parquet(self._path, columns=list(headers))
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
+            raise InputError(str(self._path), "it is damaged", "Export it again") from None
+        for header in headers:
+            kind = frame.schema[header]
+            if not kind.is_numeric() and kind != pl.Null:
+                where = f"{self._path}, column {header}"
+                raise InputError(where, f"it holds {kind}, not numbers", NUMBERS_ONLY)
+        return {h: frame[h].cast(pl.Float64).to_numpy().astype(float) for h in headers}
+
+    def place(self, row: int) -> str:
+        """See `Table`."""
+        return f"row {row + 1}"
+
+
+class MatTable:
+    """Vectors of a MATLAB file, also those inside structures; a header is then the path to it."""
+
+    def __init__(self, path: Path):
+        from scipy.io import loadmat
+        from scipy.io.matlab import MatReadError
+
+        self._path = path
+        try:
+            content = loadmat(path, squeeze_me=True, simplify_cells=True)
+        except NotImplementedError:
+            what, mend = "it is a MATLAB v7.3 (HDF5) file", "Save it in MATLAB with the option -v7"
+            raise InputError(str(path), what, mend) from None
+        except (MatReadError, ValueError, TypeError, EOFError, LookupError):
+            what, mend = "it is no MATLAB file, or damaged", "Save it in MATLAB with the option -v7"
+            raise InputError(str(path), what, mend) from None
+        self._vectors = dict(_vectors(content, ""))
+        self.headers = tuple(self._vectors)
+        if not self.headers:
+            mend = "Save time, voltage, current and speed as vectors, for example named time_s"
+            raise InputError(str(path), "it holds no vectors of numbers", mend)
+
+    def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
+        """See `Table`."""
+        chosen = {header: self._vectors[header].astype(float) for header in headers}
+        shortest = min(chosen, key=lambda header: len(chosen[header]))
+        longest = max(chosen, key=lambda header: len(chosen[header]))
+        if len(chosen[shortest]) != len(chosen[longest]):
+            what = f"{len(chosen[shortest])} and {len(chosen[longest])} samples"
+            where = f"{self._path}, variables {shortest} and {longest}"
+            raise InputError(where, what, "Save vectors of equal length")
+        return chosen
+
+    def place(self, row: int) -> str:
+        """See `Table`."""
+        return f"sample {row + 1}"
+
+
+def _vectors(content: Mapping[str, Any], path: str) -> Iterator[tuple[str, np.ndarray]]:
+    for name, value in content.items():
+        if isinstance(value, dict):
+            yield from _vectors(value, f"{path}{name}.")
+        elif isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "fiub":
+            yield f"{path}{name}", value
+
+
+def _text(path: Path) -> bytes:
+    """The bytes of a UTF-8 text, without byte order mark and with \\n somewhere."""
+    raw = path.read_bytes()
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError(str(path), "it is UTF-16 text", "Save it as UTF-8")
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    if b"\0" in raw:
+        what = f"this is no text (byte {raw.index(0)} is zero)"
+        raise InputError(str(path), what, "Export the recording as CSV")
+    if not raw.isascii():
+        try:
+            raw.decode()
+        except UnicodeDecodeError as error:
+            line = raw.count(b"\n", 0, error.start) + 1
+            byte = f"byte {error.start + 1} (0x{raw[error.start]:02x})"
+            where, mend = f"{path}, line {line}", "Save it as UTF-8"
+            raise InputError(where, f"{byte} is not UTF-8 text", mend) from None
+    return raw if b"\n" in raw else raw.replace(b"\r", b"\n")
+
+
+def _find_header(raw: bytes, path: Path) -> tuple[str, int, int]:
+    """The header, its line number, and the byte where the rows begin."""
+    start, number, comment = 0, 1, ""
+    while start < len(raw):
+        end = raw.find(b"\n", start)
+        end = len(raw) if end < 0 else end
+        line = raw[start:end].decode().strip("\r\n")
+        if line.strip() and not line.startswith(("#", "sep=")):
+            if not _is_numbers(line):
+                return line, number, end + 1
+            if comment.count(",") == line.count(",") and "," in line:
+                return comment, number - 1, start  # as numpy.savetxt writes it
+            what = "the first line holds numbers where the header should be"
+            raise InputError(f"{path}, line {number}", what, "Begin with time_s,voltage_V,...")
+        comment = line.removeprefix("#")
+        start, number = end + 1, number + 1
+    raise InputError(str(path), "it holds no header and no rows", "Export the recording again")
+
+
+def _is_numbers(line: str) -> bool:
+    fields = line.replace(",", " ").replace(";", " ").split()
+    try:
+        [float(field) for field in fields]
+    except ValueError:
+        return False
+    return True
+
+
+def _fields(line: str, separator: str) -> list[str]:
+    return next(csv.reader([line.rstrip("\r\n")], delimiter=separator), [])
+
+
+def _refuse_duplicates(headers: Sequence[str], path: Path) -> None:
+    for header, count in Counter(headers).items():
+        if count > 1 and header:
+            what = f"the header names '{header}' {count} times"
+            raise InputError(f"{path}, column {header}", what, "Give every column its own name")

@@ -1,0 +1,114 @@
+"""Units in the spellings that logs use, turned into SI by pint."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from functools import cache
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pint
+
+# An angle is a dimension here, unlike in pint's own registry: it keeps 1/s, Hz and rad/s apart.
+# "Nm" would be a nano-something there, and its whole registry takes a second to build.
+UNITS = """
+nano- = 1e-9 = n-
+micro- = 1e-6 = µ- = μ- = u-
+milli- = 1e-3 = m-
+kilo- = 1e3 = k-
+mega- = 1e6 = M-
+second = [time] = s = sec
+minute = 60 * second = min
+hour = 3600 * second = h
+meter = [length] = m = metre
+centimeter = 0.01 * meter = cm
+kilogram = [mass] = kg
+ampere = [current] = A = amp
+kelvin = [temperature]; offset: 0 = K
+degree_Celsius = kelvin; offset: 273.15 = degC = degreeC = celsius = C
+degree_Fahrenheit = 5 / 9 * kelvin; offset: 233.15 + 200 / 9 = degF = degreeF = fahrenheit
+newton = kilogram * meter / second ** 2 = N
+newton_meter = newton * meter = Nm
+newton_centimeter = 0.01 * newton_meter = Ncm
+volt = newton * meter / ampere / second = V
+radian = [angle] = rad
+degree = 0.017453292519943295 * radian = deg
+turn = 6.283185307179586 * radian = rev = revolution
+rpm = turn / minute
+rps = turn / second
+"""
+# how speed in turns per minute is written where "turn" goes without saying
+RPM = {"1/min", "min^-1", "min-1", "min⁻¹", "/min", "u/min", "upm", "r/min"}
+
+
+class UnitError(ValueError):
+    """The unit of `quantity` is unknown or measures something else; the message says which."""
+
+    def __init__(self, quantity: str, why: str):
+        self.quantity = quantity
+        super().__init__(why)
+
+
+def conversion(unit: str, quantity: str, bases: Sequence[str]) -> tuple[str, float, float]:
+    """How numbers in `unit` become SI.
+
+    **Arguments**: `unit` as found in a header; `quantity`, for the message; `bases`, the SI units
+    it may become, in order of preference.
+
+    **Returns**: the SI unit, scale and offset: SI = scale * number + offset.
+
+    **Raises**: `UnitError`.
+    """
+    unknown = True
+    for spelling in _spellings(unit):
+        for base in bases:
+            try:
+                return base, *_convert(spelling, base)
+            except ArithmeticError:
+                unknown = False
+            except LookupError:
+                pass
+    units = " or ".join(bases)
+    if unknown:
+        raise UnitError(quantity, f"unknown unit '{unit}' for {quantity} ({units})")
+    raise UnitError(quantity, f"'{unit}' does not measure {quantity} ({units})")
+
+
+def _spellings(unit: str) -> Iterator[str]:
+    """The unit as written, then as it may be meant: rad_s for rad/s, N_m for N m, RPM for rpm."""
+    unit = unit.strip()
+    if unit.casefold() in RPM:
+        yield "rpm"
+    for text in dict.fromkeys((unit, unit.lower())):
+        yield text
+        if re.search(r"[_.\-]", text):
+            yield re.sub(r"[_.\-]", " ", text)
+            yield text.replace("_", "/", 1)
+
+
+@cache
+def _convert(unit: str, base: str) -> tuple[float, float]:
+    """Scale and offset; `LookupError` if the unit is unknown, `ArithmeticError` if incompatible."""
+    if unit in (base, base.replace(" ", "")):
+        return 1.0, 0.0
+    import pint
+
+    try:
+        parsed = _registry().Unit(unit)
+    except Exception:  # pint raises a dozen kinds, down to those of the tokenizer
+        raise LookupError(unit) from None
+    try:
+        zero, one = (_registry().Quantity(x, parsed).to(base).magnitude for x in (0.0, 1.0))
+    except pint.DimensionalityError:
+        raise ArithmeticError(unit) from None
+    return one - zero, zero
+
+
+@cache
+def _registry() -> pint.UnitRegistry:
+    import pint
+
+    registry = pint.UnitRegistry(None)  # pyright: ignore[reportArgumentType]
+    registry.load_definitions(UNITS.strip().splitlines())
+    return registry

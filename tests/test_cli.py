@@ -1,0 +1,253 @@
+"""The command line: exit status, messages, and where the output goes; the long work is faked."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from test_report import fake_identification, partial_identification
+
+from pmdc_jax import cli
+from pmdc_jax.errors import InputError
+
+HEAVY = ("jax", "numpy", "plotly", "polars", "scipy", "equinox", "diffrax")
+
+
+def replace_function(monkeypatch, module: str, name: str, function) -> None:
+    """Replace a function of a module, also where the package holds a function of the same name."""
+    monkeypatch.setattr(importlib.import_module(module), name, function, raising=False)
+
+
+@pytest.fixture
+def faked(monkeypatch, tmp_path):
+    """Reading, identifying and saving replaced; what they were called with is kept."""
+    calls = SimpleNamespace(identify=None, read=[], saved=[], result=fake_identification(400))
+
+    def identify(recordings, **options):
+        calls.identify = (recordings, options)
+        if isinstance(calls.result, BaseException):
+            raise calls.result
+        return calls.result
+
+    def read_recording(path, columns=None):
+        calls.read.append((str(path), columns))
+        return Path(path).stem
+
+    def save_motor(path, motor, identification):
+        calls.saved.append(path)
+        Path(path).write_text("{}")
+
+    replace_function(monkeypatch, "pmdc_jax.identify", "identify", identify)
+    replace_function(monkeypatch, "pmdc_jax.recording", "read_recording", read_recording)
+    replace_function(monkeypatch, "pmdc_jax.motor", "save_motor", save_motor)
+    for variable in ("FORCE_COLOR", "TTY_COMPATIBLE"):  # rich takes these for a terminal
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.chdir(tmp_path)
+    return calls
+
+
+def refused(capsys, *arguments: str) -> str:
+    """The one message of a command that must exit with 2 and print nothing else."""
+    assert cli.main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("pmdc: ")
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+    return err
+
+
+@pytest.mark.parametrize("command", [(), ("identify",), ("simulate",), ("demo",)])
+def test_help_shows_an_example(capsys, command):
+    assert cli.main([*command, "--help"]) == 0
+    out, err = capsys.readouterr()
+    assert "pmdc" in out.split("\n")[0]
+    assert ("Example: pmdc" if command else "Start with: pmdc") in out
+    assert err == ""
+
+
+def test_help_is_quick():
+    code = "import sys; from pmdc_jax.cli import main; sys.exit(main(['--help']))"
+
+    def once() -> float:
+        start = time.perf_counter()
+        shown = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+        assert b"identify" in shown.stdout
+        return time.perf_counter() - start
+
+    assert min(once() for _ in range(3)) < 0.4
+
+
+def test_importing_the_command_line_imports_nothing_heavy():
+    code = "import sys, pmdc_jax.cli; print(*sys.modules)"
+    shown = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert not set(HEAVY) & set(shown.stdout.split())
+
+
+def test_identify_passes_every_option_on(faked, capsys):
+    arguments = (
+        "identify a.csv b.csv --holdout c.csv --seed 7 --column speed=rpm_meas:rpm --tie Kt=Kb"
+        " --known R=0.157 --unloaded --effect coulomb_friction --search genetic"
+    )
+    assert cli.main(arguments.split()) == 0
+    recordings, options = faked.identify
+    assert recordings == ["a", "b"]
+    assert options == {
+        "holdout": ["c"],
+        "tie": (("Kt", "Kb"),),
+        "known": {"R": 0.157},
+        "unloaded": True,
+        "effects": ("coulomb_friction",),
+        "search": "genetic",
+        "seed": 7,
+        "progress": None,
+    }
+    assert faked.read[0] == ("a.csv", {"speed": "rpm_meas:rpm"})
+
+
+def test_identify_prints_parameters_and_runs(faked, capsys):
+    faked.result = partial_identification()
+    assert cli.main(["identify", "a.csv"]) == 0
+    out, err = capsys.readouterr()
+    for word in (
+        *faked.result.parameters,
+        *faked.result.fit,
+        "at bound",
+        "not identifiable",
+        "157.20",
+    ):
+        assert word in out
+    assert "NaN" not in out
+    assert "saturated at 60 A" in err
+    assert "Runs without voltage" in err
+
+
+def test_json_on_standard_output_stands_alone(faked, capsys):
+    faked.result = partial_identification()
+    assert cli.main(["identify", "a.csv", "--json", "-"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["parameters"]["L"]["status"] == "at_bound"
+    assert "saturated" in err
+
+
+def test_outputs_are_written(faked, capsys, tmp_path):
+    arguments = "identify a.csv --save motor.json --json fit.json --report fit.html"
+    assert cli.main(arguments.split()) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "fit.html",
+        "fit.json",
+        "motor.json",
+    ]
+    assert json.loads((tmp_path / "fit.json").read_text())["converged"] is True
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [
+        ("", ["Missing command", "pmdc --help"]),
+        ("fly", ["fly"]),
+        ("identify", ["RUN", "pmdc identify --help"]),
+        ("identify a.csv --bogus", ["--bogus"]),
+        ("identify a.csv --seed one", ["--seed"]),
+        ("identify a.csv --seed -1", ["--seed"]),
+        ("identify a.csv --tie Kt", ["--tie Kt", "Kt=Kb"]),
+        ("identify a.csv --column speed", ["--column speed", "speed=rpm_meas:rpm"]),
+        ("identify a.csv --known R=much", ["--known R=much", "not a number", "SI"]),
+        ("identify a.csv --known R=nan", ["--known R=nan", "not a number"]),
+        ("identify a.csv --report nowhere/x.html", ["--report", "nowhere", "does not exist"]),
+        ("identify a.csv --save .", ["--save", "folder"]),
+        ("identify a.csv --report -", ["--report", "--json"]),
+        ("identify a.csv --json a.csv", ["--json", "a.csv", "an input"]),
+        ("identify a.csv --json x --report x", ["--report", "where --json is written"]),
+        ("simulate motor.json --input a.csv", ["--out"]),
+        ("simulate motor.json --input a.csv --out a.csv", ["--out", "an input"]),
+    ],
+)
+def test_bad_arguments_are_refused_before_the_work(faked, capsys, arguments, names):
+    message = refused(capsys, *arguments.split())
+    assert all(name in message for name in names), message
+    assert faked.identify is None
+    assert faked.read == []
+
+
+@pytest.mark.parametrize(
+    ("problem", "text"),
+    [
+        (
+            InputError("a.csv, line 3", "time runs backwards", "Sort the rows"),
+            "a.csv, line 3: time",
+        ),
+        (FileNotFoundError(2, "No such file or directory", "a.csv"), "a.csv: No such file"),
+        (OSError(28, "No space left on device"), "No space left"),
+    ],
+)
+def test_bad_input_is_told_in_one_message(faked, capsys, problem, text):
+    faked.result = problem
+    assert text in refused(capsys, "identify", "a.csv")
+
+
+def test_interrupt(faked, capsys):
+    faked.result = KeyboardInterrupt()
+    assert cli.main(["identify", "a.csv"]) == 130
+    assert capsys.readouterr() == ("", "pmdc: interrupted\n")
+
+
+def test_a_program_error_is_not_hidden(faked):
+    faked.result = ZeroDivisionError("a bug")
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["identify", "a.csv"])
+
+
+def test_simulate_reads_simulates_and_writes(faked, monkeypatch, capsys):
+    written = []
+    replace_function(monkeypatch, "pmdc_jax.motor", "load_motor", lambda path: f"motor {path}")
+    replace_function(monkeypatch, "pmdc_jax.simulate", "simulate", lambda motor, run: (motor, run))
+    replace_function(
+        monkeypatch,
+        "pmdc_jax.recording",
+        "write_recording",
+        lambda run, path: written.append((run, path)),
+    )
+    assert cli.main(["simulate", "motor.json", "--input", "drive.csv", "--out", "out.csv"]) == 0
+    assert written == [(("motor motor.json", "drive"), Path("out.csv"))]
+
+
+def test_demo_writes_into_its_folder(faked, capsys, tmp_path):
+    assert cli.main(["demo", "--out", "deep/tour"]) == 0
+    names = {path.name for path in (tmp_path / "deep" / "tour").iterdir()}
+    assert names == {"report.html", "identification.json", "motor.json"}
+    recordings, options = faked.identify
+    assert recordings == ["staircase", "prbs", "triangle", "loaded"]
+    assert options["holdout"] == ["drive"]
+    assert "report.html" in capsys.readouterr().out
+
+
+def test_demo_refuses_a_file_as_folder(faked, capsys, tmp_path):
+    (tmp_path / "taken").write_text("")
+    assert "taken" in refused(capsys, "demo", "--out", "taken")
+    assert faked.identify is None
+
+
+def test_progress_is_silent_without_a_terminal(faked, capsys):
+    assert cli.main(["identify", "a.csv"]) == 0
+    assert faked.identify[1]["progress"] is None
+    assert capsys.readouterr().err == ""
+
+
+def test_progress_tells_what_it_does_on_a_terminal(monkeypatch, capsys):
+    from pmdc_jax.report.terminal import progress
+
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    with progress() as report:
+        assert report is not None
+        report("searching, generation 12", fitness=1.0234, fraction=0.4)
+        report("refining")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "refining" in err
