@@ -32,20 +32,28 @@ class Timed(NamedTuple):
         return 1e6 * self.seconds / self.row.work
 
 
-def _clocked(run: Callable[[], Any]) -> tuple[float, Any]:
+def _clocked(run: Callable[[], Any], calls: int = 1) -> tuple[float, Any]:
+    """Seconds a call, and the last result."""
     begin = time.perf_counter()
-    result = run()
-    return time.perf_counter() - begin, result
+    for _ in range(calls):
+        result = run()
+    return (time.perf_counter() - begin) / calls, result
+
+
+def _calls_a_turn(run: Callable[[], Any]) -> int:
+    """Calls to fill 30 ms: in a single short call, waking the threads up would be all one sees."""
+    return max(1, int(0.03 / _clocked(run)[0]))
 
 
 def interleaved(rows: Sequence[Row]) -> list[Timed]:
     """Warm every row up, then take turns until each has had its repeats."""
     firsts = [_clocked(row.run) for row in rows]
+    calls = [_calls_a_turn(row.run) for row in rows]
     seconds: list[list[float]] = [[] for _ in rows]
     for turn in range(max(row.repeats for row in rows)):
-        for row, taken in zip(rows, seconds, strict=True):
+        for row, count, taken in zip(rows, calls, seconds, strict=True):
             if turn < row.repeats:
-                taken.append(_clocked(row.run)[0])
+                taken.append(_clocked(row.run, count)[0])
     return [
         Timed(row, median(taken), *first)
         for row, taken, first in zip(rows, seconds, firsts, strict=True)

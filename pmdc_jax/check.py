@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from .plausibility import alignment, angle_against_speed, plain_units, sampling, signs
+from .alignment import alignment, sampling
+from .plausibility import angle_against_speed, plain_units, signs, speed_of
 from .recording import Finding, Recording
 
 GAP = 3.0  # median steps
@@ -139,6 +140,7 @@ def constant_load(run: Recording) -> Iterator[Finding]:
 def excitation(runs: Sequence[Recording]) -> Iterator[Finding]:
     """Runs, or all runs together, in which nothing moves."""
     still = [run for run in runs if not any(_moves(y) for y in _outputs(run).values())]
+    turning = [run for run in runs if _moves(_outputs(run).get("speed"))]
     for run in runs:
         speed = _outputs(run).get("speed")
         if run in still:
@@ -150,23 +152,16 @@ def excitation(runs: Sequence[Recording]) -> Iterator[Finding]:
                 "whole run",
                 "Record steps of the voltage, and the motor as it starts and stops",
             )
-        elif speed is not None and not _moves(speed):
+        elif speed is not None and np.nanstd(speed) <= np.sqrt(2) * _noise(speed):
+            noise = _noise(speed)
+            what = f"it swings less than its noise of {noise:.3g}" if noise else "it never changes"
             yield Finding(
                 run.name,
                 "speed",
-                "note" if any(_moves(_outputs(r).get("speed")) for r in runs) else "warning",
-                "the speed does not change: Kb, Kt, J and f cannot be seen",
+                "note" if turning and run not in turning else "warning",
+                f"{what}: Kb, Kt, J and f can hardly be seen",
                 "whole run",
-                "Record a run in which the motor starts and stops",
-            )
-        elif speed is not None and np.nanstd(speed) < np.sqrt(2) * _noise(speed):
-            yield Finding(
-                run.name,
-                "speed",
-                "warning",
-                f"it swings less than its noise of {_noise(speed):.3g}",
-                "whole run",
-                "Use larger steps of voltage, or a better speed sensor",
+                "Record the motor as it starts and stops, with larger steps of the voltage",
             )
 
 
@@ -194,11 +189,8 @@ def _count(number: int, thing: str) -> str:
 
 
 def _outputs(run: Recording) -> dict[str, np.ndarray]:
-    speed = run.speed
-    if speed is None and run.angle is not None:
-        speed = np.gradient(run.angle, run.time)
     # without a voltage the current is what drives
-    found = {"current": run.current if run.voltage is not None else None, "speed": speed}
+    found = {"current": run.current if run.voltage is not None else None, "speed": speed_of(run)}
     return {quantity: values for quantity, values in found.items() if values is not None}
 
 
@@ -236,6 +228,10 @@ def _flat_top(values: np.ndarray, extreme: float) -> tuple[int, int, float]:
         return 0, 0, np.inf
     padded = np.concatenate(([False], values == extreme, [False])).astype(np.int8)
     starts, ends = (np.flatnonzero(np.diff(padded) == sign) for sign in (1, -1))
+    later = starts > 0  # a filter or a delay may hold the first value
+    if not later.any():
+        return 0, 0, np.inf
+    starts, ends = starts[later], ends[later]
     longest = int(np.argmax(ends - starts))
     inner = values[(values != extreme) & np.isfinite(values)]
     repeats = (np.count_nonzero(np.diff(inner) == 0) + 1) / len(inner)

@@ -110,7 +110,7 @@ def identify(
     known: Known = [],
     unloaded: Unloaded = False,
     effect: Effects = [],
-    search: Search = "differential_evolution",
+    search: Search = "cma_es",
 ) -> None:
     """Find the parameters of a motor from recordings.
 
@@ -151,7 +151,7 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
 
     check_outputs({"--out": out}, [motor, input])
     columns = dict(_pairs("--column", column))
-    from .motor import load_motor
+    from .motor_file import load_motor
     from .recording import read_recording, write_recording
     from .simulate import simulate
 
@@ -183,7 +183,7 @@ def _deliver(
 
     print_findings(identification)
     if save:
-        from .motor import save_motor
+        from .motor_file import save_motor
 
         save_motor(save, identification.motor, identification)
     if report:

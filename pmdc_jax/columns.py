@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from .errors import InputError
 from .units import UnitError, conversion
@@ -171,7 +171,8 @@ def understand(header: str) -> Column | None:
         if explicit and named and len(meant) == 1:
             return _column(header, named[0], unit)  # raises: the unit is wrong
     stem, dot, leaf = header.rpartition(".")
-    return understand(leaf) if dot and stem and leaf != header else None
+    column = understand(leaf) if dot and stem else None  # a path into a MATLAB structure
+    return column and evolve(column, header=header)
 
 
 def looks_like(header: str) -> str | None:
@@ -184,7 +185,7 @@ def looks_like(header: str) -> str | None:
 
 
 def mixed_axes(found: Mapping[str, Column]) -> tuple[Column, Column] | None:
-    """A column of a rotating shaft (rad, N m) and one of a linear axis (m, N), if there are both."""
+    """A column of a shaft (rad, N m) and one of a linear axis (m, N), if there are both."""
     sorts: dict[bool, Column] = {}
     for quantity in ("speed", "angle", "load", "torque"):
         column = found.get(quantity)

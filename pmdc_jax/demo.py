@@ -28,7 +28,7 @@ def demo(
     """
     folder = _folder(Path(out))
     from .identify import identify
-    from .motor import save_motor
+    from .motor_file import save_motor
     from .recording import read_recording
     from .report.identification import write_report
     from .report.json import identification_json, write_json

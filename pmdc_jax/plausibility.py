@@ -1,4 +1,4 @@
-"""Recordings held against the motor's equations: signs, units and clocks that cannot be right.
+"""Recordings held against the motor's equations: signs and units that cannot be right.
 
 Integrated over a window of the record, the linear motor's equations hold exactly and need no
 derivative of noisy data:
@@ -18,12 +18,11 @@ from .recording import Finding, Recording
 
 MAX_WINDOWS = 4000
 MIN_WINDOWS = 20
+LONGER = (1, 4, 16)  # windows this many times as long are tried too: rates of noisy channels
 CLEAR = 3.0  # a term is seen when it moves the fit by this many residuals
 RPM, DEGREES = 30 / np.pi, 180 / np.pi  # numbers per rad/s or rad
 TOP_SPEED = 6000.0  # rad/s, 57,000 rpm: no brushed motor turns faster
 KB_RANGE = (5e-5, 200.0)  # V s/rad, a factor of 20 beyond what is built
-REACH = 20  # samples, the largest shift between channels that is tried
-BEFORE, AFTER = 40, 100  # samples about a voltage edge
 
 
 class Term(NamedTuple):
@@ -51,24 +50,34 @@ def signs(run: Recording) -> Iterator[Finding]:
 def _reversed(run: Recording) -> Iterator[tuple[str, str]]:
     w = _windows(run)
     if run.drive == "voltage" and {"current", "speed"} <= set(w):
-        fit, _ = regress(w["voltage"], {k: w[k] for k in ("current", "speed", "current_rate")})
-        R, Kb = fit["current"], fit["speed"]
+        R, Kb = _electrical(w)
         if R.negative and Kb.negative:
             yield "voltage", "its sign is opposite to that of current and speed"
         elif Kb.negative and R.value > 0:
             yield "speed", "its sign is opposite to that of the voltage"
         elif R.negative and Kb.value > 0:
             yield "current", "its sign is opposite to that of the voltage"
-    elif "speed" in w:
-        # both outputs and drive known: inertia and back-EMF or friction have the same sign
-        regressors = {k: w[k] for k in ("speed", "speed_rate", "direction", "load") if k in w}
-        fit, explained = regress(w[run.drive], regressors)
-        inertia, drag = fit["speed_rate"], fit["speed"]
-        against = inertia.negative and drag.value < 0
-        if run.drive != "voltage":
-            against = inertia.negative
-        if against and explained > 0.7:
-            yield "speed", f"it falls where the {run.drive} should make it rise"
+    elif any(_falls_when_driven(run, longer) for longer in LONGER):
+        yield "speed", f"it falls where the {run.drive} should make it rise"
+
+
+def _falls_when_driven(run: Recording, longer: int) -> bool:
+    """Whether inertia comes out negative from what drives and how the speed changes."""
+    w = _windows(run, longer)
+    if not {run.drive, "speed"} <= set(w):
+        return False
+    regressors = {k: w[k] for k in ("speed", "speed_rate", "direction", "load") if k in w}
+    fit, explained = regress(w[run.drive], regressors)
+    # a voltage is balanced by the back-EMF too, which has the same sign
+    drag = run.drive != "voltage" or fit["speed"].value < 0
+    return explained > 0.7 and fit["speed_rate"].negative and drag
+
+
+def _electrical(w: Mapping[str, np.ndarray]) -> tuple[Term, Term]:
+    """R and Kb. No intercept: at a constant voltage a varying load shows them."""
+    balance = {k: w[k] for k in ("current", "speed", "current_rate")}
+    fit, _ = regress(w["voltage"], balance, intercept=False)
+    return fit["current"], fit["speed"]
 
 
 def angle_against_speed(run: Recording) -> Iterator[Finding]:
@@ -101,27 +110,43 @@ def plain_units(runs: Sequence[Recording]) -> Iterator[Finding]:
     """
     for run in runs:
         yield from _too_fast(run)
-    loaded = [w for w in map(_windows, runs) if {"voltage", "current", "speed", "load"} <= set(w)]
-    if not loaded:
-        return
-    w = {k: np.concatenate([one[k] for one in loaded]) for k in loaded[0] if k != "angle_rate"}
-    electrical, _ = regress(w["voltage"], {k: w[k] for k in ("current", "speed", "current_rate")})
-    torques = {k: w[k] for k in ("current", "speed", "speed_rate", "direction")}
-    mechanical, explained = regress(w["load"], torques)
-    Kb, Kt = electrical["speed"], mechanical["current"]
     names = ", ".join(run.name for run in runs if run.load is not None)
-    if explained < 0.8 or not Kb.positive or not (Kt.positive or Kt.negative):
+    constants = max((_constants(runs, longer) for longer in LONGER), key=lambda c: c.explained)
+    Kb, Kt = constants.Kb, constants.Kt
+    if constants.explained < 0.8 or not (constants.R.positive and Kb.positive):
         return
     if Kt.negative:
         what = "the load rises where the current falls: its sign is reversed"
         mend = "A load that opposes positive motion is positive: turn the sign of the column"
         yield Finding(names, "load", "warning", what, "all loaded runs", mend)
+    if not Kt.positive:
+        return
     ratio = Kt.value / Kb.value
     for scale, unit in ((RPM, "rpm"), (DEGREES, "deg/s")):
         if 0.8 < ratio / scale < 1.25:
             what = f"Kt is {ratio:.3g} times Kb, as if the speed were in {unit}, not rad/s"
             mend = f"If it is, write [{unit}] into the header, or --column speed=HEADER:{unit}"
             yield Finding(names, "speed", "warning", what, "all loaded runs", mend)
+
+
+class _Constants(NamedTuple):
+    R: Term
+    Kb: Term
+    Kt: Term
+    explained: float  # share of the variance of the load
+
+
+def _constants(runs: Sequence[Recording], longer: int) -> _Constants:
+    """What the runs with a known load say together."""
+    needed = {"voltage", "current", "speed", "load"}
+    loaded = [w for w in (_windows(run, longer) for run in runs) if needed <= set(w)]
+    if not loaded:
+        return _Constants(*[Term(0.0, 0.0)] * 3, explained=0.0)
+    names = (*needed, "current_rate", "speed_rate", "direction")
+    w = {k: np.concatenate([one[k] for one in loaded]) for k in names}
+    torques = {k: w[k] for k in ("current", "speed", "speed_rate", "direction")}
+    mechanical, explained = regress(w["load"], torques)
+    return _Constants(*_electrical(w), mechanical["current"], explained)
 
 
 def _too_fast(run: Recording) -> Iterator[Finding]:
@@ -134,79 +159,50 @@ def _too_fast(run: Recording) -> Iterator[Finding]:
         what = f"{top:.4g} rad/s is faster than brushed motors turn"
         yield Finding(run.name, "speed", "warning", what, "whole run", mend)
     elif {"voltage", "current"} <= set(w):
-        fit, _ = regress(w["voltage"], {k: w[k] for k in ("current", "speed", "current_rate")})
-        Kb = fit["speed"]
+        _, Kb = _electrical(w)
         if Kb.positive and not KB_RANGE[0] < Kb.value < KB_RANGE[1]:
             what = f"with the voltage it makes Kb = {Kb.value:.3g} V s/rad, unlike any motor"
             yield Finding(run.name, "speed", "warning", what, "whole run", mend)
 
 
-def alignment(run: Recording) -> Iterator[Finding]:
-    """Current or speed recorded later or earlier than the rest."""
-    edge = _edges(run)
-    if edge is None:
-        return
-    v, i, w = edge
-    late = _best_shift(lambda s: _electrical_misfit(v, i, w, s))
-    behind_speed = _best_shift(lambda s: _mechanical_misfit(i, w, s))
-    mend = "Undo it in the data, or record all channels with one clock and one filter"
-    if late and abs(late - behind_speed) < 2:
-        column, what, shift = "current", "the current comes", late
-    elif behind_speed and not late:
-        column, what, shift = "speed", "the speed comes", -behind_speed
-    elif late and not behind_speed:
-        column, what, shift = "voltage", "current and speed come", late
-    else:
-        return
-    when = "late" if shift > 0 else "early"
-    size = f"{abs(shift)} samples ({abs(shift) * run.sample_time:.3g} s) {when}"
-    yield Finding(run.name, column, "warning", f"{what} about {size}", "at voltage edges", mend)
+def regress(
+    y: np.ndarray, regressors: Mapping[str, np.ndarray], intercept: bool = True
+) -> tuple[dict[str, Term], float]:
+    """Least squares.
 
-
-def sampling(run: Recording) -> Iterator[Finding]:
-    """Sampling too slow to see the current rise."""
-    edge = _edges(run)
-    if edge is None:
-        return
-    current = edge[1][BEFORE:] - edge[1][BEFORE]
-    if abs(current[1]) > 0.9 * np.max(np.abs(current)):
-        what = f"the current settles within one sample ({run.sample_time:.3g} s): L is hardly seen"
-        mend = "Sample faster than L / R to identify the inductance"
-        yield Finding(run.name, "current", "note", what, "at voltage edges", mend)
-
-
-def regress(y: np.ndarray, regressors: Mapping[str, np.ndarray]) -> tuple[dict[str, Term], float]:
-    """Least squares with an intercept.
-
-    **Arguments**: `y` and each of `regressors`, (windows,).
+    **Arguments**: `y` and each of `regressors`, (windows,); `intercept`, whether to fit a constant.
 
     **Returns**: a `Term` for each regressor, and the share of the variance of y explained.
     """
-    X = np.stack([x - x.mean() for x in regressors.values()], axis=1)
-    rounding = 1e-9 * np.max(np.abs(y)) + 1e-300
-    y = y - y.mean()
-    scale = X.std(axis=0)
-    scale[scale == 0] = np.inf  # a constant column has no effect
-    coefficients, *_ = np.linalg.lstsq(X / scale, y, rcond=1e-8)
+    X = np.stack(list(regressors.values()), axis=1)
+    largest, rounding = np.max(np.abs(X), axis=0), 1e-9 * np.max(np.abs(y)) + 1e-300
+    if intercept:
+        X, y = X - X.mean(axis=0), y - y.mean()
+    scale = np.sqrt(np.mean(X**2, axis=0))
+    scale[scale <= 1e-12 * largest] = np.inf  # a constant column has no effect
+    U, s, Vt = np.linalg.svd(X / scale, full_matrices=False)
+    s = np.maximum(s, 1e-8 * s[0] + 1e-300)
+    coefficients = Vt.T @ (U.T @ y / s)
     residual = y - X / scale @ coefficients
     # rms of what only this regressor can explain
-    own = 1 / np.sqrt(np.maximum(np.diag(np.linalg.pinv((X / scale).T @ X / scale)), 1e-300))
-    own = np.where(np.isfinite(scale), own, 0.0) / np.sqrt(len(y))
+    own = 1 / np.sqrt(len(y) * np.sum((Vt.T / s) ** 2, axis=1))
     rms = np.sqrt(np.mean(residual**2)) + rounding
     terms = {
-        name: Term(float(c / s), float(abs(c) * o / rms))
-        for name, c, s, o in zip(regressors, coefficients, scale, own, strict=True)
+        name: Term(float(c / size), float(abs(c) * o / rms))
+        for name, c, size, o in zip(regressors, coefficients, scale, own, strict=True)
     }
     return terms, float(1 - np.mean(residual**2) / (np.mean(y**2) + 1e-300))
 
 
-def _windows(run: Recording) -> dict[str, np.ndarray]:
+def _windows(run: Recording, longer: int = 1) -> dict[str, np.ndarray]:
     """Means and rates over windows of the record, each (windows,); empty if there are too few.
 
-    Keys: the quantities, `current_rate`, `speed_rate`, `angle_rate` and `direction`, the mean sign
-    of the speed.
+    `longer` stretches the windows, against noise. Keys: the quantities, `current_rate`,
+    `speed_rate`, `angle_rate` and `direction`, the mean sign of the speed.
     """
-    size = max(4, len(run) // MAX_WINDOWS)
+    size = longer * max(4, len(run) // MAX_WINDOWS)
+    if len(run) <= MIN_WINDOWS * size:
+        return {}
     count = (len(run) - 1) // size
     ends = np.arange(count + 1) * size
     steps = np.diff(run.time[: ends[-1] + 1])
@@ -218,7 +214,7 @@ def _windows(run: Recording) -> dict[str, np.ndarray]:
     def middle(values: np.ndarray) -> np.ndarray:
         return mean((values[1 : ends[-1] + 1] + values[: ends[-1]]) / 2)
 
-    speed = _speed(run)
+    speed = speed_of(run)
     found: dict[str, np.ndarray] = {}
     for name in ("voltage", "torque", "load"):  # held from sample to sample
         if (values := getattr(run, name)) is not None:
@@ -234,68 +230,8 @@ def _windows(run: Recording) -> dict[str, np.ndarray]:
     return {k: values[good] for k, values in found.items()} if good.sum() >= MIN_WINDOWS else {}
 
 
-def _speed(run: Recording) -> np.ndarray | None:
+def speed_of(run: Recording) -> np.ndarray | None:
+    """Speed in rad/s, (samples,), from the angle where it was not recorded; None without either."""
     if run.speed is None and run.angle is not None:
         return np.gradient(run.angle, run.time)
     return run.speed
-
-
-def _edges(run: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Voltage, current and speed about an edge of the voltage, averaged over edges.
-
-    The motor's equations are linear, so that such averages obey them, with less noise.
-
-    **Returns**: three arrays (BEFORE + AFTER,), the edge first felt at BEFORE; None if there is no
-    edge or a channel is absent.
-    """
-    speed = _speed(run)
-    if run.voltage is None or run.current is None or speed is None:
-        return None
-    jumps = np.diff(run.voltage)
-    rows = np.flatnonzero(np.abs(jumps) > 0.25 * np.ptp(run.voltage)) + 1
-    rows = rows[(rows >= BEFORE) & (rows <= len(run) - AFTER)]
-    rows = rows[:: len(rows) // 2000 + 1]
-    about = rows[:, None] + np.arange(-BEFORE, AFTER)
-    channels = np.stack([run.voltage[about], run.current[about], speed[about]])
-    spans = run.time[rows + AFTER - 1] - run.time[rows - BEFORE]
-    steady = spans < 1.1 * (BEFORE + AFTER - 1) * run.sample_time
-    good = np.isfinite(channels).all((0, 2)) & steady
-    if not good.any():
-        return None
-    weight = jumps[rows[good] - 1]
-    v, i, w = np.einsum("e,cet->ct", weight, channels[:, good]) / np.sum(weight**2)
-    return v, i, w
-
-
-def _electrical_misfit(v: np.ndarray, i: np.ndarray, w: np.ndarray, shift: int) -> float:
-    """What v = R i + Kb w + L di/dt leaves with current and speed taken `shift` samples later."""
-    rows = np.arange(REACH, len(v) - REACH - 1)
-    later = rows + shift
-    # two neighbouring currents span R i + L di/dt for any ratio of L / R to the step
-    return _misfit(v[rows], [i[later], i[later + 1], w[later]])
-
-
-def _mechanical_misfit(i: np.ndarray, w: np.ndarray, shift: int) -> float:
-    """What J dw/dt = Kt i - f w leaves with the current taken `shift` samples later."""
-    rows = np.arange(REACH, len(w) - REACH - 1)
-    later = rows + shift
-    # integrated once, so that the noise of the speed is not differentiated
-    pushes = [np.cumsum(i[later]), np.cumsum(i[later + 1]), np.cumsum(w[rows])]
-    return _misfit(w[rows], [*pushes, rows.astype(float)])
-
-
-def _misfit(y: np.ndarray, regressors: list[np.ndarray]) -> float:
-    terms, explained = regress(y, dict(zip("abcd", regressors, strict=False)))
-    del terms
-    return float(np.sqrt(max(1 - explained, 0.0)))
-
-
-def _best_shift(misfit) -> int:
-    """The smallest shift with about the least misfit, if clearly better than none; else 0."""
-    shifts = sorted(range(-REACH, REACH + 1), key=abs)
-    left = {shift: misfit(shift) for shift in shifts}
-    unshifted = min(left[-1], left[0], left[1])
-    least = min(left.values())
-    if unshifted < 0.01 or least > 0.3 * unshifted:
-        return 0
-    return next(shift for shift in shifts if left[shift] < 1.5 * least)

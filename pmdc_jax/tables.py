@@ -6,6 +6,7 @@ import csv
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -87,6 +88,9 @@ class CsvTable:
             self._refuse_ragged()  # polars fills short lines without a word
         if frame.height and all(frame[i].null_count() for i in wanted):
             self._kept = np.array([bool(line.strip()) for _, line in self._lines()])
+            if len(self._kept) != frame.height:
+                what = "it breaks lines inside quotes"
+                raise InputError(str(self._path), what, "Export it as plain CSV")
             frame = frame.filter(self._kept)
         columns = (frame[i].to_numpy().astype(float) for i in wanted)
         return dict(zip(headers, columns, strict=True))
@@ -96,7 +100,7 @@ class CsvTable:
         if self._kept is not None:
             row = int(np.flatnonzero(self._kept)[row])
         numbers = (number for number, _ in self._lines())
-        return f"line {next(n for i, n in enumerate(numbers) if i == row)}"
+        return f"line {next(islice(numbers, row, None), row + 1)}"
 
     @cached_property
     def _body(self) -> bytes:
@@ -208,7 +212,6 @@ class MatTable:
 
     def __init__(self, path: Path):
         from scipy.io import loadmat
-        from scipy.io.matlab import MatReadError
 
         self._path = path
         try:
@@ -216,7 +219,7 @@ class MatTable:
         except NotImplementedError:
             what, mend = "it is a MATLAB v7.3 (HDF5) file", "Save it in MATLAB with the option -v7"
             raise InputError(str(path), what, mend) from None
-        except (MatReadError, ValueError, TypeError, EOFError, LookupError):
+        except Exception:  # a damaged file makes scipy raise anything, down to UnboundLocalError
             what, mend = "it is no MATLAB file, or damaged", "Save it in MATLAB with the option -v7"
             raise InputError(str(path), what, mend) from None
         self._vectors = dict(_vectors(content, ""))
@@ -298,7 +301,11 @@ def _is_numbers(line: str) -> bool:
 
 
 def _fields(line: str, separator: str) -> list[str]:
-    return next(csv.reader([line.rstrip("\r\n")], delimiter=separator), [])
+    line = line.rstrip("\r\n")
+    try:
+        return next(csv.reader([line], delimiter=separator), [])
+    except csv.Error:  # a field longer than any number
+        return line.split(separator)
 
 
 def _refuse_duplicates(headers: Sequence[str], path: Path) -> None:

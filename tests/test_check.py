@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import time
+import time as clock
+from functools import cache
 
 import numpy as np
 import pytest
@@ -48,6 +49,7 @@ def excite(rng, kind, samples, settle, rated):
     return 24 * voltage, rated * load
 
 
+@cache
 def good_run(seed, kind=None, samples=3000, noise=None, coulomb=None):
     """A recording of a random motor with plausible noise, and sometimes with rounded speed."""
     rng = np.random.default_rng(seed)
@@ -68,10 +70,214 @@ def good_run(seed, kind=None, samples=3000, noise=None, coulomb=None):
     if seed % 3 == 0:  # an encoder counted over the sampling time
         count = np.ptp(speed) / 300
         speed = count * np.round(speed / count)
-    time = rng.uniform(0, 100) + dt * np.arange(samples)
+    stamps = rng.uniform(0, 100) + dt * np.arange(samples)
     loaded = load if kind == "load_cycles" or seed % 2 else None
-    return Recording(f"{kind}-{seed}", time, voltage, current, speed, loaded)
+    return Recording(f"{kind}-{seed}", stamps, voltage, current, speed, loaded)
 
 
 def told(recordings, severity=("warning", "error")):
     return [finding for finding in check(recordings) if finding.severity in severity]
+
+
+def shifted(run, **late):
+    """The run with some channels `late` by so many samples."""
+    reach = max(abs(d) for d in late.values())
+    length = len(run) - 2 * reach
+    cut = {q: values[reach : reach + length] for q, values in run.columns().items()}
+    cut |= {q: getattr(run, q)[reach - d : reach - d + length] for q, d in late.items()}
+    return evolve(run, **cut)
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_good_data_pass_in_silence(seed):
+    run = good_run(seed)
+    angle = np.cumsum(run.speed) * run.sample_time
+    assert told([run]) == []
+    assert told([evolve(run, current=None), evolve(run, voltage=None)]) == []
+    assert told([evolve(run, angle=angle), evolve(run, angle=angle, speed=None)]) == []
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+@pytest.mark.parametrize("kind", EXCITATIONS)
+def test_clean_and_very_noisy_data_pass_in_silence(kind, noise):
+    for seed in range(4):
+        assert told([good_run(seed, kind, noise=noise)]) == []
+
+
+def test_closed_loop_with_dry_friction_and_brush_drop_passes_in_silence():
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        Kb, R, J, dt = 0.05, 0.8, 5e-5, 1e-3
+        state, total, rows = np.zeros(2), 0.0, []
+        for k in range(3000):
+            seen = state + rng.normal(size=2) * [0.05, 0.5]
+            error = 200 * np.sin(k // 300) - seen[1]
+            total += error * dt
+            voltage = np.clip(0.05 * error + 0.3 * total, -24, 24)
+            rows.append([voltage, *seen])
+            current = (voltage - Kb * state[1] - 0.8 * np.tanh(state[0] / 0.1)) / R
+            torque = Kb * current - 0.03 * np.tanh(state[1])
+            state = np.array([0.3 * state[0] + 0.7 * current, state[1] + torque * dt / J])
+        v, i, w = np.array(rows).T
+        assert told([Recording("loop", dt * np.arange(3000), v, i, w)]) == []
+
+
+def test_time_that_is_rounded_or_drifts_is_no_jitter():
+    run = good_run(1)
+    grid = 1e-3 * np.arange(len(run))
+    drifting = grid * (1 + 1e-4 * np.sin(grid))
+    for stamps in (np.round(grid, 5), drifting):
+        assert told([evolve(run, time=stamps)]) == []
+
+
+def test_a_run_at_rest_among_others_is_only_noted():
+    run, rng = good_run(0, "steps"), np.random.default_rng(0)
+    current = 0.02 + 0.01 * rng.normal(size=len(run))
+    rest = evolve(run, name="rest", voltage=0 * run.voltage, current=current, speed=0 * run.speed)
+    assert told([run, rest]) == []
+    assert [f.run for f in check([run, rest]) if "nothing moves" in f.what] == ["rest"]
+    assert [f.severity for f in told([rest])] == ["error"]
+
+
+def test_a_load_of_zero_is_no_finding_and_a_constant_one_is_noted():
+    run = good_run(0, "steps")
+    assert check([evolve(run, load=np.zeros(len(run)))]) == check([run])
+    (note,) = set(check([evolve(run, load=np.full(len(run), 0.2))])) - set(check([run]))
+    assert (note.column, note.severity) == ("load", "note")
+    assert "the load column is constant: it is taken as known" in note.what
+
+
+def with_gap(run):
+    keep = np.r_[0:1000, 1400 : len(run)]
+    return evolve(run, **{q: values[keep] for q, values in run.columns().items()})
+
+
+def with_jitter(run):
+    scatter = np.random.default_rng(0).uniform(-0.2, 0.2, len(run))
+    return evolve(run, time=run.time + run.sample_time * scatter)
+
+
+def with_holes(run):
+    speed = run.speed.copy()
+    speed[100:400] = np.nan
+    return evolve(run, speed=speed)
+
+
+def clip(run, quantity, share):
+    values = getattr(run, quantity)
+    limit = np.min(values) + share * np.ptp(values)
+    return evolve(run, **{quantity: np.minimum(values, limit)})
+
+
+def buried(run):
+    noise = np.random.default_rng(0).normal(size=len(run)) * 3 * np.std(run.speed)
+    return evolve(run, speed=run.speed + noise)
+
+
+def with_angle(run, scale):
+    return evolve(run, angle=scale * np.cumsum(run.speed) * run.sample_time)
+
+
+def wrapped(run):
+    return evolve(run, speed=None, angle=np.mod(0.05 * np.arange(len(run)), 2 * np.pi))
+
+
+RPM = 30 / np.pi
+FAULTS = [
+    ("gap", with_gap, "time", "1 gap in time, the longest"),
+    ("jitter", with_jitter, "time", "jitter by"),
+    ("holes", with_holes, "speed", "300 of 3000 values are missing"),
+    ("clipped current", lambda run: clip(run, "current", 0.7), "current", "clipped at"),
+    ("clipped speed", lambda run: clip(run, "speed", 0.7), "speed", "clipped at"),
+    ("voltage sign", lambda run: evolve(run, voltage=-run.voltage), "voltage", "sign"),
+    ("speed sign", lambda run: evolve(run, speed=-run.speed), "speed", "sign"),
+    ("current sign", lambda run: evolve(run, current=-run.current), "current", "sign"),
+    (
+        "speed sign without current",
+        lambda run: evolve(run, speed=-run.speed, current=None),
+        "speed",
+        "it falls where the voltage",
+    ),
+    (
+        "current sign without voltage",
+        lambda run: evolve(run, current=-run.current, voltage=None),
+        "speed",
+        "it falls where the current",
+    ),
+    ("late current", lambda run: shifted(run, current=3), "current", "3 samples"),
+    ("early current", lambda run: shifted(run, current=-5), "current", "early"),
+    ("late speed", lambda run: shifted(run, speed=8), "speed", "late"),
+    ("early speed", lambda run: shifted(run, speed=-8), "speed", "early"),
+    ("late both", lambda run: shifted(run, speed=8, current=8), "voltage", "8 samples"),
+    ("buried speed", buried, "speed", "it swings less than its noise"),
+    ("angle in degrees", lambda run: with_angle(run, 180 / np.pi), "angle", "in degrees"),
+    ("speed in rpm by angle", lambda run: with_angle(run, 1 / RPM), "angle", "speed were in rpm"),
+    ("angle the other way", lambda run: with_angle(run, -1), "angle", "wrong sign"),
+    ("wrapped angle", wrapped, "angle", "starts again after each turn"),
+    ("impossible speed", lambda run: evolve(run, speed=1e3 * run.speed), "speed", "faster than"),
+]
+
+
+@pytest.mark.parametrize(("name", "inject", "column", "what"), FAULTS, ids=[f[0] for f in FAULTS])
+def test_each_fault_is_found(name, inject, column, what):
+    del name
+    for seed in (1, 7, 13):
+        run = good_run(seed, "prbs", noise=1e-3)
+        found = told([inject(run)])
+        assert any(f.column == column and what in f.what for f in found), (run.name, found)
+
+
+@pytest.mark.parametrize(
+    ("fault", "column", "what"),
+    [
+        (lambda run: evolve(run, speed=RPM * run.speed), "speed", "as if the speed were in rpm"),
+        (lambda run: evolve(run, speed=6 * RPM * run.speed), "speed", "in deg/s, not rad/s"),
+        (lambda run: evolve(run, load=-run.load), "load", "its sign is reversed"),
+    ],
+)
+def test_a_known_load_shows_wrong_units_and_its_own_sign(fault, column, what):
+    for seed in range(1, 15, 2):
+        runs = [good_run(seed, "steps"), good_run(seed, "load_cycles")]
+        assert told(runs) == []
+        found = told([fault(run) for run in runs])
+        assert any(f.column == column and what in f.what for f in found)
+
+
+def test_signs_are_found_for_every_motor_and_excitation():
+    for seed in range(18):
+        for column in ("voltage", "current", "speed"):
+            run = good_run(seed)
+            found = told([evolve(run, **{column: -getattr(run, column)})])
+            assert [f.column for f in found if "sign" in f.what] == [column]
+
+
+def test_nothing_at_all_is_an_error():
+    t = np.arange(100) / 100
+    flat = Recording("flat", t, np.full(100, 5.0), np.ones(100), np.full(100, 40.0))
+    assert [f.severity for f in check([flat])] == ["error"]
+
+
+def test_a_blocked_shaft_is_said():
+    run = good_run(0, "steps")
+    blocked = evolve(run, name="blocked", speed=np.zeros(len(run)))
+    assert [(f.column, f.severity) for f in told([blocked])] == [("speed", "warning")]
+    assert told([run, blocked]) == []
+
+
+def test_slow_sampling_is_noted():
+    found = check([good_run(0, "steps")]), check([good_run(5, "steps", samples=3000)])
+    assert all(isinstance(findings, tuple) for findings in found)
+    motor, count = (1.0, 1e-5, 0.05, 0.05, 1e-4, 1e-6), 2000
+    voltage = 12.0 * (np.arange(count) // 200 % 2)
+    i, w = simulate(motor, 1e-3, voltage, np.zeros(count))
+    (note,) = check([Recording("slow", np.arange(count) * 1e-3, voltage, i, w)])
+    assert note.severity == "note" and "settles within one sample" in note.what
+
+
+def test_a_million_rows_take_less_than_a_second():
+    run, count = good_run(7, "prbs"), 1_000_000
+    repeated = {q: np.resize(values, count) for q, values in run.columns().items()}
+    big = evolve(run, **repeated | {"time": np.arange(count) * run.sample_time})
+    begin = clock.perf_counter()
+    check([big])
+    assert clock.perf_counter() - begin < 4  # on a machine that others use too

@@ -114,15 +114,16 @@ def test_the_script_finds_the_motor(identify):
         assert found[name] == pytest.approx(getattr(motor, name), rel=tolerance)
 
 
-def test_the_script_differentiates_correctly():
+@pytest.mark.parametrize("inductance", [1.0, 5.0], ids=["real poles", "complex poles"])
+def test_the_script_differentiates_correctly(inductance):
     """Products of derivatives and residual against finite differences of the squared error."""
     rng = np.random.default_rng(2)
     runs = [Run.of(vb.record(vb.paper_motor(), vb.prbs(rng, 0.2), rng))]
-    weights = np.array([2.0, 3.0])
-    case = scipy_identify.Case(runs, weights)
-    at = np.concatenate([np.log(SIX * 1.1), [1.0, 2.0]])
+    case = scipy_identify.Case(runs, np.array([2.0, 3.0]))
+    parameters = SIX * [1.1, inductance, 1.1, 1.1, 1.1, 1.1]
+    at = np.concatenate([np.log(parameters), [1.0, 2.0]])
     _, gradient, _ = scipy_identify._normal_equations(at, case)
     for n, slope in enumerate(gradient):
         nudge = 1e-5 * np.eye(8)[n]
         up, down = (scipy_identify._normal_equations(at + s * nudge, case)[0] for s in (1, -1))
-        assert (up - down) / 2e-5 == pytest.approx(slope, rel=1e-5)
+        assert (up - down) / 2e-5 == pytest.approx(slope, rel=1e-5, abs=1e-2)

@@ -34,13 +34,14 @@ def exact_step(parameters: NDArray, dt: float) -> NDArray:
     """
     R, L, Kb, Kt, J, f = np.moveaxis(np.asarray(parameters), -1, 0)
     a, b, c, d = -R / L, -Kb / L, Kt / J, -f / J
-    mean = (a + d) / 2
-    half_gap = np.sqrt((a - d) ** 2 / 4 + b * c + 0j)
-    half_gap = np.where(np.abs(half_gap * dt) < 1e-7, 1e-7 / dt, half_gap)
-    slow, fast = np.exp((mean + half_gap) * dt), np.exp((mean - half_gap) * dt)
-    even, odd = (slow + fast) / 2, (slow - fast) / (2 * half_gap)
-    if not np.iscomplexobj(parameters):
-        even, odd = even.real, odd.real
+    mean, square = (a + d) / 2, (a - d) ** 2 / 4 + b * c
+    swings = square.real < 0  # two branches keep real arithmetic real, as the complex step needs
+    gap = np.sqrt(np.where(swings, -square, square))
+    gap = np.where(np.abs(gap * dt) < 1e-7, 1e-7 / dt, gap)
+    apart, turn, decay = np.where(swings, 0.0, gap), np.where(swings, gap, 0.0), np.exp(mean * dt)
+    slow, fast = np.exp((mean + apart) * dt), np.exp((mean - apart) * dt)
+    even = np.where(swings, decay * np.cos(turn * dt), (slow + fast) / 2)
+    odd = np.where(swings, decay * np.sin(turn * dt), (slow - fast) / 2) / gap
     phi = [[even + odd * (a - mean), odd * b], [odd * c, even + odd * (d - mean)]]
     # A^-1 (Phi - I) applied to the columns (1/L, 0) of the voltage and (0, -1/J) of the load
     det = a * d - b * c

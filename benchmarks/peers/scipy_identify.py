@@ -152,25 +152,22 @@ def _normal_equations(unknowns: NDArray, case: Case) -> tuple[float, NDArray, ND
 
 
 def _refine(unknowns: NDArray, case: Case, tolerance: float) -> tuple[float, NDArray]:
-    """Minimise from one start until a step promises less than `tolerance` of the cost."""
+    """Minimise from one start until the whole Gauss-Newton step promises too little of the cost."""
     cost, gradient, matrix = _normal_equations(unknowns, case)
     damping = 1e-2
-    for _ in range(60):
-        damped = matrix + damping * np.diag(np.diag(matrix))
-        move = -np.linalg.solve(damped, gradient)
-        move[:6] = np.clip(move[:6], -1.0, 1.0)
-        trial = unknowns + move
-        new_cost, new_gradient, new_matrix = _normal_equations(trial, case)
-        if not new_cost < cost:
-            if damping > 1e6 or -move @ gradient < tolerance * cost:
-                break
-            damping *= 8.0
-            continue
-        small = cost - new_cost < tolerance * cost
-        unknowns, cost, gradient, matrix = trial, new_cost, new_gradient, new_matrix
-        damping /= 8.0
-        if small:
+    for _ in range(100):
+        scale = np.diag(np.diag(matrix))
+        promise = gradient @ np.linalg.solve(matrix + 1e-12 * scale, gradient) / 2
+        if promise < tolerance * cost or damping > 1e8:
             break
+        move = -np.linalg.solve(matrix + damping * scale, gradient)
+        move[:6] = np.clip(move[:6], -1.0, 1.0)
+        trial = _normal_equations(unknowns + move, case)
+        if trial[0] < cost:
+            unknowns, damping = unknowns + move, damping / 8.0
+            cost, gradient, matrix = trial
+        else:
+            damping *= 8.0
     return cost, unknowns
 
 
@@ -195,7 +192,10 @@ def _refine_by_scipy(unknowns: NDArray, case: Case, tolerance: float) -> tuple[f
     def jacobian(x):
         return factor(x)[:, :-1]
 
-    options = {"x_scale": "jac", "method": "trf", "ftol": tolerance, "xtol": 1e-10}
+    reach = np.full(len(unknowns), np.inf)
+    reach[:6] = 5.0  # in logarithms: a wild first step must not overflow
+    bounds = (unknowns - reach, unknowns + reach)
+    options = {"bounds": bounds, "x_scale": "jac", "ftol": tolerance, "xtol": 1e-10}
     result = least_squares(residual, unknowns, jacobian, **options)
     return result.cost, result.x
 

@@ -11,7 +11,7 @@ from attrs import field, frozen
 from ..motor import Motor
 from ..recording import Finding
 
-Status = Literal["identified", "at_bound", "tied", "not_identifiable"]
+Status = Literal["identified", "at_bound", "tied", "not_identifiable", "known"]
 Role = Literal["train", "holdout"]
 
 
@@ -19,10 +19,11 @@ Role = Literal["train", "holdout"]
 class Estimate:
     """One parameter: its value (SI), standard error, 95 % interval, unit and what to make of it.
 
-    `stderr` and `ci95` are None where the data do not determine the parameter.
+    `stderr` and `ci95` are None where the data do not determine the parameter; `value` too where no run has
+    anything to do with it.
     """
 
-    value: float
+    value: float | None
     stderr: float | None
     ci95: tuple[float, float] | None
     unit: str
@@ -58,6 +59,7 @@ class RunFit:
     current_simulated: np.ndarray | None
     speed: np.ndarray | None
     speed_simulated: np.ndarray
+    load: np.ndarray | None
 
 
 @frozen

@@ -34,9 +34,9 @@ def phi_functions(z: Matrix) -> tuple[list[Matrix], list[Matrix]]:
     small = z / 2**HALVINGS
     phis = []
     for k in range(1, 4):
-        term = one / math.factorial(ORDER + k)
+        term = one / float(math.factorial(ORDER + k))
         for j in reversed(range(ORDER)):
-            term = one / math.factorial(j + k) + product(small, term)
+            term = one / float(math.factorial(j + k)) + product(small, term)
         phis.append(term)
 
     def double(half, scaled):

@@ -111,7 +111,8 @@ class _Run:
             drive, i = "current", recording.current
             assert i is not None, "Recording guarantees something that drives"
             self.value = np.append((i[:-1] + i[1:]) / 2, i[-1])
-        self.grid = (float(recording.sample_time), drive)
+        # rounded: two runs of one clock must share a grid, whatever the last bits of their time stamps
+        self.grid = (float(f"{recording.sample_time:.9g}"), drive)
         self.initial = (_first(self.current), _first(self.speed))
 
     def fill(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:

@@ -1,0 +1,116 @@
+"""Channels recorded by different clocks: what follows an edge of the voltage, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from .plausibility import regress, speed_of
+from .recording import Finding, Recording
+
+REACH = 20  # samples, the largest shift between channels that is tried
+SHIFTS = sorted(range(-REACH, REACH + 1), key=abs)
+SHIFTED = 0.3  # a shift must leave less than this of the misfit
+BEFORE, AFTER = 40, 100  # samples about a voltage edge
+
+
+def alignment(run: Recording) -> Iterator[Finding]:
+    """Current or speed recorded later or earlier than the rest."""
+    edge = _edges(run)
+    if edge is None:
+        return
+    electrical = {shift: _electrical_misfit(edge, shift) for shift in SHIFTS}
+    mechanical = {shift: _mechanical_misfit(edge, shift) for shift in SHIFTS}
+    late, behind_speed = _best_shift(electrical), _best_shift(mechanical)
+    if late and mechanical[0] < 0.5 * mechanical[late]:
+        column, what, shift = "voltage", "current and speed come", late
+    elif late and mechanical[late] < 0.5 * mechanical[0]:
+        column, what, shift = "current", "the current comes", late
+    elif late:
+        column, what, shift = "current", "the current, and perhaps the speed, comes", late
+    elif behind_speed:
+        column, what, shift = "speed", "the speed comes", -behind_speed
+    else:
+        return
+    when = "late" if shift > 0 else "early"
+    what += f" about {abs(shift)} samples ({abs(shift) * run.sample_time:.3g} s) {when}"
+    mend = "Undo it in the data, or record all channels with one clock and one filter"
+    yield Finding(run.name, column, "warning", what, "at voltage edges", mend)
+
+
+def sampling(run: Recording) -> Iterator[Finding]:
+    """Sampling too slow to see the current rise."""
+    edge = _edges(run)
+    if edge is None:
+        return
+    current = edge.current[BEFORE:] - edge.current[BEFORE]
+    if abs(current[1]) > 0.9 * np.max(np.abs(current)):
+        what = f"the current settles within one sample ({run.sample_time:.3g} s): L is hardly seen"
+        mend = "Sample faster than L / R to identify the inductance"
+        yield Finding(run.name, "current", "note", what, "at voltage edges", mend)
+
+
+class _Edge(NamedTuple):
+    """What happens about a voltage edge, each (BEFORE + AFTER,), the edge first felt at BEFORE."""
+
+    voltage: np.ndarray
+    current: np.ndarray
+    speed: np.ndarray
+    direction: np.ndarray
+
+
+def _edges(run: Recording) -> _Edge | None:
+    """The average over edges, or None if there is none or a channel is absent.
+
+    The motor's equations are linear, so that such averages obey them, with less noise.
+    """
+    speed = speed_of(run)
+    if run.voltage is None or run.current is None or speed is None:
+        return None
+    jumps = np.diff(run.voltage)
+    rows = np.flatnonzero(np.abs(jumps) > 0.1 * np.ptp(run.voltage)) + 1
+    rows = rows[(rows >= BEFORE) & (rows <= len(run) - AFTER)]
+    rows = rows[:: len(rows) // 2000 + 1]
+    about = rows[:, None] + np.arange(-BEFORE, AFTER)
+    channels = [run.voltage[about], run.current[about], speed[about], np.sign(speed[about])]
+    spans = run.time[rows + AFTER - 1] - run.time[rows - BEFORE]
+    steady = spans < 1.1 * (BEFORE + AFTER - 1) * run.sample_time
+    good = np.isfinite(channels).all((0, 2)) & steady
+    if not good.any():
+        return None
+    weight = jumps[rows[good] - 1] / np.sum(jumps[rows[good] - 1] ** 2)
+    return _Edge(*(weight @ values[good] for values in channels))
+
+
+def _electrical_misfit(edge: _Edge, shift: int) -> float:
+    """What v = R i + Kb w + L di/dt leaves with current and speed taken `shift` samples later."""
+    rows = np.arange(REACH, BEFORE + AFTER - REACH - 1)
+    later = rows + shift
+    # two neighbouring currents span R i + L di/dt for any ratio of L / R to the step
+    return _misfit(
+        edge.voltage[rows], edge.current[later], edge.current[later + 1], edge.speed[later]
+    )
+
+
+def _mechanical_misfit(edge: _Edge, shift: int) -> float:
+    """What J dw/dt = Kt i - f w - T sign(w) leaves with the current taken `shift` samples later."""
+    rows = np.arange(REACH, BEFORE + AFTER - REACH - 1)
+    later = rows + shift
+    # integrated once, so that the noise of the speed is not differentiated
+    rates = (edge.current[later], edge.current[later + 1], edge.speed[rows], edge.direction[rows])
+    return _misfit(edge.speed[rows], *map(np.cumsum, rates), rows.astype(float))
+
+
+def _misfit(y: np.ndarray, *regressors: np.ndarray) -> float:
+    _, explained = regress(y, dict(zip("abcde", regressors, strict=False)))
+    return float(np.sqrt(max(1 - explained, 0.0)))
+
+
+def _best_shift(misfit: Mapping[int, float]) -> int:
+    """The smallest shift with about the least misfit, if clearly better than none; else 0."""
+    unshifted, least = min(misfit[-1], misfit[0], misfit[1]), min(misfit.values())
+    if unshifted < 0.01 or least > SHIFTED * unshifted:
+        return 0
+    return next(shift for shift in SHIFTS if misfit[shift] <= 1.5 * least)

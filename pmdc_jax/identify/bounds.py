@@ -1,0 +1,85 @@
+"""Between which values to search, derived from the recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..recording import Recording
+
+# How far a crude estimate may be off, as a factor either way. Wide: the search is cheap.
+CRUDE = 30.0
+
+
+def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, float]]:
+    """Search bounds of R, L, Kb, Kt, J and f in SI, a decade and a half either way of crude estimates.
+
+    R and Kb from the quasi-steady balance v = R i + Kb w (stall current and no-load speed); Kt around Kb, its
+    equal in SI; J and f from the torque that is there, the speed that it keeps up and the change of speed that
+    it brings about; L from R and the time constants that the sampling can show.
+    """
+    R, Kb = _armature(recordings)
+    torque, speed, change, step, duration = _motion(recordings, Kb)
+    inertia = torque * np.sqrt(step * duration) / change
+    friction = torque / speed
+    return {
+        "R": _around(R),
+        "L": (R * step / 20, R * np.sqrt(step * duration)),
+        "Kb": _around(Kb),
+        "Kt": _around(Kb),
+        "J": (inertia / CRUDE**2, inertia * CRUDE**2),
+        "f": (friction / CRUDE**3, friction * CRUDE / 3),
+    }
+
+
+def _armature(recordings: Sequence[Recording]) -> tuple[float, float]:
+    """R and Kb by least squares on means over short stretches, where L di/dt is small."""
+    rows = []
+    for run in recordings:
+        if run.voltage is not None and run.current is not None and run.speed is not None:
+            columns = np.stack([run.voltage, run.current, run.speed])
+            rows.append(_means(columns[:, ~np.isnan(columns).any(0)], 20))
+    if rows:
+        voltage, current, speed = np.concatenate(rows, axis=1)
+        inputs = np.stack([current, speed], 1)
+        scale = np.linalg.norm(inputs, axis=0) + 1e-300
+        R, Kb = np.linalg.lstsq(inputs / scale, voltage, rcond=1e-6)[0] / scale
+        steady = np.linalg.norm(voltage) / scale
+        # a motor that only stalls, or only runs light, shows one of the two: then the other is open
+        return (R if R > 0 else steady[0]), (Kb if Kb > 0 else steady[1])
+    gains = [_rms(r.voltage) / _rms(r.speed) for r in recordings if r.voltage is not None and r.speed is not None]
+    loads = [_rms(r.voltage) / _rms(r.current) for r in recordings if r.voltage is not None and r.current is not None]
+    Kb = float(np.median(gains)) if gains else 0.05
+    return (float(np.median(loads)) / 3 if loads else 1.0), Kb
+
+
+def _motion(recordings: Sequence[Recording], Kt: float):
+    """Typical torque N m, speed rad/s and its change rad/s, shortest sample time and longest run in s."""
+    torque, speed, change = [1e-9], [1e-9], [1e-9]
+    for run in recordings:
+        if run.torque is not None:
+            torque.append(_rms(run.torque))
+        elif run.current is not None:
+            torque.append(Kt * _rms(run.current))
+        elif run.speed is not None:
+            torque.append(Kt * _rms(run.voltage))
+        if run.speed is not None:
+            speed.append(_rms(run.speed))
+            change.append(float(np.nanstd(run.speed)))
+    step = min(run.sample_time for run in recordings)
+    duration = max(run.time[-1] - run.time[0] for run in recordings)
+    return max(torque), max(speed), max(change), step, duration
+
+
+def _around(value: float) -> tuple[float, float]:
+    return value / CRUDE, value * CRUDE
+
+
+def _means(columns: np.ndarray, length: int) -> np.ndarray:
+    whole = columns.shape[1] // length
+    return columns[:, : whole * length].reshape(len(columns), whole, length).mean(2)
+
+
+def _rms(samples: np.ndarray | None) -> float:
+    return float(np.sqrt(np.nanmean(np.square(samples)))) if samples is not None else 0.0

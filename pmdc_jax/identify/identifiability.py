@@ -1,0 +1,73 @@
+"""Directions that the recordings cannot see, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..recording import Recording
+from .identification import Direction
+from .parameters import Parameters
+
+# A parameter belongs to an unseen direction if it makes up at least this share of it.
+SHARE = 0.05
+
+
+def explain(
+    unseen: Sequence[np.ndarray], parameters: Parameters, recordings: Sequence[Recording]
+) -> tuple[Direction, ...]:
+    """Say of each unseen direction which parameters it moves together, why it is unseen, and how to mend it."""
+    directions = []
+    for vector in unseen:
+        names = tuple(
+            name for name, share in zip(parameters.names, vector, strict=True) if abs(share) > SHARE
+        )
+        directions.append(Direction(names, *_reason(set(names), recordings)))
+    return tuple(directions)
+
+
+def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]:
+    loads = [r.load for r in recordings if r.load is not None]
+    loaded = any(np.ptp(load) > 0 or np.any(load != 0) for load in loads)
+    electrical = any(r.voltage is not None for r in recordings)
+    measured = any(r.voltage is not None and r.current is not None for r in recordings)
+    listed = _listed(sorted(names))
+    if electrical and not measured and names & {"R", "L", "Kb", "Kt"}:
+        return (
+            f"no run has both voltage and current, so {listed} trade off against each other",
+            "Record the current too, or give values with --known",
+        )
+    if {"Kt", "J"} <= names and not loaded and not any(r.torque is not None for r in recordings):
+        return (
+            "no run has a known load torque, so only the ratios of Kt, J and f are seen",
+            "Add a run with a known load torque, or tie Kt = Kb with --tie Kt=Kb",
+        )
+    if names == {"L"}:
+        return (
+            "the sampling is too slow, or the voltage too smooth, to show the electrical time constant",
+            "Record voltage steps at a sample time below L / R, or give L with --known",
+        )
+    if names == {"f"}:
+        return (
+            "viscous friction changes these runs by less than their noise",
+            "Record steady running at several speeds, light and long",
+        )
+    if "J" in names and not names & {"Kt", "Kb"}:
+        return (
+            "speed changes too little for its inertia to show",
+            "Add a run with voltage steps or a fast changing voltage",
+        )
+    if {"R", "Kb"} & names:
+        return (
+            f"voltage, current and speed keep the same proportions, so {listed} trade off against each other",
+            "Add runs at other loads, at stall, or with voltage steps",
+        )
+    return (
+        f"the runs do not tell {listed} apart",
+        "Add a run with more excitation: voltage steps, both directions, several speeds and loads",
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

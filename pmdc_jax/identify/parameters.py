@@ -1,0 +1,111 @@
+"""Which parameters are sought, and how a vector of search coordinates makes a motor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..effects import EFFECTS, AbstractEffect
+from ..errors import InputError
+from ..motor import PARAMETERS, Motor
+
+Coordinates = Float[Array, "*population parameters"]
+
+
+class Parameters(eqx.Module):
+    """The sought parameters, their bounds, and the rest, which is known or tied.
+
+    A coordinate is the natural logarithm of its parameter, or the parameter itself where the effect's table
+    says so; effects' parameters are named like coulomb_friction.torque_Nm.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    logarithmic: tuple[bool, ...] = eqx.field(static=True)
+    effects: tuple[type[AbstractEffect], ...] = eqx.field(static=True)
+    ties: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    known: dict[str, Float[Array, ""]]
+    lower: Float[Array, " parameters"]
+    upper: Float[Array, " parameters"]
+
+    @classmethod
+    def of(
+        cls,
+        bounds: Mapping[str, tuple[float, float]],
+        effects: Sequence[type[AbstractEffect]] = (),
+        known: Mapping[str, float] | None = None,
+        ties: Sequence[tuple[str, str]] = (),
+    ) -> Parameters:
+        """Seek everything that is neither known nor tied.
+
+        **Arguments**: `bounds` of R, L, Kb, Kt, J, f in SI, lower > 0; `effects`, whose parameters are sought
+        in the ranges of their own table unless `bounds` holds others; `known` values; `ties`, pairs (a, b)
+        for a = b, of which only b is sought.
+        """
+        ranges = {name: (*bounds[name], True) for name in PARAMETERS}
+        for effect in effects:
+            for field, r in effect.ranges.items():
+                name = f"{effect.name}.{field}"
+                ranges[name] = (*bounds.get(name, (r.lower, r.upper)), r.scale == "log")
+        fixed = dict(known or {})
+        names = tuple(n for n in ranges if n not in fixed and n not in {a for a, _ in ties})
+        limits = np.array([ranges[n][:2] for n in names], float).reshape(-1, 2)
+        logarithmic = np.array([ranges[n][2] for n in names], bool)
+        limits[logarithmic] = np.log(limits[logarithmic])
+        return cls(
+            names=names,
+            logarithmic=tuple(logarithmic.tolist()),
+            effects=tuple(effects),
+            ties=tuple(ties),
+            known={name: np.asarray(float(value)) for name, value in fixed.items()},
+            lower=limits[:, 0],
+            upper=limits[:, 1],
+        )
+
+    def __call__(self, coordinates: Coordinates) -> Motor:
+        """The motor, or the population of motors, at these coordinates."""
+        like = jnp.zeros(coordinates.shape[:-1])
+        values = {name: like + value for name, value in self.known.items()}
+        for k, (name, log) in enumerate(zip(self.names, self.logarithmic, strict=True)):
+            values[name] = jnp.exp(coordinates[..., k]) if log else coordinates[..., k]
+        for target, source in self.ties:
+            values[target] = values[source]
+        effects = tuple(
+            effect(**{field: values[f"{effect.name}.{field}"] for field in effect.ranges})
+            for effect in self.effects
+        )
+        return Motor(**{name: values[name] for name in PARAMETERS}, effects=effects)
+
+    def value(self, name: str, coordinates: np.ndarray) -> float:
+        """One parameter in SI."""
+        source = dict(self.ties).get(name, name)
+        if source in self.known:
+            return float(self.known[source])
+        k = self.names.index(source)
+        return float(np.exp(coordinates[k]) if self.logarithmic[k] else coordinates[k])
+
+
+def unit_of(name: str) -> str:
+    """Unit of a parameter of the motor or of an effect."""
+    if name in PARAMETERS:
+        return PARAMETERS[name]
+    effect, field = name.split(".")
+    return EFFECTS[effect].ranges[field].unit
+
+
+def effects_named(names: Sequence[str]) -> tuple[type[AbstractEffect], ...]:
+    """Effect classes by name; raises `InputError` on an unknown one."""
+    for name in names:
+        if name not in EFFECTS:
+            raise InputError("--effect", f"there is no effect {name}", f"Choose of {', '.join(EFFECTS)}")
+    return tuple(EFFECTS[name] for name in dict.fromkeys(names))
+
+
+def check_names(option: str, names: Sequence[str]) -> None:
+    """Refuse a name that is no parameter of the motor."""
+    for name in names:
+        if name not in PARAMETERS:
+            raise InputError(option, f"there is no parameter {name}", f"Choose of {', '.join(PARAMETERS)}")

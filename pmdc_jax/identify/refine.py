@@ -1,0 +1,276 @@
+"""Refinement by Levenberg-Marquardt on forward sensitivities."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from ..simulate import LOCAL, Tape, sensitivities
+from .parameters import Parameters
+
+STEPS = 60
+
+
+class Unknowns(NamedTuple):
+    """What a refinement moves: search coordinates, and what each run does not tell."""
+
+    coordinates: Float[Array, " parameters"]
+    local: Float[Array, "runs 3"]  # initial current A, initial speed rad/s, load offset N m
+
+
+class Refined(NamedTuple):
+    """Where a refinement ended."""
+
+    unknowns: Unknowns
+    fitness: float  # sum over both outputs of the mean square residual over the noise variance
+    at_bound: tuple[int, ...]  # which coordinates were held at a bound
+    converged: bool  # by the gradient, not by the solver's word
+
+
+class Problem(eqx.Module):
+    """A least-squares problem: runs on tape, the noise to scale by, what may move and which runs count.
+
+    Runs that do not count (hold-outs) are simulated all the same, and their own unknowns can be fitted.
+    """
+
+    parameters: Parameters
+    tape: Tape
+    noise: Float[Array, "2"]  # standard deviations of current A and speed rad/s
+    free: Bool[Array, " parameters"]
+    counts: Bool[Array, " runs"]
+
+    def moves(self) -> Bool[Array, "runs columns"]:
+        """Which coordinates and which of its own unknowns each run may tell of."""
+        tape = self.tape
+        first = jnp.argmax(jnp.asarray(tape.run)[None, :] == jnp.arange(tape.runs)[:, None], axis=1)
+        voltage = jnp.asarray(tape.drive.voltage)[jnp.asarray(tape.grid)[first]] > 0
+        own = jnp.stack([voltage, jnp.ones_like(voltage), jnp.asarray(tape.load_unknown)], 1)
+        return jnp.concatenate([self.free[None, :] & self.counts[:, None], own], 1)
+
+
+class Evaluation(NamedTuple):
+    """A free run, its residuals over the noise, and their derivatives.
+
+    Columns: the coordinates, then the run's own initial current, initial speed and load offset.
+    """
+
+    seen: Float[Array, "blocks 2 samples"]
+    residuals: Float[Array, "blocks 2 samples"]
+    jacobian: Float[Array, "blocks 2 samples columns"]
+
+
+@eqx.filter_jit
+def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
+    """Simulate every run of the problem and compare."""
+    tape, local = problem.tape, unknowns.local
+    seen, jacobian = sensitivities(
+        problem.parameters, unknowns.coordinates, tape, local[:, :2], local[:, 2]
+    )
+    scale = tape.weight / problem.noise[:, None]
+    jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]
+    return Evaluation(seen, (seen - tape.measured) * scale, jacobian)
+
+
+def normal_matrix(
+    evaluation: Evaluation, tape: Tape, counts: Bool[Array, " runs"] | np.ndarray
+) -> Float[Array, "columns+1 columns+1"]:
+    """[J r]' [J r] over all unknowns: coordinates, then the locals run by run, then the residual."""
+    _, r, jacobian = evaluation
+    both = jnp.concatenate([jacobian, r[..., None]], -1)
+    of_block = jnp.einsum("bcsi,bcsj->bij", both, both)
+    of_run = jax.ops.segment_sum(of_block, tape.run, tape.runs) * counts[:, None, None]
+    index = _columns(jacobian.shape[-1] - LOCAL, tape.runs)
+    size = index.max() + 1
+    return jnp.zeros((size, size)).at[index[:, :, None], index[:, None, :]].add(of_run)
+
+
+def _columns(count: int, runs: int) -> np.ndarray:
+    """Where each run's columns lie among all unknowns and the residual."""
+    own = count + LOCAL * np.arange(runs)[:, None] + np.arange(LOCAL)
+    shared = np.broadcast_to(np.arange(count), (runs, count))
+    return np.concatenate([shared, own, np.full((runs, 1), count + LOCAL * runs)], 1)
+
+
+# Levenberg-Marquardt needs of the residuals r and their Jacobian J no more than J'J, J'r and r'r. So it is given
+# the smallest residual vector with the same ones, as long as there are unknowns instead of samples.
+@eqx.filter_custom_jvp
+def compressed(flat: Float[Array, " columns"], args) -> Float[Array, " columns+1"]:
+    return _factor(flat, args)[:, -1]
+
+
+@compressed.def_jvp
+def _compressed_jvp(primals, tangents):
+    flat, args = primals
+    factor = _factor(flat, args)
+    direction = tangents[0]
+    change = jnp.zeros_like(factor[:, -1]) if direction is None else factor[:, :-1] @ direction
+    return factor[:, -1], change
+
+
+def _factor(flat: Float[Array, " columns"], args) -> Float[Array, "columns+1 columns+1"]:
+    problem, scale, size = args
+    evaluation = evaluate(problem, _unflatten(problem, flat * scale))
+    matrix = normal_matrix(evaluation, problem.tape, problem.counts)
+    stretch = jnp.append(scale, 1.0)
+    matrix = matrix * stretch[:, None] * stretch / size
+    # a failed simulation must look bad, not equal to nothing
+    bad = ~jnp.all(jnp.isfinite(matrix))
+    matrix = jnp.where(bad, jnp.zeros_like(matrix).at[-1, -1].set(1e12), matrix)
+    values, vectors = jnp.linalg.eigh(matrix)
+    return jnp.sqrt(jnp.maximum(values, 0.0))[:, None] * vectors.T
+
+
+def _unflatten(problem: Problem, flat: Float[Array, " columns"]) -> Unknowns:
+    count = len(problem.free)
+    return Unknowns(flat[:count], flat[count:].reshape(problem.tape.runs, LOCAL))
+
+
+def _flatten(unknowns: Unknowns) -> Float[Array, " columns"]:
+    return jnp.concatenate([unknowns.coordinates, unknowns.local.reshape(-1)])
+
+
+@eqx.filter_jit
+def _levenberg_marquardt(problem: Problem, start: Unknowns, scale, size, tolerance):
+    solution = optx.least_squares(
+        compressed,
+        optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),
+        _flatten(start) / scale,
+        args=(problem, scale, size),
+        max_steps=STEPS,
+        throw=False,
+    )
+    return _unflatten(problem, solution.value * scale), 2 * solution.state.f_info.as_min() * size
+
+
+def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-5) -> Refined:
+    """Levenberg-Marquardt from a start, within the bounds.
+
+    optimistix has no bounds, so they are an active set: a coordinate that ends beyond its bound is held there
+    and the others are refined again.
+    """
+    low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
+    matrix = np.asarray(normal_matrix(evaluate(problem, start), problem.tape, problem.counts))
+    size = max(matrix[-1, -1], 1e-30)
+    # each run's own unknowns are measured in what changes the residual as much as e-fold in a parameter might
+    lengths = np.sqrt(np.diag(matrix)[:-1] / size)
+    scale = np.where(lengths > 0, 1 / np.where(lengths > 0, lengths, 1.0), 1.0)
+    scale[: len(low)] = 1.0
+    held, unknowns, squares = {}, start, size
+    for _ in range(len(low) + 1):
+        now = eqx.tree_at(lambda p: p.free, problem, _without(problem.free, held))
+        unknowns, squares = _levenberg_marquardt(
+            now, unknowns, jnp.asarray(scale), jnp.asarray(size), jnp.asarray(tolerance)
+        )
+        coordinates = np.array(unknowns.coordinates)
+        beyond = {int(k): low[k] for k in np.flatnonzero(coordinates < low)}
+        beyond |= {int(k): high[k] for k in np.flatnonzero(coordinates > high)}
+        held |= beyond
+        coordinates[list(held)] = list(held.values())
+        unknowns = unknowns._replace(coordinates=jnp.asarray(coordinates))
+        if not beyond:
+            break
+    return Refined(unknowns, float(squares) / _samples(problem), tuple(sorted(held)), False)
+
+
+class Polished(NamedTuple):
+    """The end of the line: where, what is simulated there, and the noise as the residuals show it."""
+
+    refined: Refined
+    evaluation: Evaluation
+    noise: np.ndarray
+
+
+# Gauss-Newton steps of the polish, and the share of the sum of squares below which a step is not worth it
+POLISH = 12
+WORTH = 1e-9
+
+
+def polish(problem: Problem, end: Refined) -> Polished:
+    """Gauss-Newton to the bottom, while each output is weighed by what its own residuals turn out to be.
+
+    The claim of convergence is the gradient's: no step within the bounds would lower the sum of squares by
+    more than `WORTH`. A coordinate held at a bound is let go where the gradient points back inside.
+    """
+    low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
+    held, unknowns, share = set(end.at_bound), end.unknowns, 1.0
+    best, converged, evaluation = np.inf, False, None
+    noise = np.asarray(problem.noise)
+    counted = np.asarray(problem.counts)[np.asarray(problem.tape.run)]
+    for _ in range(POLISH):
+        evaluation = evaluate(problem, unknowns)
+        noise, stretch = _own_noise(problem, evaluation, counted)
+        scaled = evaluation._replace(
+            residuals=evaluation.residuals * stretch[:, None],
+            jacobian=evaluation.jacobian * stretch[:, None, None],
+        )
+        matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
+        held = {k for k in held if (matrix[k, -1] > 0) == (unknowns.coordinates[k] <= low[k])}
+        squares = float(np.log(np.maximum(noise, 1e-300)).sum())
+        step, gain = _gauss_newton(matrix, held)
+        if squares > best + 1e-9 and share > 1e-3:
+            share /= 4  # the last step was too long
+        else:
+            best, origin, direction, share = squares, unknowns, step, 1.0
+            if gain <= WORTH * matrix[-1, -1]:
+                converged = True
+                break
+        moved = np.asarray(_flatten(origin)) + share * direction
+        inside = np.clip(moved[: len(low)], low, high)
+        held |= set(np.flatnonzero(inside != moved[: len(low)]).tolist())
+        moved[: len(low)] = inside
+        unknowns = _unflatten(problem, jnp.asarray(moved))
+    assert evaluation is not None
+    fitness = float(np.square(np.asarray(evaluation.residuals)[counted]).sum()) / _samples(problem)
+    return Polished(Refined(unknowns, fitness, tuple(sorted(held)), converged), scaled, noise)
+
+
+def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 3) -> tuple[Unknowns, Evaluation]:
+    """Fit only what belongs to each run: its initial state, and its load where nobody knows it."""
+    still = eqx.tree_at(lambda p: p.free, problem, jnp.zeros_like(problem.free))
+    everyone = np.ones(problem.tape.runs)
+    for _ in range(passes):
+        matrix = np.asarray(normal_matrix(evaluate(still, unknowns), still.tape, everyone))
+        step, _ = _gauss_newton(matrix, set())
+        unknowns = _unflatten(problem, _flatten(unknowns) + step)
+    return unknowns, evaluate(still, unknowns)
+
+
+def _gauss_newton(matrix: np.ndarray, held: set[int]) -> tuple[np.ndarray, float]:
+    """The step that lowers the sum of squares most, and by how much; unseen directions are left alone."""
+    gradient, hessian = matrix[:-1, -1].copy(), matrix[:-1, :-1].copy()
+    if not np.all(np.isfinite(matrix)):
+        return np.zeros(len(gradient)), np.inf
+    for k in held:
+        gradient[k] = hessian[k, :] = hessian[:, k] = 0.0
+    lengths = np.sqrt(np.diag(hessian))
+    lengths = np.where(lengths > 0, lengths, 1.0)
+    values, vectors = np.linalg.eigh(hessian / lengths[:, None] / lengths)
+    along = vectors.T @ (gradient / lengths)
+    visible = values > 1e-10 * values.max(initial=1e-300)
+    along = np.where(visible, along, 0.0)
+    shrunk = along / np.where(visible, values, 1.0)
+    return -(vectors @ shrunk) / lengths, float(along @ shrunk)
+
+
+def _own_noise(problem: Problem, evaluation: Evaluation, counted: np.ndarray):
+    """Standard deviation of the residuals of each output, and the old scale over the new."""
+    weight = np.asarray(problem.tape.weight)[counted].sum((0, 2))
+    squares = np.square(np.asarray(evaluation.residuals)[counted]).sum((0, 2))
+    ratio = np.sqrt(squares / np.maximum(weight, 1.0))
+    ratio = np.where(ratio > 0, ratio, 1.0)
+    return np.asarray(problem.noise) * ratio, 1 / ratio
+
+
+def _samples(problem: Problem) -> float:
+    counted = np.asarray(problem.counts)[np.asarray(problem.tape.run)]
+    return max(float(np.asarray(problem.tape.weight)[counted].sum((0, 2)).max()), 1.0)
+
+
+def _without(free, held) -> Bool[Array, " parameters"]:
+    return jnp.asarray([bool(f) and k not in held for k, f in enumerate(np.asarray(free))])

@@ -1,0 +1,191 @@
+"""Global search: evolutionary algorithms over whole populations of motors."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import InputError
+from ..motor import Motor
+from ..simulate import Tape, squared_errors
+from .parameters import Parameters
+
+if TYPE_CHECKING:
+    from ..report.terminal import ReportProgress
+
+# Candidates a thread takes at least: below this, starting it costs more than it saves.
+SHARE = 64
+
+
+class Method(NamedTuple):
+    """A search: where evosax keeps it, and the population and generations it is good at."""
+
+    algorithm: Callable[[], type]
+    population: int
+    generations: int
+    distribution: bool = False  # evolves a distribution from a mean, not a population
+
+
+def _binary_ga() -> type:
+    from .binary_ga import BinaryGA
+
+    return BinaryGA
+
+
+def _evosax(name: str) -> Callable[[], type]:
+    def load() -> type:
+        from evosax import algorithms
+
+        return getattr(algorithms, name)
+
+    return load
+
+
+METHODS: Mapping[str, Method] = {
+    "cma_es": Method(_evosax("CMA_ES"), 32, 60, distribution=True),
+    "paper_ga": Method(_binary_ga, 20, 200),
+    "differential_evolution": Method(_evosax("DifferentialEvolution"), 128, 80),
+    "particle_swarm": Method(_evosax("PSO"), 128, 40),
+}
+
+# A distribution starts from the best of this many candidates scattered over the bounds.
+SCATTERED = 256
+
+# The search may stop once the best tenth of the population agree this well, in natural logarithms.
+AGREED = 0.02
+
+
+class Found(NamedTuple):
+    """All that the search leaves behind."""
+
+    candidates: np.ndarray  # (kept, parameters) coordinates, best first
+    fitness: np.ndarray  # (kept,)
+    best: np.ndarray  # (generations,)
+    median: np.ndarray  # (generations,)
+    evaluations: int
+    interrupted: bool
+
+
+def search(
+    parameters: Parameters,
+    tape: Tape,
+    noise: np.ndarray,
+    method: str = "cma_es",
+    seed: int = 0,
+    population: int | None = None,
+    generations: int | None = None,
+    progress: ReportProgress | None = None,
+) -> Found:
+    """Search the bounds of `parameters` for motors that reproduce the tape.
+
+    The fitness is the paper's equation (10), F1 + a F2, mean square speed error plus `a` times mean square
+    current error, over the variance of the noise of speed: `a` is the ratio of the two variances, so that a
+    perfect model has 2 (or 1 with a single output). Simulations that fail count as infinitely bad.
+
+    **Arguments**: `noise`, standard deviations of current (A) and speed (rad/s); `method`, a key of `METHODS`;
+    `population` and `generations`, by default the method's own; `progress`, called every generation.
+    Interrupted from the keyboard, the search ends with what it has.
+    """
+    if method not in METHODS:
+        raise InputError("--search", f"there is no search {method}", f"Choose of {', '.join(METHODS)}")
+    chosen = METHODS[method]
+    size, rounds = population or chosen.population, generations or chosen.generations
+    low, high = np.asarray(parameters.lower), np.asarray(parameters.upper)
+    key = jax.random.key(seed)
+    fitness_of = _Fitness(parameters, tape, noise)
+
+    algorithm = _algorithm(method, size, len(low))
+    settings = algorithm.default_params
+    start = _scattered(key, SCATTERED if chosen.distribution else size, len(low))
+    seen = [(start, fitness_of.scattered(low + (high - low) * start, size))]
+    if chosen.distribution:
+        state = algorithm.init(key, jnp.asarray(start[np.argmin(seen[0][1])]), settings)
+    else:
+        state = algorithm.init(key, jnp.asarray(start), jnp.asarray(seen[0][1]), settings)
+
+    interrupted = False
+    try:
+        for generation in range(1, rounds):
+            ask, tell = jax.random.split(jax.random.fold_in(key, generation))
+            asked, state = algorithm.ask(ask, state, settings)
+            cube = np.clip(np.asarray(asked), 0.0, 1.0)
+            fitness = fitness_of(low + (high - low) * cube)
+            state, _ = algorithm.tell(tell, jnp.asarray(cube), jnp.asarray(fitness), state, settings)
+            seen.append((cube, fitness))
+            if progress:
+                best = min(f.min() for _, f in seen)
+                progress(f"searching, generation {generation}", float(best), generation / rounds)
+            elite = cube[np.argsort(fitness)[: size // 10 + 1]]
+            if generation > 10 and np.all(np.ptp((high - low) * elite, axis=0) < AGREED):
+                break
+    except KeyboardInterrupt:
+        interrupted = True
+    return _collect(seen, low, high, interrupted)
+
+
+@functools.cache
+def _algorithm(method: str, population: int, dimensions: int):
+    """One instance for each size: evosax compiles its steps anew for every instance."""
+    return METHODS[method].algorithm()(population, jnp.zeros(dimensions))
+
+
+class _Fitness:
+    """Fitness of a population: coordinates (population, parameters) to (population,)."""
+
+    def __init__(self, parameters: Parameters, tape: Tape, noise: np.ndarray):
+        self.parameters, self.noise = parameters, noise
+        # on the device once, not at every generation
+        self.tape: Tape = jax.tree.map(jnp.asarray, tape)
+        self.samples = np.maximum(np.asarray(tape.weight).sum((0, 2)), 1.0)
+        self.threads = os.cpu_count() or 1
+
+    def scattered(self, coordinates: np.ndarray, size: int) -> np.ndarray:
+        """Many candidates in populations of the usual size, for which the simulation is compiled already."""
+        parts = np.array_split(coordinates, max(1, len(coordinates) // size))
+        return np.concatenate([self(part) for part in parts])
+
+    def __call__(self, coordinates: np.ndarray) -> np.ndarray:
+        # XLA walks a population on one core; the cores share the population out among them
+        shares = max(1, min(self.threads, len(coordinates) // SHARE))
+        while len(coordinates) % shares:
+            shares -= 1  # unequal shares would be compiled once more
+        if shares == 1:
+            return self._part(coordinates)
+        with ThreadPoolExecutor(shares) as pool:
+            return np.concatenate(list(pool.map(self._part, np.split(coordinates, shares))))
+
+    def _part(self, coordinates: np.ndarray) -> np.ndarray:
+        with jax.enable_x64(True):  # the setting belongs to the thread
+            motors: Motor = self.parameters(jnp.asarray(coordinates))
+            errors = np.stack([np.asarray(e) for e in squared_errors(motors, self.tape)])
+        mean_squares = errors / (self.samples * self.noise**2)[:, None]
+        return np.minimum(mean_squares.sum(0), 1e300)
+
+
+def _scattered(key: jax.Array, size: int, dimensions: int) -> np.ndarray:
+    """A Latin hypercube: every parameter's range covered evenly, whatever the population."""
+    shuffle, jitter = jax.random.split(key)
+    keys = jax.random.split(shuffle, dimensions)
+    strata = np.stack([np.asarray(jax.random.permutation(k, size)) for k in keys], axis=1)
+    return (strata + np.asarray(jax.random.uniform(jitter, strata.shape))) / size
+
+
+def _collect(seen: list, low: np.ndarray, high: np.ndarray, interrupted: bool) -> Found:
+    cubes = np.concatenate([cube for cube, _ in seen])
+    fitness = np.concatenate([f for _, f in seen])
+    order = np.argsort(fitness, kind="stable")[:2000]
+    return Found(
+        candidates=low + (high - low) * cubes[order],
+        fitness=fitness[order],
+        best=np.minimum.accumulate([f.min() for _, f in seen]),
+        median=np.array([np.median(f) for _, f in seen]),
+        evaluations=len(fitness),
+        interrupted=interrupted,
+    )

@@ -1,0 +1,103 @@
+"""How sure an estimate is, when residuals are correlated, and which directions the data cannot see."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..simulate import LOCAL
+
+# A direction known no better than this, as standard error of a logarithm, counts as unseen.
+FLAT = 0.5
+
+
+class Information(NamedTuple):
+    """What the runs tell about the coordinates."""
+
+    covariance: Float[np.ndarray, "parameters parameters"]  # unseen directions left out
+    unseen: tuple[np.ndarray, ...]  # unit vectors, logarithms of parameters
+
+
+def information(residuals, jacobian, run, free: np.ndarray, runs: int) -> Information:
+    """Covariance of the estimated coordinates that stays right when residuals are correlated.
+
+    With H = sum J'J, the estimate's error is H^-1 sum_k J_k' r_k. Each run's own unknowns are projected out; then
+    the variance of the sum is the long-run variance of its terms, whatever their correlation in time.
+
+    **Arguments**: `residuals` (blocks, 2, samples) and `jacobian` (blocks, 2, samples, columns), over the noise;
+    `run`, the run of each block; `free`, which coordinates were estimated; `runs`, how many runs count, from the
+    first on.
+
+    **Source**: White, Econometrica 48 (1980); Andrews, Monahan, Econometrica 60 (1992), doi:10.2307/2951574.
+    """
+    residuals, jacobian, run = (np.asarray(x) for x in (residuals, jacobian, run))
+    count = jacobian.shape[-1] - LOCAL
+    shared, scores = [], []
+    for index in range(runs):
+        J = jacobian[run == index]
+        r = residuals[run == index]
+        own = J[..., count:].reshape(-1, LOCAL)
+        across = J[..., :count].reshape(-1, count)
+        # the run's own unknowns take their part away
+        taken = np.linalg.pinv(own.T @ own, hermitian=True) @ (own.T @ across)
+        across = (across - own @ taken).reshape(*J.shape[:-1], count)
+        shared.append(np.einsum("bcsi,bcsj->ij", across, across))
+        # samples in order, both outputs of an instant together
+        scores.append(np.einsum("bcsi,bcs->bsi", across, r).reshape(-1, count))
+    hessian = np.sum(shared, 0)
+    unseen, inverse = _split(hessian, free)
+    spread = sum(long_run_variance(score @ inverse) for score in scores)
+    return Information(np.asarray(spread), unseen)
+
+
+def _split(hessian: np.ndarray, free: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Unseen directions, and the inverse on the others."""
+    count = len(hessian)
+    inverse = np.zeros((count, count))
+    index = np.flatnonzero(free)
+    values, vectors = np.linalg.eigh(hessian[np.ix_(index, index)])
+    seen = values > max(1 / FLAT**2, 1e-13 * values.max(initial=0.0))
+    full = np.zeros((count, len(index)))
+    full[index] = vectors
+    inverse = (full[:, seen] / values[seen]) @ full[:, seen].T
+    return tuple(full[:, k] for k in np.flatnonzero(~seen)), inverse
+
+
+def long_run_variance(terms: Float[np.ndarray, "samples n"]) -> Float[np.ndarray, "n n"]:
+    """Variance of the sum of correlated terms with mean zero.
+
+    Prewhitened by one autoregression each, then a quadratic-spectral kernel with the automatic bandwidth of
+    Andrews (1991); on sums over short stretches, which keep the variance of the whole sum and make slow
+    correlation easier to see.
+    """
+    stretch = max(1, len(terms) // 2000)
+    whole = len(terms) // stretch * stretch
+    sums = terms[:whole].reshape(-1, stretch, terms.shape[1]).sum(1)
+    memory = np.clip(_autoregression(sums), -0.97, 0.97)
+    whitened = sums[1:] - memory * sums[:-1]
+    rest = np.clip(_autoregression(whitened), -0.97, 0.97)
+    slow = np.sum(4 * rest**2 / (1 - rest) ** 8) / np.sum((1 - rest) ** -4.0)
+    bandwidth = 1.3221 * max(slow * len(whitened), 1e-12) ** 0.2
+    lags = np.arange(1, min(len(whitened) - 1, int(8 * bandwidth) + 2))
+    kernel = _quadratic_spectral(lags / bandwidth)
+    length = 2 ** int(np.ceil(np.log2(len(whitened) + len(lags) + 1)))
+    spectrum = np.fft.rfft(whitened, length, axis=0)
+    variance = whitened.T @ whitened
+    for i in range(variance.shape[0]):
+        cross = np.fft.irfft(np.conj(spectrum[:, i : i + 1]) * spectrum, length, axis=0)
+        one_sided = kernel @ cross[lags]
+        variance[i] += one_sided
+        variance[:, i] += one_sided
+    recolour = 1 / (1 - memory)
+    return variance * recolour[:, None] * recolour * (len(sums) / len(whitened))
+
+
+def _autoregression(series: np.ndarray) -> np.ndarray:
+    return np.sum(series[1:] * series[:-1], 0) / (np.sum(series[:-1] ** 2, 0) + 1e-300)
+
+
+def _quadratic_spectral(x: np.ndarray) -> np.ndarray:
+    z = 6 * np.pi * x / 5
+    return 25 / (12 * np.pi**2 * x**2) * (np.sin(z) / z - np.cos(z))

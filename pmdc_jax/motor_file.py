@@ -1,0 +1,88 @@
+"""Motors as JSON files: values, and how sure they are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .effects import EFFECTS
+from .errors import InputError
+from .motor import PARAMETERS, Motor
+
+if TYPE_CHECKING:
+    from .identify.identification import Identification
+
+FORMAT = "pmdc motor 1"
+
+
+def save_motor(
+    path: str | Path, motor: Motor, identification: Identification | None = None
+) -> None:
+    """Write a motor as JSON, atomically.
+
+    **Arguments**: `motor`, of scalars; `identification`, whose standard errors, statuses and covariance (of the
+    coordinates: natural logarithms of positive parameters) are kept beside the values.
+    """
+    from .report.files import write_text
+
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "parameters": {name: float(getattr(motor, name)) for name in PARAMETERS},
+        "units": dict(PARAMETERS),
+        "effects": [
+            {"name": e.name, "parameters": {f: float(getattr(e, f)) for f in e.ranges}}
+            for e in motor.effects
+        ],
+    }
+    if identification is not None:
+        found = identification.parameters
+        content["stderr"] = {name: estimate.stderr for name, estimate in found.items()}
+        content["status"] = {name: estimate.status for name, estimate in found.items()}
+        content["covariance"] = {
+            "of": "coordinates: natural logarithms of positive parameters",
+            "names": list(identification.covariance_names),
+            "matrix": np.asarray(identification.covariance).tolist(),
+        }
+    write_text(Path(path), json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def load_motor(path: str | Path) -> Motor:
+    """Read a motor written by `save_motor`, or by hand: only "parameters" is needed.
+
+    **Raises**: `InputError` where the file is missing, is not JSON, or lacks or misspells something.
+    """
+    where = str(path)
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(where, "there is no such file", "Write one with pmdc identify --save") from None
+    except OSError as error:
+        raise InputError(where, f"cannot be read ({error.strerror})", "Check path and permissions") from None
+    except ValueError as error:
+        raise InputError(where, f"is not JSON ({error})", "Write one with pmdc identify --save") from None
+    if not isinstance(content, dict) or not isinstance(content.get("parameters"), dict):
+        raise InputError(where, 'has no "parameters"', "Write one with pmdc identify --save")
+    constants = _numbers(where, content["parameters"], PARAMETERS, "parameters")
+    effects = []
+    for entry in content.get("effects", []):
+        name = entry.get("name") if isinstance(entry, dict) else entry
+        if name not in EFFECTS:
+            raise InputError(where, f"effect {name!r} is not known", f"Choose of {', '.join(EFFECTS)}")
+        fields = _numbers(where, entry.get("parameters", {}), EFFECTS[name].ranges, name)
+        effects.append(EFFECTS[name](**fields))
+    return Motor(**constants, effects=tuple(effects))
+
+
+def _numbers(where: str, given: dict, wanted, of: str) -> dict[str, np.ndarray]:
+    numbers = {}
+    for name in wanted:
+        value = given.get(name)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+            raise InputError(where, f"{of}: {name} is {value!r}, not a number", "Give a number in SI")
+        if name in PARAMETERS and not (value > 0 or (name == "f" and value == 0)):
+            raise InputError(where, f"{of}: {name} is {value}, not positive", "Give a value in SI")
+        numbers[name] = np.asarray(float(value))
+    return numbers

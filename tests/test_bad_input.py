@@ -1,0 +1,401 @@
+"""Broken and nasty recordings: each is refused with a message that names the file and the trouble.
+
+`cases()` is one table for Python and for the command line.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.io import savemat
+
+from pmdc_jax.errors import InputError
+from pmdc_jax.recording import Recording, read_recording, write_recording
+
+HEADER = "time_s,voltage_V,current_A,speed_rad_s"
+
+
+class Case(NamedTuple):
+    """`write` puts files into a folder and returns their paths and further command line arguments;
+    the message must hold `fragment`."""
+
+    name: str
+    write: Callable[[Path], tuple[list[Path], list[str]]]
+    fragment: str
+
+
+def rows(count=20, columns=4, start=0.0, step=0.01):
+    """Lines of a good recording."""
+    values = np.random.default_rng(0).normal(size=(count, columns)).round(4)
+    values[:, 0] = start + step * np.arange(count)
+    return [",".join(f"{x:.6g}" for x in row) for row in values]
+
+
+def csv(*lines, name="run.csv", args=(), encoding="utf-8", end="\n"):
+    """Write these lines."""
+
+    def write(folder):
+        path = folder / name
+        path.write_bytes((end.join(lines) + end).encode(encoding))
+        return [path], list(args)
+
+    return write
+
+
+def edited(line, text, header=HEADER, **kwargs):
+    """A good file with one line (counted from 1) replaced."""
+    lines = [header, *rows(columns=header.count(",") + 1)]
+    lines[line - 1] = text
+    return csv(*lines, **kwargs)
+
+
+def raw(content, name="run.csv"):
+    """Write these bytes."""
+
+    def write(folder):
+        (folder / name).write_bytes(content)
+        return [folder / name], []
+
+    return write
+
+
+def mat(name="run.mat", **variables):
+    """Write a MATLAB file."""
+
+    def write(folder):
+        savemat(folder / name, variables)
+        return [folder / name], []
+
+    return write
+
+
+def frame(name="run.parquet", **columns):
+    """Write a Parquet file."""
+
+    def write(folder):
+        pl.DataFrame(columns).write_parquet(folder / name)
+        return [folder / name], []
+
+    return write
+
+
+def missing(folder):
+    """A file that is not there."""
+    return [folder / "absent.csv"], []
+
+
+def a_folder(folder):
+    """A folder named like a file."""
+    (folder / "run.csv").mkdir()
+    return [folder / "run.csv"], []
+
+
+def mapped(*columns, header="a,b,c,d"):
+    """A file whose columns are mapped by hand."""
+    args = [part for column in columns for part in ("--column", column)]
+    return csv(header, *rows(), args=args)
+
+
+def good_mat(**changes):
+    """Variables of a good MATLAB file with changes."""
+    t = np.arange(50) * 0.01
+    return {"time_s": t, "voltage_V": np.sin(t), "speed_rad_s": np.cos(t)} | changes
+
+
+def nan_share(share, column):
+    """A file with this share of empty cells in one column."""
+    lines = [HEADER]
+    for k, line in enumerate(rows(100)):
+        cells = line.split(",")
+        if (k % 10) < 10 * share:
+            cells[column] = ""
+        lines.append(",".join(cells))
+    return csv(*lines)
+
+
+def cases() -> Iterator[Case]:
+    """The table."""
+    yield Case("missing file", missing, "no such file")
+    yield Case("folder", a_folder, "folder")
+    yield Case("empty file", raw(b""), "the file is empty")
+    yield Case("only blank lines", raw(b"\n\n \n"), "no header")
+    yield Case("only a byte order mark", raw(b"\xef\xbb\xbf"), "no header")
+    yield Case("header only", csv(HEADER), "no rows")
+    yield Case("one sample", csv(HEADER, *rows(1)), "at least 10")
+    yield Case("nine samples", csv(HEADER, *rows(9)), "9 samples")
+    yield Case("no header", csv(*rows()), "line 1: the first line holds numbers")
+    yield Case(
+        "no time column", csv("index,voltage_V,current_A,speed_rad_s", *rows()), "no time column"
+    )
+    yield Case(
+        "nothing useful", csv("time_s,a,b,c", *rows()), "columns in the file: time_s, a, b, c"
+    )
+    yield Case("voltage alone", csv("time_s,voltage_V", *rows(columns=2)), "nothing to identify")
+    yield Case("speed alone", csv("time_s,speed_rad_s", *rows(columns=2)), "nothing to identify")
+    yield Case("blanks separate", csv("time_s voltage_V speed_rad_s", "0 1 2"), "separate them by")
+    yield Case(
+        "text in a column", edited(7, "0.05,1,oops,2"), "line 7, column current_A: 'oops' is not"
+    )
+    yield Case(
+        "line of units", csv(HEADER, "s,V,A,rad/s", *rows()), "line 2, column time_s: 's' is not"
+    )
+    yield Case("clock time", edited(2, "12:00:01,1,2,3"), "line 2, column time_s: '12:00:01'")
+    yield Case(
+        "text after comments",
+        csv("# bench 3", "", HEADER, "# begin", *rows(12), "", "0.5,1,x,2"),
+        "line 18, column current_A: 'x'",
+    )
+    yield Case(
+        "decimal comma between commas",
+        csv("time_s,voltage_V,speed_rad_s", *["0,01,1,0,2,0"] * 20),
+        "line 2: it has 6 fields",
+    )
+    yield Case("a thousand's comma", edited(5, '0.03,"1,234.5",1,1'), "line 5, column voltage_V")
+    yield Case("long row", edited(9, "0.07,1,2,3,4"), "line 9: it has 5 fields")
+    yield Case("short row", edited(11, "0.09,1"), "line 11: it has 2 fields")
+    yield Case("cut off in the middle", edited(21, "0.19,0."), "line 21: it has 2 fields")
+    yield Case("unclosed quote", edited(6, '0.04,"1,2,3'), "run.csv")
+    yield Case(
+        "Latin-1 header",
+        csv("time_s,voltage_V,Winkel [°]", *rows(columns=3), encoding="latin-1"),
+        "line 1: byte 26 (0xb0) is not UTF-8",
+    )
+    yield Case("Latin-1 later", edited(8, "0.06,1,2,3 µ", encoding="latin-1"), "line 8: byte")
+    yield Case("UTF-16", csv(HEADER, *rows(), encoding="utf-16"), "UTF-16")
+    yield Case("binary junk", raw(bytes(range(256)) * 20), "no text")
+    yield Case("gzip named csv", raw(gzip.compress(b"time_s" * 99)), "run.csv")
+    yield Case("unknown suffix", raw(b"PK\x03\x04", "run.xlsx"), "unknown kind of file '.xlsx'")
+    yield Case("no suffix", csv(HEADER, *rows(), name="run"), "unknown kind of file ''")
+    yield Case(
+        "duplicate columns",
+        csv("time_s,voltage_V,speed_rad_s,speed_rad_s", *rows()),
+        "'speed_rad_s' 2 times",
+    )
+    yield Case(
+        "two columns for one quantity",
+        csv("time_s,voltage_V,speed_rad_s,Speed [rpm]", *rows()),
+        "columns speed_rad_s and Speed [rpm]: both mean speed",
+    )
+    yield Case(
+        "unknown unit",
+        csv("time_s,voltage_V,current_A,speed [furlong]", *rows()),
+        "column speed [furlong]: unknown unit 'furlong'",
+    )
+    yield Case(
+        "speed in kg",
+        csv("time_s,voltage_V,current_A,speed [kg]", *rows()),
+        "'kg' does not measure speed",
+    )
+    yield Case(
+        "speed in Hz",
+        csv("time_s,voltage_V,current_A,speed [1/s]", *rows()),
+        "'1/s' does not measure speed",
+    )
+    yield Case("time goes backwards", edited(12, "0.02,1,2,3"), "line 12, column time_s: time goes")
+    yield Case(
+        "two runs in one file",
+        csv(HEADER, *rows(15), *rows(15)),
+        "line 17, column time_s: time goes backwards",
+    )
+    yield Case("repeated time", edited(4, "0.01,1,2,3"), "line 4, column time_s: the time stamp")
+    yield Case(
+        "time rounded away", csv(HEADER, *rows(step=0.0)), "line 3, column time_s: the time stamp"
+    )
+    yield Case("time missing", edited(6, ",1,2,3"), "line 6, column time_s: 1 of 20 values")
+    yield Case("voltage missing", edited(6, "0.04,,2,3"), "line 6, column voltage_V: 1 of 20")
+    yield Case("voltage NaN", edited(3, "0.01,NaN,2,3"), "line 3, column voltage_V: 1 of 20")
+    yield Case(
+        "load missing",
+        edited(5, "0.03,1,2,NA", header="time_s,voltage_V,speed_rad_s,load_torque_Nm"),
+        "line 5, column load_torque_Nm",
+    )
+    yield Case("infinite speed", edited(10, "0.08,1,2,inf"), "line 10, column speed_rad_s: 1 inf")
+    yield Case(
+        "speed mostly missing",
+        nan_share(0.3, 3),
+        "column speed_rad_s: 30 of 100 values are missing",
+    )
+    yield Case(
+        "driving current missing",
+        edited(6, "0.04,,3", header="time_s,current_A,speed_rad_s"),
+        "line 6, column current_A",
+    )
+    yield Case(
+        "voltage column empty, nothing else drives",
+        csv("time_s,voltage_V,speed_rad_s", *[f"{k / 100},,{k}" for k in range(20)]),
+        "nothing to identify",
+    )
+    yield from mapping_cases()
+    yield from binary_cases()
+
+
+def mapping_cases() -> Iterator[Case]:
+    """Bad `--column` arguments."""
+    three = ("time=a:s", "voltage=b:V")
+    yield Case("map to no column", mapped(*three, "speed=z:rpm"), "no column 'z'")
+    yield Case("map no quantity", mapped(*three, "torsion=c"), "unknown quantity 'torsion'")
+    yield Case("map in a wrong unit", mapped(*three, "speed=c:kg"), "'kg' does not measure speed")
+    yield Case("map in no unit", mapped(*three, "speed=c:rpn"), "unknown unit 'rpn'")
+    yield Case(
+        "map one to two", mapped(*three, "speed=c:rpm", "current=c:A"), "both speed and current"
+    )
+    yield Case("map nothing", mapped(*three, "speed="), "no column ''")
+
+
+def binary_cases() -> Iterator[Case]:
+    """Bad MATLAB and Parquet files."""
+    yield Case("text named mat", raw(b"time_s,voltage_V\n" * 20, "run.mat"), "no MATLAB file")
+    yield Case("short junk named mat", raw(b"ab", "run.mat"), "no MATLAB file")
+    hdf5 = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n" * 20
+    yield Case("MATLAB v7.3", raw(hdf5, "run.mat"), "-v7")
+    yield Case("mat of texts", mat(note="hello"), "no vectors")
+    yield Case("mat of one matrix", mat(data=np.eye(30)), "no vectors")
+    yield Case("mat without time", mat(**good_mat(time_s="none")), "no time column")
+    yield Case(
+        "mat of unequal lengths",
+        mat(**good_mat(speed_rad_s=np.arange(40.0))),
+        "variables speed_rad_s and time_s: 40 and 50 samples",
+    )
+    yield Case(
+        "mat with two speeds",
+        mat(a=good_mat(), b={"speed_rpm": np.arange(50.0)}),
+        "both mean speed",
+    )
+    yield Case("mat with NaN in time", mat(**good_mat(time_s=np.full(50, np.nan))), "column time_s")
+    yield Case("text named parquet", raw(b"time_s,voltage_V\n" * 20, "run.parquet"), "no Parquet")
+    t = [k / 10 for k in range(20)]
+    words = ["fast"] * 20
+    yield Case(
+        "parquet with texts",
+        frame(time_s=t, voltage_V=t, speed_rad_s=words),
+        "column speed_rad_s: it holds String",
+    )
+    yield Case(
+        "parquet with time backwards",
+        frame(time_s=t[::-1], voltage_V=t, speed_rad_s=t),
+        "row 2, column time_s: time goes backwards",
+    )
+    yield Case("empty parquet", frame(time_s=[], voltage_V=[], speed_rad_s=[]), "no rows")
+
+
+def columns_of(args):
+    """The mapping in `--column` arguments."""
+    return dict(value.split("=", 1) for value in args[1::2])
+
+
+@pytest.mark.parametrize("case", list(cases()), ids=lambda case: case.name)
+def test_is_refused_with_a_message_that_names_file_and_trouble(case, tmp_path):
+    paths, args = case.write(tmp_path)
+    with pytest.raises(InputError) as caught:
+        for path in paths:
+            read_recording(path, columns_of(args))
+    message = str(caught.value)
+    assert case.fragment in message
+    assert paths[-1].name in message
+    assert "\n" not in message
+    assert caught.value.mend
+
+
+def test_there_are_many_cases():
+    names = [case.name for case in cases()]
+    assert len(names) == len(set(names)) >= 35
+
+
+def forbid(monkeypatch, mode):
+    """As root nothing is forbidden, so opening a file is made to fail."""
+    opened = Path.open
+
+    def refuse(self, how="r", *args, **kwargs):
+        if mode in how:
+            raise PermissionError(13, "Permission denied")
+        return opened(self, how, *args, **kwargs)
+
+    monkeypatch.setattr(Path, "open", refuse)
+
+
+def test_no_permission_to_read(tmp_path, monkeypatch):
+    (path,), _ = csv(HEADER, *rows())(tmp_path)
+    forbid(monkeypatch, "r")
+    with pytest.raises(InputError, match=r"run\.csv: no permission to read"):
+        read_recording(path)
+
+
+@pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="root may read anything")
+def test_no_permission_to_read_for_real(tmp_path):
+    (path,), _ = csv(HEADER, *rows())(tmp_path)
+    path.chmod(0)
+    with pytest.raises(InputError, match=r"run\.csv: no permission to read"):
+        read_recording(path)
+
+
+def good_recording():
+    t = np.arange(20) / 10
+    return Recording("run", t, voltage=np.sin(t), speed=np.cos(t))
+
+
+def test_no_permission_to_write(tmp_path, monkeypatch):
+    forbid(monkeypatch, "w")
+    with pytest.raises(InputError, match=r"out\.csv: it cannot be written \(Permission denied\)"):
+        write_recording(good_recording(), tmp_path / "out.csv")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "what"), [("absent/out.csv", "No such"), ("out.mat", "kind")])
+def test_bad_output(tmp_path, name, what):
+    with pytest.raises(InputError, match=what):
+        write_recording(good_recording(), tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"time": np.zeros(20)}, "sample 2, column time: the time stamp"),
+        ({"speed": np.zeros(19)}, "column speed: shape"),
+        ({"speed": None}, "nothing to identify"),
+        ({"voltage": np.full(20, np.inf)}, "infinite"),
+    ],
+)
+def test_recordings_made_in_python_are_checked_too(changes, what):
+    t = np.arange(20) / 10
+    with pytest.raises(InputError, match=what):
+        Recording(**{"name": "run", "time": t, "voltage": t, "speed": t} | changes)
+
+
+def test_damaged_text_is_read_or_refused_but_never_breaks(tmp_path):
+    rng = np.random.default_rng(0)
+    good = "\n".join([HEADER, *rows(12)]).encode()
+    path = tmp_path / "run.csv"
+    for _ in range(200):
+        text = bytearray(good)
+        for place in rng.integers(len(good) - 40, size=2):
+            piece = bytes(
+                rng.choice(list(b',;\n"#\t -eE.\r9x'), rng.integers(0, 4)).astype(np.uint8)
+            )
+            text[place : place + rng.integers(0, 4)] = piece
+        path.write_bytes(bytes(text))
+        try:
+            read_recording(path)
+        except InputError as error:
+            assert str(path) in str(error)
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".parquet"])
+def test_files_cut_short_are_refused(tmp_path, suffix):
+    if suffix == ".mat":
+        mat(**good_mat())(tmp_path)
+    else:
+        write_recording(good_recording(), tmp_path / "run.parquet")
+    path = tmp_path / f"run{suffix}"
+    content = path.read_bytes()
+    for share in (0.1, 0.5, 0.9):
+        path.write_bytes(content[: int(share * len(content))])
+        with pytest.raises(InputError, match="run"):
+            read_recording(path)

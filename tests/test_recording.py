@@ -1,0 +1,310 @@
+"""Reading and writing recordings, and understanding their headers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time as clock
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.io import savemat
+
+from pmdc_jax.columns import understand
+from pmdc_jax.recording import Recording, read_recording, write_recording
+
+T = np.arange(12) * 0.01
+NUMBER = {"allow_nan": False, "allow_infinity": False, "width": 64}
+
+
+def table(header, *columns, separator=","):
+    lines = [
+        separator.join(f"{x!r}" for x in map(float, row)) for row in zip(*columns, strict=True)
+    ]
+    return "\n".join([header, *lines]) + "\n"
+
+
+def read_text(folder, text, columns=None, name="run.csv", encoding="utf-8"):
+    path = folder / name
+    path.write_bytes(text.encode(encoding))
+    return read_recording(path, columns)
+
+
+@st.composite
+def recordings(draw):
+    count = draw(st.integers(10, 40))
+    steps = draw(arrays(float, count, elements=st.floats(1e-6, 1e3, **NUMBER)))
+    start = draw(st.floats(-1e3, 1e3, **NUMBER))
+    channel = arrays(float, count, elements=st.floats(-1e12, 1e12, **NUMBER))
+    optional = ("current", "load", "angle", "temperature", "torque")
+    present = {name: draw(channel) for name in optional if draw(st.booleans())}
+    present["speed"] = draw(channel)
+    present["speed"][3] = np.nan  # a missing sample
+    return Recording("run", start + np.cumsum(steps), voltage=draw(channel), **present)
+
+
+@given(recordings(), st.sampled_from([".csv", ".parquet"]))
+@settings(max_examples=40, deadline=None)
+def test_what_is_written_is_read_again_to_the_last_bit(recording, suffix):
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"run{suffix}"
+        write_recording(recording, path)
+        again = read_recording(path)
+        assert [file.name for file in Path(folder).iterdir()] == [path.name]
+    assert again.name == "run" and not again.notes and not again.ignored
+    assert set(again.columns()) == set(recording.columns())
+    for quantity, values in recording.columns().items():
+        np.testing.assert_array_equal(again.columns()[quantity], values)
+
+
+RPM, DEGREE = np.pi / 30, np.pi / 180
+UNDERSTOOD = [
+    ("Speed [rpm]", "speed", RPM),
+    ("SPEED (RPM)", "speed", RPM),
+    ("rpm", "speed", RPM),
+    ("Speed, rpm", "speed", RPM),
+    ("motor speed rpm", "speed", RPM),
+    ("n / min^-1", "speed", RPM),
+    ("Drehzahl [1/min]", "speed", RPM),
+    ("n in U/min", "speed", RPM),
+    ("speed [deg/s]", "speed", DEGREE),
+    ("speed_deg_s", "speed", DEGREE),
+    ("speed [rev/s]", "speed", 2 * np.pi),
+    ("omega (rad/s)", "speed", 1),
+    ("ω [rad/s]", "speed", 1),
+    ("speed_rad_per_s", "speed", 1),
+    ("v [m/s]", "speed", 1),
+    ("data.speed_rpm", "speed", RPM),
+    ("Current (mA)", "current", 1e-3),
+    ("Motorstrom [mA]", "current", 1e-3),
+    ("i_A", "current", 1),
+    ("u [V]", "voltage", 1),
+    ("U / V", "voltage", 1),
+    ("v [mV]", "voltage", 1e-3),
+    ("Ankerspannung [V]", "voltage", 1),
+    ("Angle [deg]", "angle", DEGREE),
+    ("Winkel [°]", "angle", DEGREE),
+    ("position [mm]", "angle", 1e-3),
+    ("time_ms", "time", 1e-3),
+    ("Zeit [µs]", "time", 1e-6),
+    ("t", "time", 1),
+    ("time (Sec)", "time", 1),
+    ("load_N_m", "load", 1),
+    ("Lastmoment [mNm]", "load", 1e-3),
+    ("load_torque [N·m]", "load", 1),
+    ("torque [Ncm]", "torque", 1e-2),
+    ("T [°C]", "temperature", 1),
+]
+
+
+@pytest.mark.parametrize(("header", "quantity", "scale"), UNDERSTOOD)
+def test_headers_that_are_understood(header, quantity, scale):
+    column = understand(header)
+    assert column is not None
+    assert column.quantity == quantity
+    assert column.scale == pytest.approx(scale, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "v",
+        "i",
+        "n",
+        "T [Nm]",
+        "Drehzahl",
+        "speed_ref",
+        "speed_max",
+        "current_limit",
+        "u",
+        "",
+        "[V]",
+    ],
+)
+def test_headers_that_say_too_little(header):
+    assert understand(header) is None
+
+
+def test_temperatures_have_an_offset():
+    column = understand("winding_temperature [°F]")
+    assert column is not None
+    assert 212 * column.scale + column.offset == pytest.approx(100)
+
+
+@given(
+    st.sampled_from(["{} [{}]", "{} ({})", "{}_{}", "{} / {}", "{} in {}"]),
+    st.sampled_from(["speed", "Motor Speed", "OMEGA", "angular_velocity"]),
+    st.sampled_from([("rpm", RPM), ("deg/s", DEGREE), ("rad/s", 1.0), ("krpm", 1e3 * RPM)]),
+)
+@settings(max_examples=60, deadline=None)
+def test_every_way_to_write_a_unit(pattern, name, unit):
+    column = understand(pattern.format(name, unit[0]))
+    assert column is not None
+    assert (column.quantity, column.scale) == ("speed", pytest.approx(unit[1], rel=1e-14))
+
+
+def test_numbers_become_si_and_the_rest_is_remembered(tmp_path):
+    text = table("time_ms,voltage_V,Speed [rpm],flag", 1000 * T, T, 60 + T, T)
+    run = read_text(tmp_path, text)
+    np.testing.assert_allclose(run.time, T, atol=1e-15)
+    np.testing.assert_allclose(run.speed, 2 * np.pi + T * RPM)
+    assert run.current is None and run.ignored == ("flag",) and run.notes == ()
+    assert len(run) == 12 and run.sample_time == pytest.approx(0.01)
+    assert run.duration == pytest.approx(0.11)
+
+
+def test_names_without_a_unit_are_taken_as_si_and_noted(tmp_path):
+    run = read_text(tmp_path, table("time_s,voltage_V,speed", T, T, T))
+    (note,) = run.notes
+    assert (note.column, note.severity) == ("speed", "note")
+    assert "taken as rad/s" in note.what
+
+
+def test_an_unused_look_alike_is_noted(tmp_path):
+    run = read_text(tmp_path, table("time_s,voltage_V,current_A,speed_kg", T, T, T, T))
+    (note,) = run.notes
+    assert note.column == "speed_kg" and "looks like speed" in note.what
+
+
+def test_shaft_and_axis_together_are_warned_of(tmp_path):
+    run = read_text(tmp_path, table("time_s,voltage_V,speed [m/s],load [N m]", T, T, T, T))
+    assert [finding.severity for finding in run.notes] == ["warning"]
+
+
+@pytest.mark.parametrize(
+    ("mapping", "scale"),
+    [
+        ({"speed": "rpm_meas:rpm"}, RPM),
+        ({"speed": "rpm_meas"}, 1),
+        ({"speed": "w:a [rpm]"}, RPM),
+        ({"speed": "w:a [rpm]:deg/s"}, DEGREE),
+        ({"speed": "enc_rpm"}, RPM),
+    ],
+)
+def test_columns_mapped_by_hand(tmp_path, mapping, scale):
+    text = table("time_s,voltage_V,rpm_meas,w:a [rpm],enc_rpm", T, T, T, T, T)
+    run = read_text(tmp_path, text, mapping)
+    np.testing.assert_allclose(run.speed, T * scale)
+
+
+def test_what_is_mapped_wins_over_what_is_understood(tmp_path):
+    text = table("time_s,voltage_V,speed_rad_s,Speed [rpm]", T, T, T, T)
+    run = read_text(tmp_path, text, {"speed": "Speed [rpm]", "load_torque": "speed_rad_s:Nm"})
+    np.testing.assert_allclose(run.speed, T * RPM)
+    np.testing.assert_allclose(run.load, T)
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_dialects_of_csv(tmp_path, separator, end):
+    text = "\ufeff# bench 3\n\n" + table(
+        separator.join(["time_s", "voltage_V", "speed_rad_s"]), T, T, T, separator=separator
+    )
+    lines = text.splitlines()
+    lines.insert(6, "# pause")
+    lines.insert(9, "")
+    text = end.join([*lines, "", ""])
+    run = read_text(tmp_path, text)
+    np.testing.assert_array_equal(run.speed, T)
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_decimal_commas(tmp_path, separator):
+    text = table(f"time_s{separator}voltage_V{separator}speed_rad_s", T, T, T, separator=separator)
+    run = read_text(tmp_path, text.replace(".", ","))
+    np.testing.assert_array_equal(run.speed, T)
+
+
+def test_padded_and_quoted_numbers(tmp_path):
+    text = table("time_s, voltage_V ,speed_rad_s", T, T, T).replace(",", " , ")
+    np.testing.assert_array_equal(read_text(tmp_path, text).speed, T)
+    quoted = "\n".join(
+        ",".join(f'"{cell.strip()}"' for cell in line.split(",")) for line in text.splitlines()
+    )
+    np.testing.assert_array_equal(read_text(tmp_path, quoted).speed, T)
+
+
+def test_header_in_a_comment_as_numpy_writes_it(tmp_path):
+    path = tmp_path / "run.csv"
+    columns = np.stack([T, T, T], axis=1)
+    np.savetxt(path, columns, delimiter=",", header="time_s,voltage_V,speed_rad_s")
+    np.testing.assert_allclose(read_recording(path).speed, T)
+
+
+@pytest.mark.parametrize("cell", ["", "NaN", "nan", "NA", " "])
+def test_missing_outputs_are_nan(tmp_path, cell):
+    lines = table("time_s,voltage_V,current_A,speed_rad_s", T, T, T, T).splitlines()
+    lines[4] = f"0.03,1,{cell},{cell}"
+    run = read_text(tmp_path, "\n".join(lines))
+    assert run.current is not None and run.speed is not None
+    assert np.flatnonzero(np.isnan(run.current)).tolist() == [3]
+    assert np.flatnonzero(np.isnan(run.speed)).tolist() == [3]
+
+
+def test_an_empty_column_counts_as_absent(tmp_path):
+    lines = ["time_s,voltage_V,current_A,speed_rad_s", *[f"{t},,1,{t}" for t in T]]
+    run = read_text(tmp_path, "\n".join(lines))
+    assert run.voltage is None and run.drive == "current" and run.halves == ("mechanical",)
+    assert [note.column for note in run.notes] == ["voltage_V"]
+
+
+@pytest.mark.parametrize(
+    ("quantities", "drive", "halves"),
+    [
+        ("voltage current speed", "voltage", ("electrical", "mechanical")),
+        ("voltage angle", "voltage", ("electrical", "mechanical")),
+        ("voltage current", "voltage", ("electrical", "mechanical")),
+        ("current angle", "current", ("mechanical",)),
+        ("current torque speed", "torque", ("mechanical",)),
+    ],
+)
+def test_what_a_run_can_say(quantities, drive, halves):
+    run = Recording("run", T, **dict.fromkeys(quantities.split(), T))
+    assert (run.drive, run.halves) == (drive, halves)
+
+
+@pytest.mark.parametrize("shape", [(-1,), (-1, 1), (1, -1)])
+@pytest.mark.parametrize("nested", [False, True])
+def test_matlab_vectors_of_any_orientation(tmp_path, shape, nested):
+    variables = {"t": T, "voltage_V": T, "Speed_rpm": T, "gain": 35.15, "note": "hello"}
+    variables = {
+        k: v.reshape(shape) if k in "t voltage_V Speed_rpm" else v for k, v in variables.items()
+    }
+    savemat(tmp_path / "run.mat", {"log": {"run1": variables}} if nested else variables)
+    run = read_recording(tmp_path / "run.mat")
+    np.testing.assert_allclose(run.speed, T * RPM)
+    np.testing.assert_array_equal(run.time, T)
+
+
+def test_integers_in_parquet_and_matlab(tmp_path):
+    whole = np.arange(12)
+    columns = {"time_s": whole, "voltage_V": whole, "speed_rad_s": whole}
+    pl.DataFrame(columns).write_parquet(tmp_path / "run.parquet")
+    savemat(tmp_path / "run.mat", columns)
+    for name in ("run.parquet", "run.mat"):
+        np.testing.assert_array_equal(read_recording(tmp_path / name).speed, whole)
+
+
+def test_a_million_rows_take_about_a_second(tmp_path):
+    rng = np.random.default_rng(0)
+    count = 1_000_000
+    columns = dict(zip(("voltage", "current", "speed"), rng.normal(size=(3, count)), strict=True))
+    write_recording(Recording("big", np.arange(count) / 1e4, **columns), tmp_path / "big.csv")
+    begin = clock.perf_counter()
+    assert len(read_recording(tmp_path / "big.csv")) == count
+    assert clock.perf_counter() - begin < 5  # on a machine that others use too
+
+
+def test_importing_is_light():
+    code = (
+        "import sys, pmdc_jax.recording, pmdc_jax.check;"
+        "print(*{'jax', 'pint', 'polars', 'scipy'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
