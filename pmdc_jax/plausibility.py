@@ -58,7 +58,7 @@ def _reversed(run: Recording) -> Iterator[tuple[str, str]]:
         elif R.negative and Kb.value > 0:
             yield "current", "its sign is opposite to that of the voltage"
     elif any(_falls_when_driven(run, longer) for longer in LONGER):
-        yield "speed", f"it falls where the {run.drive} should make it rise"
+        yield "speed", f"it falls where the {run.drive} should make it rise: one has a wrong sign"
 
 
 def _falls_when_driven(run: Recording, longer: int) -> bool:

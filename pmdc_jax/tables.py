@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -21,6 +21,7 @@ MISSING = ["NA", "N/A", "n/a", "null", "NULL", "None"]
 NUMBERS_ONLY = "Recordings hold plain numbers; leave a cell empty where a sample is missing"
 
 
+@runtime_checkable
 class Table(Protocol):
     """A file with named columns."""
 
