@@ -79,7 +79,7 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
 
 def normal_matrix(
     evaluation: Evaluation, tape: Tape, counts: Bool[Array, " runs"] | np.ndarray
-) -> Float[Array, "columns+1 columns+1"]:
+) -> Float[Array, "unknowns unknowns"]:
     """[J r]' [J r] over all unknowns: coordinates, then the locals run by run, then the residual."""
     _, r, jacobian = evaluation
     both = jnp.concatenate([jacobian, r[..., None]], -1)

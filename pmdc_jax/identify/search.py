@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -13,16 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import InputError
-from ..motor import Motor
 from ..simulate import Tape, squared_errors
 from .parameters import Parameters
 
 if TYPE_CHECKING:
     from ..report.terminal import ReportProgress
-
-# Candidates a thread takes at least: below this, starting it costs more than it saves.
-SHARE = 64
-
 
 class Method(NamedTuple):
     """A search: where evosax keeps it, and the population and generations it is good at."""
@@ -144,7 +137,6 @@ class _Fitness:
         # on the device once, not at every generation
         self.tape: Tape = jax.tree.map(jnp.asarray, tape)
         self.samples = np.maximum(np.asarray(tape.weight).sum((0, 2)), 1.0)
-        self.threads = os.cpu_count() or 1
 
     def scattered(self, coordinates: np.ndarray, size: int) -> np.ndarray:
         """Many candidates in populations of the usual size, for which the simulation is compiled already."""
@@ -152,19 +144,8 @@ class _Fitness:
         return np.concatenate([self(part) for part in parts])
 
     def __call__(self, coordinates: np.ndarray) -> np.ndarray:
-        # XLA walks a population on one core; the cores share the population out among them
-        shares = max(1, min(self.threads, len(coordinates) // SHARE))
-        while len(coordinates) % shares:
-            shares -= 1  # unequal shares would be compiled once more
-        if shares == 1:
-            return self._part(coordinates)
-        with ThreadPoolExecutor(shares) as pool:
-            return np.concatenate(list(pool.map(self._part, np.split(coordinates, shares))))
-
-    def _part(self, coordinates: np.ndarray) -> np.ndarray:
-        with jax.enable_x64(True):  # the setting belongs to the thread
-            motors: Motor = self.parameters(jnp.asarray(coordinates))
-            errors = np.stack([np.asarray(e) for e in squared_errors(motors, self.tape)])
+        motors = self.parameters(jnp.asarray(coordinates))
+        errors = np.stack([np.asarray(e) for e in squared_errors(motors, self.tape)])
         mean_squares = errors / (self.samples * self.noise**2)[:, None]
         return np.minimum(mean_squares.sum(0), 1e300)
 

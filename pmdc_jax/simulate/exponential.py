@@ -20,8 +20,8 @@ def product(a: Matrix, b: Matrix) -> Matrix:
     return jnp.stack([a[i, 0] * b[0] + a[i, 1] * b[1] for i in range(2)])
 
 
-def phi_functions(z: Matrix) -> tuple[list[Matrix], list[Matrix]]:
-    """phi_0 to phi_3 of z / 2 and of z.
+def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
+    """phi_0 to phi_count of z / 2 and of z.
 
     phi_0(z) = exp(z), phi_k(z) = sum_j z^j / (j + k)!. A Taylor series of a scaled-down z, doubled up again by
     phi_p(2 z) = 2^-p (phi_0 phi_p + sum_{j=1..p} phi_j / (p - j)!), and phi_0 = 1 + z phi_1 so that slow
@@ -32,26 +32,29 @@ def phi_functions(z: Matrix) -> tuple[list[Matrix], list[Matrix]]:
     """
     one = jnp.zeros_like(z).at[0, 0].set(1.0).at[1, 1].set(1.0)
     small = z / 2**HALVINGS
-    phis = []
-    for k in range(1, 4):
+
+    def series(k: int) -> Matrix:
         term = one / float(math.factorial(ORDER + k))
         for j in reversed(range(ORDER)):
             term = one / float(math.factorial(j + k)) + product(small, term)
-        phis.append(term)
+        return term
 
     def double(half, scaled):
-        f1, f2, f3 = half
-        f0 = one + product(scaled, f1)
-        return (
-            (product(f0, f1) + f1) / 2,
-            (product(f0, f2) + f1 + f2) / 4,
-            (product(f0, f3) + f1 / 2 + f2 + f3) / 8,
+        f0 = one + product(scaled, half[0])
+        return tuple(
+            sum(
+                (half[j - 1] / float(math.factorial(p - j)) for j in range(1, p + 1)),
+                start=product(f0, half[p - 1]),
+            )
+            / 2**p
+            for p in range(1, count + 1)
         )
 
-    def doubling(n, carry):
+    def doubling(_, carry):
         half, scaled = carry
         return double(half, scaled), 2 * scaled
 
-    half, scaled = jax.lax.fori_loop(0, HALVINGS - 1, doubling, (tuple(phis), small))
+    start = (tuple(series(k) for k in range(1, count + 1)), small)
+    half, scaled = jax.lax.fori_loop(0, HALVINGS - 1, doubling, start)
     full = double(half, scaled)
     return [one + product(scaled, half[0]), *half], [one + product(z, full[0]), *full]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+
 import diffrax
 import equinox as eqx
 import jax
@@ -18,17 +21,38 @@ UNROLL = {True: 8, False: 4}
 SMALL = 64
 
 
-@eqx.filter_jit
+# Candidates a thread takes at least: below this, handing them over costs more than it saves.
+SHARE = 64
+
+
 def squared_errors(
     motors: Motor, tape: Tape
 ) -> tuple[Float[Array, " population"], Float[Array, " population"]]:
     """Sums of squared errors of current (A^2) and speed (rad^2/s^2) for a population, in free run.
 
-    Blocks are walked one after another with the whole population in the state.
-
     **Arguments**: `motors`, whose fields have the shape (population,). Every run starts at the tape's initial
     state; unknown loads are taken as zero. A motor whose simulation fails gets infinity, never NaN.
     """
+    size = motors.R.shape[0]
+    shares = max(1, min(os.cpu_count() or 1, size // SHARE))
+    if shares == 1 or size % shares:  # unequal shares would be compiled once more
+        return _squared_errors(motors, tape)
+    double = jax.config.read("jax_enable_x64")
+
+    def part(k: int):
+        with jax.enable_x64(double):  # the setting belongs to the thread
+            mine = slice(k * size // shares, (k + 1) * size // shares)
+            return _squared_errors(jax.tree.map(lambda leaf: leaf[mine], motors), tape)
+
+    # XLA walks a population on one core; the cores share it out among them
+    with ThreadPoolExecutor(shares) as pool:
+        current, speed = zip(*pool.map(part, range(shares)), strict=True)
+    return jnp.concatenate(current), jnp.concatenate(speed)
+
+
+@eqx.filter_jit
+def _squared_errors(motors: Motor, tape: Tape):
+    """One share: its blocks one after another, the whole population in the state."""
     grids = along_grids(motors, tape)
     unroll = UNROLL[motors.R.shape[0] <= SMALL]
 

@@ -50,10 +50,11 @@ def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator
     doi:10.1006/jcph.2002.6995.
     """
     A, B = motor.state_space(drive)
-    (half0, half1, *_), (phi0, phi1, phi2, phi3) = phi_functions(A * step)
-    inputs = step * product(phi1, B)
     if not motor.effects:
-        return Propagator(phi0, inputs)
+        _, (phi0, phi1) = phi_functions(A * step, 1)
+        return Propagator(phi0, step * product(phi1, B))
+    (half0, half1, *_), (phi0, phi1, phi2, phi3) = phi_functions(A * step, 3)
+    inputs = step * product(phi1, B)
     push = step / 2 * half1
     stages = Stages(
         half=half0,
