@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .compilation_cache import keep_compiled
 from .errors import InputError
 
 if TYPE_CHECKING:
@@ -199,7 +200,12 @@ def _deliver(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit status: 0 done, 2 bad input or arguments, 130 interrupted."""
+    """Run one command; the exit status: 0 done, 2 bad input or arguments, 130 interrupted.
+
+    Without `arguments` this process is the command, takes its own, and keeps what it compiles.
+    """
+    if arguments is None:
+        keep_compiled()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # an Ω must not fail on an old code page

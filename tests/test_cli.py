@@ -45,7 +45,7 @@ def faked(monkeypatch, tmp_path):
 
     replace_function(monkeypatch, "pmdc_jax.identify", "identify", identify)
     replace_function(monkeypatch, "pmdc_jax.recording", "read_recording", read_recording)
-    replace_function(monkeypatch, "pmdc_jax.motor", "save_motor", save_motor)
+    replace_function(monkeypatch, "pmdc_jax.motor_file", "save_motor", save_motor)
     for variable in ("FORCE_COLOR", "TTY_COMPATIBLE"):  # rich takes these for a terminal
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.chdir(tmp_path)
@@ -206,7 +206,7 @@ def test_a_program_error_is_not_hidden(faked):
 
 def test_simulate_reads_simulates_and_writes(faked, monkeypatch, capsys):
     written = []
-    replace_function(monkeypatch, "pmdc_jax.motor", "load_motor", lambda path: f"motor {path}")
+    replace_function(monkeypatch, "pmdc_jax.motor_file", "load_motor", lambda path: f"motor {path}")
     replace_function(monkeypatch, "pmdc_jax.simulate", "simulate", lambda motor, run: (motor, run))
     replace_function(
         monkeypatch,

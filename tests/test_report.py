@@ -63,6 +63,7 @@ def fake_run(name: str, rng: np.random.Generator, samples: int) -> RunFit:
         current_simulated=current,
         speed=noisy_speed,
         speed_simulated=speed,
+        load=None,
     )
 
 

@@ -77,6 +77,7 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     return Evaluation(seen, (seen - tape.measured) * scale, jacobian)
 
 
+@eqx.filter_jit
 def normal_matrix(
     evaluation: Evaluation, tape: Tape, counts: Bool[Array, " runs"] | np.ndarray
 ) -> Float[Array, "unknowns unknowns"]:

@@ -86,9 +86,9 @@ def sensitivities(
     )(jnp.eye(count))
     motor = prepared[0]
     begins = _begins(motor, initial, tape)
-    starts = begins
-    if motor.effects:
-        starts, _ = _join(prepared, tape, initial, load_offset)
+    # the derivatives by the parameters are those at the joined starts, also for a linear motor
+    guess, last = _join(prepared, tape, initial, load_offset)
+    starts = _stitch(last, tape, guess, begins)
     states = starts.shape[1]
     columns = count + 1 + states
     d_prepared = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_prepared)
