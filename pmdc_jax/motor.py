@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
@@ -127,7 +128,7 @@ class Motor(eqx.Module):
         grips = [effect.grip(state) for effect in self.effects if effect.holds == holds]
         if not grips:
             return None
-        return Grip(sum(g.backward for g in grips), sum(g.forward for g in grips))
+        return reduce(lambda a, b: Grip(a.backward + b.backward, a.forward + b.forward), grips)
 
     def sensors(self, current: Scalars, speed: Scalars) -> tuple[Scalars, Scalars]:
         """Current in A and speed in rad/s as the sensors report them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import subprocess
 import sys
 import time
@@ -11,10 +12,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from attrs import evolve
 from test_report import fake_identification, partial_identification
 
 from pmdc_jax import cli
+from pmdc_jax.compilation_cache import keep_compiled
 from pmdc_jax.errors import InputError
+from pmdc_jax.identify.identification import Estimate
 
 HEAVY = ("jax", "numpy", "plotly", "polars", "scipy", "equinox", "diffrax")
 
@@ -251,3 +255,64 @@ def test_progress_tells_what_it_does_on_a_terminal(monkeypatch, capsys):
     out, err = capsys.readouterr()
     assert out == ""
     assert "refining" in err
+
+
+CACHE = "JAX_COMPILATION_CACHE_DIR"
+
+
+def cache_folder(monkeypatch, **environment: str) -> str | None:
+    """Where JAX is told to keep what it compiles, in this environment."""
+    monkeypatch.setattr("os.environ", environment)
+    keep_compiled()
+    return environment.get(CACHE)
+
+
+def test_compiled_code_goes_to_the_users_cache(monkeypatch, tmp_path):
+    folder = cache_folder(monkeypatch, HOME=str(tmp_path), XDG_CACHE_HOME=str(tmp_path / "c"))
+    assert "pmdc_jax" in folder
+    assert not Path(folder).exists()  # that is left to JAX, when there is something to keep
+
+
+def test_compiled_code_goes_where_the_user_says(monkeypatch, tmp_path):
+    assert Path(cache_folder(monkeypatch, PMDC_CACHE=str(tmp_path / "new"))).parent.name == "new"
+    assert cache_folder(monkeypatch, PMDC_CACHE=str(tmp_path), **{CACHE: "mine"}) == "mine"
+
+
+def test_no_compiled_code_is_kept_where_that_is_unwanted_or_impossible(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert cache_folder(monkeypatch, PMDC_CACHE="") is None
+    assert cache_folder(monkeypatch, PMDC_CACHE=str(tmp_path / "file")) is None
+    assert cache_folder(monkeypatch, PMDC_CACHE=str(tmp_path / "file" / "below")) is None
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert cache_folder(monkeypatch, PMDC_CACHE=str(tmp_path)) is None
+
+
+def test_only_the_command_keeps_compiled_code(faked, monkeypatch, tmp_path):
+    environment = {"PMDC_CACHE": str(tmp_path)}
+    monkeypatch.setattr("os.environ", environment)
+    assert cli.main(["identify", "a.csv"]) == 0  # called by a program
+    assert CACHE not in environment
+    monkeypatch.setattr("sys.argv", ["pmdc", "identify", "a.csv"])
+    assert cli.main() == 0
+    assert environment[CACHE].startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("code", "kept"),
+    [("import pmdc_jax, pmdc_jax.cli", False), ("from pmdc_jax.cli import main; main()", True)],
+)
+def test_jax_keeps_what_the_command_compiles(tmp_path, code, kept):
+    code = f"{code}\nimport jax; jax.jit(lambda x: x + 1)(1.0)"
+    environment = {n: v for n, v in os.environ.items() if not n.startswith("JAX_")}
+    environment["PMDC_CACHE"] = str(tmp_path)
+    run = [sys.executable, "-c", code, "--help"]
+    subprocess.run(run, check=True, capture_output=True, env=environment)
+    assert bool(list(tmp_path.rglob("*-cache"))) == kept
+
+
+def test_a_parameter_that_no_run_knows_of_is_printed(faked, capsys):
+    R = Estimate(None, None, None, "ohm", "not_identifiable")
+    faked.result = evolve(faked.result, parameters=faked.result.parameters | {"R": R})
+    assert cli.main(["identify", "a.csv"]) == 0
+    row = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("R "))
+    assert row.split() == ["R", "–", "Ω", "–", "–", "not", "identifiable"]

@@ -18,12 +18,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 
 if TYPE_CHECKING:
     from ..motor import Motor
 
-Scalars = Float[Array, "*batch"]
+Scalars = Float[Array | np.ndarray, "*batch"]
 
 
 class State(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -23,6 +23,7 @@ from .identifiability import explain
 from .identification import Direction, Estimate, Identification, Role, RunFit, Search, Status
 from .noise import white_noise
 from .parameters import Parameters, check_names, effects_named, unit_of
+from .profile import QUADRATIC, profile_interval
 from .refine import Problem, Refined, Unknowns, fit_own, polish, refine
 from .search import Found, search as global_search
 from .uncertainty import FLAT, Information, information
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from ..report.terminal import ReportProgress
 
 STARTS = 4
+REACH = float(stats.norm.ppf(0.975))
 # Two refinements found the same optimum if their fitness agrees to this share.
 SAME = 1e-4
 # Starts nearer to each other than this, in natural logarithms, are one.
@@ -103,12 +105,18 @@ def identify(
     motor = _plain(parameters(best.unknowns.coordinates))
     directions = explain(info.unseen, parameters, training)
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(scale))
+
+    def interval(k: int, spread: float, centre: float) -> tuple[float, float]:
+        if not parameters.logarithmic[k] or spread < QUADRATIC:
+            return centre - REACH * spread, centre + REACH * spread
+        return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], REACH)
+
     unknowns, ended = fit_own(problem, best.unknowns)
     roles: list[Role] = ["train"] * len(recordings) + ["holdout"] * len(holdout)
     fit = _fits(even, roles, tape, np.asarray(ended.seen), np.asarray(unknowns.local))
     return Identification(
         motor=motor,
-        parameters=_estimates(parameters, best, info, untouched, dict(known or {})),
+        parameters=_estimates(parameters, best, info, untouched, dict(known or {}), interval),
         unidentified_directions=directions,
         fit=fit,
         noise=_noise_of(fit),
@@ -203,8 +211,14 @@ def _plain(motor: Motor) -> Motor:
 
 
 def _estimates(
-    parameters: Parameters, best: Refined, info: Information, untouched: Mapping, known: Mapping
+    parameters: Parameters,
+    best: Refined,
+    info: Information,
+    untouched: Mapping[str, float],
+    known: Mapping[str, float],
+    interval: Callable[[int, float, float], tuple[float, float]],
 ) -> dict[str, Estimate]:
+    """What to say of each parameter; `interval` gives the 95 % interval of a coordinate from its spread."""
     coordinates = np.asarray(best.unknowns.coordinates)
     ties = dict(parameters.ties)
     names = [*PARAMETERS, *(n for n in parameters.names if n not in PARAMETERS)]
@@ -224,12 +238,13 @@ def _estimates(
             estimates[name] = Estimate(value, None, None, unit, status)
             continue
         spread = float(np.sqrt(info.covariance[k, k]))
-        reach = float(stats.norm.ppf(0.975)) * spread
+        low, high = interval(k, spread, coordinates[k])
         if parameters.logarithmic[k]:
-            stderr, interval = value * spread, (value * np.exp(-reach), value * np.exp(reach))
+            stderr, low, high = value * spread, np.exp(low), np.exp(high)
         else:
-            stderr, interval = spread, (value - reach, value + reach)
-        estimates[name] = Estimate(value, stderr, (float(interval[0]), float(interval[1])), unit, status)
+            stderr = spread
+        ends = (float(low), float(high))
+        estimates[name] = Estimate(value, stderr, ends, unit, status)
     return estimates
 
 

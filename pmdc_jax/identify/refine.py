@@ -213,7 +213,7 @@ def polish(problem: Problem, end: Refined) -> Polished:
         matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
         held = {k for k in held if (matrix[k, -1] > 0) == (unknowns.coordinates[k] <= low[k])}
         squares = float(np.log(np.maximum(noise, 1e-300)).sum())
-        step, gain = _gauss_newton(matrix, held)
+        step, gain = gauss_newton(matrix, held, len(low))
         if squares > best + 1e-9 and share > 1e-3:
             share /= 4  # the last step was too long
         else:
@@ -237,23 +237,32 @@ def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 3) -> tuple[Unkn
     everyone = np.ones(problem.tape.runs)
     for _ in range(passes):
         matrix = np.asarray(normal_matrix(evaluate(still, unknowns), still.tape, everyone))
-        step, _ = _gauss_newton(matrix, set())
+        step, _ = gauss_newton(matrix, set(), 0)
         unknowns = _unflatten(problem, _flatten(unknowns) + step)
     return unknowns, evaluate(still, unknowns)
 
 
-def _gauss_newton(matrix: np.ndarray, held: set[int]) -> tuple[np.ndarray, float]:
-    """The step that lowers the sum of squares most, and by how much; unseen directions are left alone."""
+# Curvature added to every coordinate in a step, as if each were known to within a factor of e^10 beforehand:
+# nothing to one that the data see, and it keeps one that they do not see where it is.
+RIDGE = 0.01
+
+
+def gauss_newton(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.ndarray, float]:
+    """The step that lowers the sum of squares most, and by how much.
+
+    **Arguments**: `matrix`, as from `normal_matrix`; `held`, which of the `count` coordinates stay.
+    """
     gradient, hessian = matrix[:-1, -1].copy(), matrix[:-1, :-1].copy()
     if not np.all(np.isfinite(matrix)):
         return np.zeros(len(gradient)), np.inf
     for k in held:
         gradient[k] = hessian[k, :] = hessian[:, k] = 0.0
+    hessian[np.arange(count), np.arange(count)] += RIDGE
     lengths = np.sqrt(np.diag(hessian))
     lengths = np.where(lengths > 0, lengths, 1.0)
     values, vectors = np.linalg.eigh(hessian / lengths[:, None] / lengths)
     along = vectors.T @ (gradient / lengths)
-    visible = values > 1e-10 * values.max(initial=1e-300)
+    visible = values > 1e-12 * values.max(initial=1e-300)
     along = np.where(visible, along, 0.0)
     shrunk = along / np.where(visible, values, 1.0)
     return -(vectors @ shrunk) / lengths, float(along @ shrunk)

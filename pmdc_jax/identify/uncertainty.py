@@ -17,6 +17,7 @@ class Information(NamedTuple):
     """What the runs tell about the coordinates."""
 
     covariance: Float[np.ndarray, "parameters parameters"]  # unseen directions left out
+    inflation: Float[np.ndarray, " parameters"]  # of the variance, over that for white residuals
     unseen: tuple[np.ndarray, ...]  # unit vectors, logarithms of parameters
 
 
@@ -49,7 +50,9 @@ def information(residuals, jacobian, run, free: np.ndarray, runs: int) -> Inform
     hessian = np.sum(shared, 0)
     unseen, inverse = _split(hessian, free)
     spread = sum(long_run_variance(score @ inverse) for score in scores)
-    return Information(np.asarray(spread), unseen)
+    white = np.diag(inverse)
+    inflation = np.where(white > 0, np.diag(spread) / np.where(white > 0, white, 1.0), 1.0)
+    return Information(np.asarray(spread), inflation, unseen)
 
 
 def _split(hessian: np.ndarray, free: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:

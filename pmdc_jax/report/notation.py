@@ -36,9 +36,9 @@ class Written:
 
 def write_estimate(estimate: Estimate) -> Written:
     """Write an estimate with as many decimals as its standard error deserves (two digits of it)."""
-    exponent = engineering_exponent(estimate.value)
+    exponent = engineering_exponent(estimate.value or 0.0)
     scale = 10.0**exponent
-    decimals = _decimals(estimate.value / scale, (estimate.stderr or 0.0) / scale)
+    decimals = _decimals((estimate.value or 0.0) / scale, (estimate.stderr or 0.0) / scale)
 
     def write(number: float | None) -> str:
         return fixed(None if number is None else number / scale, decimals)
