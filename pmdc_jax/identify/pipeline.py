@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -93,8 +95,7 @@ def identify(
         free=jnp.ones(len(parameters.names), bool),
         counts=jnp.arange(len(runs)) < len(recordings),
     )
-    ends = [refine(problem, _start(tape, c)) for c in _distinct(found)]
-    ends.sort(key=lambda end: end.fitness)
+    ends = _refine_all(problem, [_start(tape, c) for c in _distinct(found)])
     best, at_best, scale = polish(problem, ends[0])
     refined = time.perf_counter()
 
@@ -185,6 +186,19 @@ def _distinct(found: Found) -> list[np.ndarray]:
         if len(kept) == STARTS:
             break
     return kept
+
+
+def _refine_all(problem: Problem, starts: Sequence[Unknowns]) -> list[Refined]:
+    """Refine from several starts, one a core at a time; the best first."""
+
+    def one(start: Unknowns) -> Refined:
+        with jax.enable_x64(True):  # the setting belongs to the thread
+            return refine(problem, start)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        # the first alone: it compiles for all
+        ends = [one(starts[0]), *pool.map(one, starts[1:])]
+    return sorted(ends, key=lambda end: end.fitness)
 
 
 def _tidy(best: Refined, info: Information, parameters: Parameters) -> Refined:

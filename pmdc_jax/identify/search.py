@@ -42,7 +42,7 @@ def _evosax(name: str) -> Callable[[], type]:
 
 
 METHODS: Mapping[str, Method] = {
-    "cma_es": Method(_evosax("CMA_ES"), 32, 60, distribution=True),
+    "cma_es": Method(_evosax("CMA_ES"), 32, 30, distribution=True),
     "paper_ga": Method(_binary_ga, 20, 200),
     "differential_evolution": Method(_evosax("DifferentialEvolution"), 128, 80),
     "particle_swarm": Method(_evosax("PSO"), 128, 40),
@@ -50,9 +50,11 @@ METHODS: Mapping[str, Method] = {
 
 # A distribution starts from the best of this many candidates scattered over the bounds.
 SCATTERED = 256
+# ... with this standard deviation, in the unit cube: the best of so many is not far off.
+SPREAD = 0.15
 
 # The search may stop once the best tenth of the population agree this well, in natural logarithms.
-AGREED = 0.02
+AGREED = 0.1
 
 
 class Found(NamedTuple):
@@ -96,6 +98,8 @@ def search(
 
     algorithm = _algorithm(method, size, len(low))
     settings = algorithm.default_params
+    if chosen.distribution:
+        settings = settings.replace(std_init=SPREAD)
     start = _scattered(key, SCATTERED if chosen.distribution else size, len(low))
     seen = [(start, fitness_of.scattered(low + (high - low) * start, size))]
     if chosen.distribution:

@@ -15,10 +15,9 @@ from ..motor import Motor
 from .solver import HeldInput, Walk, along_grids, held_step, pick_grid, walk
 from .tape import Tape
 
-# Samples whose arithmetic XLA fuses into one kernel, measured: small populations gain from fewer kernels,
-# large ones lose by recomputation.
-UNROLL = {True: 8, False: 4}
-SMALL = 64
+# Samples of linear motors whose arithmetic XLA fuses into one kernel, measured: small populations gain from fewer
+# kernels, large ones lose by recomputation, and so does every population with effects.
+SMALL, UNROLL_SMALL, UNROLL_LARGE = 64, 8, 4
 
 
 # Candidates a thread takes at least: below this, handing them over costs more than it saves.
@@ -54,7 +53,9 @@ def squared_errors(
 def _squared_errors(motors: Motor, tape: Tape):
     """One share: its blocks one after another, the whole population in the state."""
     grids = along_grids(motors, tape)
-    unroll = UNROLL[motors.R.shape[0] <= SMALL]
+    unroll = UNROLL_SMALL if motors.R.shape[0] <= SMALL else UNROLL_LARGE
+    if motors.effects:
+        unroll = 1
 
     def advance(carry, block):
         along, drive = pick_grid(grids, tape, tape.grid[block])
