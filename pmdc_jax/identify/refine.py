@@ -234,7 +234,7 @@ def polish(problem: Problem, end: Refined) -> Polished:
 def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 3) -> tuple[Unknowns, Evaluation]:
     """Fit only what belongs to each run: its initial state, and its load where nobody knows it."""
     still = eqx.tree_at(lambda p: p.free, problem, jnp.zeros_like(problem.free))
-    everyone = np.ones(problem.tape.runs)
+    everyone = jnp.ones(problem.tape.runs, bool)
     for _ in range(passes):
         matrix = np.asarray(normal_matrix(evaluate(still, unknowns), still.tape, everyone))
         step, _ = gauss_newton(matrix, set(), 0)

@@ -6,9 +6,11 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import qmc
 
 from ..errors import InputError
 from ..simulate import Tape, squared_errors
@@ -100,7 +102,7 @@ def search(
     settings = algorithm.default_params
     if chosen.distribution:
         settings = settings.replace(std_init=SPREAD)
-    start = _scattered(key, SCATTERED if chosen.distribution else size, len(low))
+    start = _scattered(seed, SCATTERED if chosen.distribution else size, len(low))
     seen = [(start, fitness_of.scattered(low + (high - low) * start, size))]
     if chosen.distribution:
         state = algorithm.init(key, jnp.asarray(start[np.argmin(seen[0][1])]), settings)
@@ -148,18 +150,18 @@ class _Fitness:
         return np.concatenate([self(part) for part in parts])
 
     def __call__(self, coordinates: np.ndarray) -> np.ndarray:
-        motors = self.parameters(jnp.asarray(coordinates))
+        motors = _motors(self.parameters, coordinates)
         errors = np.stack([np.asarray(e) for e in squared_errors(motors, self.tape)])
         mean_squares = errors / (self.samples * self.noise**2)[:, None]
         return np.minimum(mean_squares.sum(0), 1e300)
 
 
-def _scattered(key: jax.Array, size: int, dimensions: int) -> np.ndarray:
+_motors = eqx.filter_jit(lambda parameters, coordinates: parameters(coordinates))
+
+
+def _scattered(seed: int, size: int, dimensions: int) -> np.ndarray:
     """A Latin hypercube: every parameter's range covered evenly, whatever the population."""
-    shuffle, jitter = jax.random.split(key)
-    keys = jax.random.split(shuffle, dimensions)
-    strata = np.stack([np.asarray(jax.random.permutation(k, size)) for k in keys], axis=1)
-    return (strata + np.asarray(jax.random.uniform(jitter, strata.shape))) / size
+    return qmc.LatinHypercube(dimensions, rng=np.random.default_rng(seed)).random(size)
 
 
 def _collect(seen: list, low: np.ndarray, high: np.ndarray, interrupted: bool) -> Found:

@@ -86,13 +86,28 @@ def sensitivities(
     )(jnp.eye(count))
     motor = prepared[0]
     begins = _begins(motor, initial, tape)
-    # the derivatives by the parameters are those at the joined starts, also for a linear motor
-    guess, last = _join(prepared, tape, initial, load_offset)
-    starts = _stitch(last, tape, guess, begins)
-    states = starts.shape[1]
+    states = begins.shape[1]
     columns = count + 1 + states
     d_prepared = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_prepared)
-    passed = _pass(prepared, d_prepared, columns, tape, starts, load_offset)
+
+    def once(starts):
+        return _pass(prepared, d_prepared, columns, tape, starts, load_offset)
+
+    # the derivatives by the parameters must be those at the joined starts
+    if motor.effects:
+        guess, last = _join(prepared, tape, initial, load_offset)
+        starts = _stitch(last, tape, guess, begins)
+        passed = once(starts)
+    else:
+        # twice the same pass, for the price of compiling one: the first joins a linear motor's blocks exactly
+        def join(_, carry):
+            starts, joined, _ = carry
+            passed = once(joined)
+            return joined, _stitch(passed, tape, joined, begins), passed
+
+        shapes = jax.eval_shape(once, begins)
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        starts, _, passed = jax.lax.fori_loop(0, 2, join, (begins, begins, nothing))
     joined, d_starts = _stitch_tangents(passed, tape, starts, begins, count)
 
     by_start = passed.d_seen[:, -states:]
