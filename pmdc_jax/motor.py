@@ -60,11 +60,16 @@ class Motor(eqx.Module):
         """
         v, c, t = drive or Drive()
         zero = jnp.zeros_like(self.R)
-        A = [[-v * self.R / self.L, -v * self.Kb / self.L], [v * self.Kt / self.J, -self.f / self.J]]
+        A = [
+            [-v * self.R / self.L, -v * self.Kb / self.L],
+            [v * self.Kt / self.J, -self.f / self.J],
+        ]
         B = [[v / self.L, zero], [(c * self.Kt + t) / self.J, -1 / self.J]]
         return _matrix(A), _matrix(B)
 
-    def transfer_function(self) -> tuple[dict[str, Float[Array, "order *batch"]], Float[Array, "3 *batch"]]:
+    def transfer_function(
+        self,
+    ) -> tuple[dict[str, Float[Array, "order *batch"]], Float[Array, "3 *batch"]]:
         """Numerators by "input -> output" and the common denominator, highest power of s first, equation (9).
 
         voltage -> speed is Kt / (L J s^2 + (R J + L f) s + R f + Kt Kb).
@@ -86,7 +91,7 @@ class Motor(eqx.Module):
     def rest(self, current: Scalars, speed: Scalars) -> State:
         """State with this current and speed and all of the effects' states at zero."""
         zero = jnp.zeros(jnp.broadcast_shapes(jnp.shape(current), jnp.shape(self.R)))
-        return State(zero + current, zero + speed, {name: zero for name in self.states})
+        return State(zero + current, zero + speed, dict.fromkeys(self.states, zero))
 
     def derivative(
         self,

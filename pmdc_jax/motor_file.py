@@ -58,11 +58,17 @@ def load_motor(path: str | Path) -> Motor:
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise InputError(where, "there is no such file", "Write one with pmdc identify --save") from None
+        raise InputError(
+            where, "there is no such file", "Write one with pmdc identify --save"
+        ) from None
     except OSError as error:
-        raise InputError(where, f"cannot be read ({error.strerror})", "Check path and permissions") from None
+        raise InputError(
+            where, f"cannot be read ({error.strerror})", "Check path and permissions"
+        ) from None
     except ValueError as error:
-        raise InputError(where, f"is not JSON ({error})", "Write one with pmdc identify --save") from None
+        raise InputError(
+            where, f"is not JSON ({error})", "Write one with pmdc identify --save"
+        ) from None
     if not isinstance(content, dict) or not isinstance(content.get("parameters"), dict):
         raise InputError(where, 'has no "parameters"', "Write one with pmdc identify --save")
     constants = _numbers(where, content["parameters"], PARAMETERS, "parameters")
@@ -70,7 +76,9 @@ def load_motor(path: str | Path) -> Motor:
     for entry in content.get("effects", []):
         name = entry.get("name") if isinstance(entry, dict) else entry
         if name not in EFFECTS:
-            raise InputError(where, f"effect {name!r} is not known", f"Choose of {', '.join(EFFECTS)}")
+            raise InputError(
+                where, f"effect {name!r} is not known", f"Choose of {', '.join(EFFECTS)}"
+            )
         fields = _numbers(where, entry.get("parameters", {}), EFFECTS[name].ranges, name)
         effects.append(EFFECTS[name](**fields))
     return Motor(**constants, effects=tuple(effects))
@@ -81,7 +89,9 @@ def _numbers(where: str, given: dict, wanted, of: str) -> dict[str, np.ndarray]:
     for name in wanted:
         value = given.get(name)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-            raise InputError(where, f"{of}: {name} is {value!r}, not a number", "Give a number in SI")
+            raise InputError(
+                where, f"{of}: {name} is {value!r}, not a number", "Give a number in SI"
+            )
         if name in PARAMETERS and not (value > 0 or (name == "f" and value == 0)):
             raise InputError(where, f"{of}: {name} is {value}, not positive", "Give a value in SI")
         numbers[name] = np.asarray(float(value))

@@ -1,13 +1,27 @@
-"""Shared by all tests: annotations of the whole package are checked while it runs, and 64-bit arrays."""
+"""For all tests: the package's annotations are checked while it runs, and compilations are kept."""
 
 from __future__ import annotations
 
+# First, so that the change to jaxtyping below is seen by nobody but the package under test.
+import diffrax  # noqa: F401
+import equinox  # noqa: F401
+import evosax  # noqa: F401
 import jax
+import jaxtyping
+import optimistix  # noqa: F401
 import pytest
-from jaxtyping import install_import_hook
 
-# Before anything imports the package: every function and class of it then checks shapes and types.
-install_import_hook("pmdc_jax", "beartype.beartype")
+# Where the package says Array, a numpy array or a Python number will do: JAX takes both. Shapes and
+# kinds of numbers are still checked, of every argument, field and result of every function.
+jaxtyping.Array = jaxtyping.ArrayLike
+jaxtyping.install_import_hook("pmdc_jax", "beartype.beartype")
+
+
+def pytest_configure(config):
+    """Keep compilations between runs, and between the workers of one run: they are most of the time."""
+    if cache := getattr(config, "cache", None):
+        jax.config.update("jax_compilation_cache_dir", str(cache.mkdir("jax")))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 @pytest.fixture

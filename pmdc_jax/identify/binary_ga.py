@@ -43,7 +43,9 @@ class BinaryGA(PopulationBasedAlgorithm):
     Learning", chapters 1 and 3.
     """
 
-    def __init__(self, population_size: int, solution: Float[Array, " n"], bits: int = 10, **kwargs):
+    def __init__(
+        self, population_size: int, solution: Float[Array, " n"], bits: int = 10, **kwargs
+    ):
         super().__init__(population_size, solution, **kwargs)
         self.bits = bits
 

@@ -48,8 +48,16 @@ def _armature(recordings: Sequence[Recording]) -> tuple[float, float]:
         steady = np.linalg.norm(voltage) / scale
         # a motor that only stalls, or only runs light, shows one of the two: then the other is open
         return (R if R > 0 else steady[0]), (Kb if Kb > 0 else steady[1])
-    gains = [_rms(r.voltage) / _rms(r.speed) for r in recordings if r.voltage is not None and r.speed is not None]
-    loads = [_rms(r.voltage) / _rms(r.current) for r in recordings if r.voltage is not None and r.current is not None]
+    gains = [
+        _rms(r.voltage) / _rms(r.speed)
+        for r in recordings
+        if r.voltage is not None and r.speed is not None
+    ]
+    loads = [
+        _rms(r.voltage) / _rms(r.current)
+        for r in recordings
+        if r.voltage is not None and r.current is not None
+    ]
     Kb = float(np.median(gains)) if gains else 0.05
     return (float(np.median(loads)) / 3 if loads else 1.0), Kb
 

@@ -100,7 +100,9 @@ def effects_named(names: Sequence[str]) -> tuple[type[AbstractEffect], ...]:
     """Effect classes by name; raises `InputError` on an unknown one."""
     for name in names:
         if name not in EFFECTS:
-            raise InputError("--effect", f"there is no effect {name}", f"Choose of {', '.join(EFFECTS)}")
+            raise InputError(
+                "--effect", f"there is no effect {name}", f"Choose of {', '.join(EFFECTS)}"
+            )
     return tuple(EFFECTS[name] for name in dict.fromkeys(names))
 
 
@@ -108,4 +110,6 @@ def check_names(option: str, names: Sequence[str]) -> None:
     """Refuse a name that is no parameter of the motor."""
     for name in names:
         if name not in PARAMETERS:
-            raise InputError(option, f"there is no parameter {name}", f"Choose of {', '.join(PARAMETERS)}")
+            raise InputError(
+                option, f"there is no parameter {name}", f"Choose of {', '.join(PARAMETERS)}"
+            )

@@ -27,7 +27,8 @@ from .noise import white_noise
 from .parameters import Parameters, check_names, effects_named, unit_of
 from .profile import QUADRATIC, profile_interval
 from .refine import Problem, Refined, Unknowns, fit_own, polish, refine
-from .search import Found, search as global_search
+from .search import Found
+from .search import search as global_search
 from .uncertainty import FLAT, Information, information
 
 if TYPE_CHECKING:
@@ -147,7 +148,9 @@ def _refuse(recordings, holdout, tie, known) -> None:
     check_names("--known", list(known or {}))
     for target, source in tie:
         if target == source or target in (known or {}) or target in {b for _, b in tie}:
-            raise InputError("--tie", f"{target}={source} ties in a circle or a known value", "Drop one")
+            raise InputError(
+                "--tie", f"{target}={source} ties in a circle or a known value", "Drop one"
+            )
     for name, value in (known or {}).items():
         if not value > 0:
             raise InputError("--known", f"{name}={value} is not positive", "Give a value in SI")
@@ -272,7 +275,11 @@ def _status(k: int, best: Refined, info: Information, tied: bool) -> Status:
 
 
 def _fits(
-    even: Sequence[Recording], roles: Sequence[Role], tape: Tape, seen: np.ndarray, local: np.ndarray
+    even: Sequence[Recording],
+    roles: Sequence[Role],
+    tape: Tape,
+    seen: np.ndarray,
+    local: np.ndarray,
 ) -> dict[str, RunFit]:
     fits = {}
     for index, (run, role) in enumerate(zip(even, roles, strict=True)):
@@ -314,7 +321,10 @@ def _noise_of(fit: Mapping[str, RunFit]) -> dict[str, float | None]:
         pairs = [(getattr(f, name), getattr(f, f"{name}_simulated")) for f in runs]
         return [m - s for m, s in pairs if m is not None and s is not None]
 
-    return {"current_A": white_noise(errors("current")), "speed_rad_s": white_noise(errors("speed"))}
+    return {
+        "current_A": white_noise(errors("current")),
+        "speed_rad_s": white_noise(errors("speed")),
+    }
 
 
 def _search_record(method: str, found: Found, ends: Sequence[Refined], best: Refined) -> Search:

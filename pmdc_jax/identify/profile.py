@@ -45,7 +45,9 @@ def profile_interval(
     return ends[0], ends[1]
 
 
-def _refitted(problem: Problem, start: Unknowns, index: int, value: float) -> tuple[Unknowns, float]:
+def _refitted(
+    problem: Problem, start: Unknowns, index: int, value: float
+) -> tuple[Unknowns, float]:
     unknowns = start._replace(coordinates=start.coordinates.at[index].set(value))
     for _ in range(REFITS):
         matrix = np.array(normal_matrix(evaluate(problem, unknowns), problem.tape, problem.counts))

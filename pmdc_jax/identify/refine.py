@@ -187,16 +187,17 @@ class Polished(NamedTuple):
     noise: np.ndarray
 
 
-# Gauss-Newton steps of the polish, and the share of the sum of squares below which a step is not worth it
-POLISH = 12
-WORTH = 1e-9
+# Gauss-Newton steps of the polish, and the fall of the sum of squares, in noise variances, below which a step is
+# not worth it: the square of 0.03 standard errors.
+POLISH = 20
+WORTH = 1e-3
 
 
 def polish(problem: Problem, end: Refined) -> Polished:
     """Gauss-Newton to the bottom, while each output is weighed by what its own residuals turn out to be.
 
     The claim of convergence is the gradient's: no step within the bounds would lower the sum of squares by
-    more than `WORTH`. A coordinate held at a bound is let go where the gradient points back inside.
+    more than `WORTH` noise variances. A coordinate held at a bound is let go where the gradient points back inside.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
     held, unknowns, share = set(end.at_bound), end.unknowns, 1.0
@@ -218,7 +219,7 @@ def polish(problem: Problem, end: Refined) -> Polished:
             share /= 4  # the last step was too long
         else:
             best, origin, direction, share = squares, unknowns, step, 1.0
-            if gain <= WORTH * matrix[-1, -1]:
+            if gain <= WORTH * matrix[-1, -1] / _samples(problem):
                 converged = True
                 break
         moved = np.asarray(_flatten(origin)) + share * direction
@@ -242,9 +243,9 @@ def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 3) -> tuple[Unkn
     return unknowns, evaluate(still, unknowns)
 
 
-# Curvature added to every coordinate in a step, as if each were known to within a factor of e^10 beforehand:
+# Curvature added to every coordinate in a step, as if each were known to within a factor of e beforehand:
 # nothing to one that the data see, and it keeps one that they do not see where it is.
-RIDGE = 0.01
+RIDGE = 1.0
 
 
 def gauss_newton(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.ndarray, float]:

@@ -19,6 +19,7 @@ from .parameters import Parameters
 if TYPE_CHECKING:
     from ..report.terminal import ReportProgress
 
+
 class Method(NamedTuple):
     """A search: where evosax keeps it, and the population and generations it is good at."""
 
@@ -91,7 +92,9 @@ def search(
     Interrupted from the keyboard, the search ends with what it has.
     """
     if method not in METHODS:
-        raise InputError("--search", f"there is no search {method}", f"Choose of {', '.join(METHODS)}")
+        raise InputError(
+            "--search", f"there is no search {method}", f"Choose of {', '.join(METHODS)}"
+        )
     chosen = METHODS[method]
     size, rounds = population or chosen.population, generations or chosen.generations
     low, high = np.asarray(parameters.lower), np.asarray(parameters.upper)
@@ -116,7 +119,9 @@ def search(
             asked, state = algorithm.ask(ask, state, settings)
             cube = np.clip(np.asarray(asked), 0.0, 1.0)
             fitness = fitness_of(low + (high - low) * cube)
-            state, _ = algorithm.tell(tell, jnp.asarray(cube), jnp.asarray(fitness), state, settings)
+            state, _ = algorithm.tell(
+                tell, jnp.asarray(cube), jnp.asarray(fitness), state, settings
+            )
             seen.append((cube, fitness))
             if progress:
                 best = min(f.min() for _, f in seen)

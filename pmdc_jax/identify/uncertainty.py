@@ -11,12 +11,14 @@ from ..simulate import LOCAL
 
 # A direction known no better than this, as standard error of a logarithm, counts as unseen.
 FLAT = 0.5
+# How far along an unseen direction the truth may lie, as standard deviation of a logarithm: a factor of twenty.
+ANYWHERE = 3.0
 
 
 class Information(NamedTuple):
     """What the runs tell about the coordinates."""
 
-    covariance: Float[np.ndarray, "parameters parameters"]  # unseen directions left out
+    covariance: Float[np.ndarray, "parameters parameters"]
     inflation: Float[np.ndarray, " parameters"]  # of the variance, over that for white residuals
     unseen: tuple[np.ndarray, ...]  # unit vectors, logarithms of parameters
 
@@ -48,24 +50,25 @@ def information(residuals, jacobian, run, free: np.ndarray, runs: int) -> Inform
         # samples in order, both outputs of an instant together
         scores.append(np.einsum("bcsi,bcs->bsi", across, r).reshape(-1, count))
     hessian = np.sum(shared, 0)
-    unseen, inverse = _split(hessian, free)
+    unseen, inverse, blind = _split(hessian, free)
     spread = sum(long_run_variance(score @ inverse) for score in scores)
     white = np.diag(inverse)
     inflation = np.where(white > 0, np.diag(spread) / np.where(white > 0, white, 1.0), 1.0)
-    return Information(np.asarray(spread), inflation, unseen)
+    return Information(np.asarray(spread) + blind, inflation, unseen)
 
 
-def _split(hessian: np.ndarray, free: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Unseen directions, and the inverse on the others."""
-    count = len(hessian)
-    inverse = np.zeros((count, count))
+def _split(hessian: np.ndarray, free: np.ndarray):
+    """Unseen directions, the inverse on the others, and the variance that the unseen ones leave in all."""
     index = np.flatnonzero(free)
     values, vectors = np.linalg.eigh(hessian[np.ix_(index, index)])
     seen = values > max(1 / FLAT**2, 1e-13 * values.max(initial=0.0))
-    full = np.zeros((count, len(index)))
+    full = np.zeros((len(hessian), len(index)))
     full[index] = vectors
     inverse = (full[:, seen] / values[seen]) @ full[:, seen].T
-    return tuple(full[:, k] for k in np.flatnonzero(~seen)), inverse
+    # a parameter with only a small part in an unseen direction is still less sure by that part
+    open_ended = np.minimum(1 / np.maximum(values[~seen], 1e-300), ANYWHERE**2)
+    blind = (full[:, ~seen] * open_ended) @ full[:, ~seen].T
+    return tuple(full[:, k] for k in np.flatnonzero(~seen)), inverse, blind
 
 
 def long_run_variance(terms: Float[np.ndarray, "samples n"]) -> Float[np.ndarray, "n n"]:

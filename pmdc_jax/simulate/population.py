@@ -72,7 +72,12 @@ def _squared_errors(motors: Motor, tape: Tape):
         initial = motors.rest(*tape.initial[tape.run[block]])
         begins = tape.begins[block]
         state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
-        samples = (tape.value[block], tape.load[block], tape.measured[block].T, tape.weight[block].T)
+        samples = (
+            tape.value[block],
+            tape.load[block],
+            tape.measured[block].T,
+            tape.weight[block].T,
+        )
         (state, errors), _ = jax.lax.scan(sample, (state, carry.seen), samples, unroll=unroll)
         return Walk(state, errors)
 

@@ -101,7 +101,7 @@ def sensitivities(
     else:
         # twice the same pass, for the price of compiling one: the first joins a linear motor's blocks exactly
         def join(_, carry):
-            starts, joined, _ = carry
+            _, joined, _ = carry
             passed = once(joined)
             return joined, _stitch(passed, tape, joined, begins), passed
 
@@ -114,7 +114,9 @@ def sensitivities(
     seen = passed.seen + jnp.einsum("sncb,bn->scb", by_start, joined - starts)
     through = jnp.einsum("sncb,bnp->scbp", by_start, d_starts)
     own = jnp.moveaxis(passed.d_seen[:, : count + 1], 1, -1)
-    direct = jnp.concatenate([own[..., :count], jnp.zeros((*own.shape[:-1], 2)), own[..., count:]], -1)
+    direct = jnp.concatenate(
+        [own[..., :count], jnp.zeros((*own.shape[:-1], 2)), own[..., count:]], -1
+    )
     return seen.transpose(2, 1, 0), (direct + through).transpose(2, 1, 0, 3)
 
 
@@ -180,8 +182,10 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
         return Walk((state, d_state), (seen, d_seen))
 
     state = _unpack(motor, starts.T)
-    identity = jnp.zeros((columns, states, len(starts))).at[columns - states :].set(
-        jnp.eye(states)[:, :, None]
+    identity = (
+        jnp.zeros((columns, states, len(starts)))
+        .at[columns - states :]
+        .set(jnp.eye(states)[:, :, None])
     )
     d_state = jax.vmap(lambda column: _unpack(motor, column))(identity)
     seen = (jnp.zeros((2, len(starts))), jnp.zeros((columns, 2, len(starts))))
@@ -222,9 +226,7 @@ def _stitch_tangents(passed: Pass, tape: Tape, starts: Starts, begins: Starts, c
 
     def follow(carry, block):
         begin, first, passed_end, jacobian, start, own = block
-        new, d_new = jax.tree.map(
-            lambda a, b: jnp.where(first, a, b), (begin, at_begin), carry
-        )
+        new, d_new = jax.tree.map(lambda a, b: jnp.where(first, a, b), (begin, at_begin), carry)
         return (passed_end + jacobian @ (new - start), jacobian @ d_new + own), (new, d_new)
 
     blocks = (begins, jnp.asarray(tape.begins), passed.end, by_start, starts, by_own)

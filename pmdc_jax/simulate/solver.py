@@ -95,9 +95,7 @@ def held_step(
     n2, e2 = rates(_add(halfway, _times(push, n1)), _shifted(state.extra, h / 2, e1))
     end = _add(moved, _times(2 * push, n2), _times(turn, n0))
     n3, e3 = rates(end, _shifted(state.extra, h, e2))
-    moved = _add(
-        moved, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3)
-    )
+    moved = _add(moved, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
     extra = {
         name: state.extra[name] + h / 6 * (e0[name] + 2 * (e1[name] + e2[name]) + e3[name])
         for name in state.extra
@@ -109,7 +107,9 @@ def held_step(
     return State(*moved, extra)
 
 
-def _cross(row: int, grip: Grip | None, before: tuple, after: tuple, push: Float[Array, "2 *batch"]):
+def _cross(
+    row: int, grip: Grip | None, before: tuple, after: tuple, push: Float[Array, "2 *batch"]
+):
     """Mend a step in which the state that a dry element holds comes to zero.
 
     For a share of the step the state moved on as it did before; for the rest of it the element takes

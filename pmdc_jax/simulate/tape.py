@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..motor import Drive
-from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ..recording import Recording
@@ -84,7 +84,9 @@ class Tape(eqx.Module):
         """Number of runs."""
         return self.initial.shape[0]
 
-    def samples_of(self, run: int, signal: Float[Array, "blocks samples"], length: int) -> np.ndarray:
+    def samples_of(
+        self, run: int, signal: Float[Array, "blocks samples"], length: int
+    ) -> np.ndarray:
         """The `length` samples of one run, cut out of a signal laid out like the tape."""
         return np.asarray(signal)[np.asarray(self.run) == run].reshape(-1)[:length]
 

@@ -64,7 +64,11 @@ def _speed_of(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
     unwrapped = np.full_like(angle, np.nan)
     jumps = np.abs(np.diff(angle[known]))
     # a wrapped angle jumps by most of a turn between samples; a travel in metres or turns never does
-    wraps = len(jumps) > 0 and np.nanmax(angle) - np.nanmin(angle) <= 2 * np.pi * 1.01 and np.max(jumps) > np.pi
+    wraps = (
+        len(jumps) > 0
+        and np.nanmax(angle) - np.nanmin(angle) <= 2 * np.pi * 1.01
+        and np.max(jumps) > np.pi
+    )
     unwrapped[known] = np.unwrap(angle[known]) if wraps else angle[known]
     speed = np.gradient(unwrapped, time)
     return np.asarray(speed)

@@ -1,0 +1,444 @@
+"""Simulation against closed forms, scipy and plain sequential loops."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import linalg, signal
+from scipy.integrate import solve_ivp
+
+import pmdc_jax
+from benchmarks import virtual_bench as vb
+from pmdc_jax.effects import CoulombFriction, ResistanceHeating
+from pmdc_jax.motor import PARAMETERS, Motor
+from pmdc_jax.recording import Recording
+from pmdc_jax.simulate import Tape, free_run, reference_solution, squared_errors, uniform
+from pmdc_jax.simulate.exponential import phi_functions
+
+PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
+BLOCKS = 4  # every tape below has this shape, so that few are compiled
+SAMPLES = 128 * BLOCKS
+
+
+def motor(effects=(), **changes) -> Motor:
+    return Motor(**{n: np.asarray(x, float) for n, x in (PAPER | changes).items()}, effects=effects)
+
+
+def population(motors: list[dict[str, float]], effects=()) -> Motor:
+    return Motor(**{n: np.array([m[n] for m in motors]) for n in PARAMETERS}, effects=effects)
+
+
+def recording(name="run", samples=SAMPLES, step=1e-3, seed=0, **columns) -> Recording:
+    """Voltage and load that change now and then, and measured outputs that are only noise."""
+    rng = np.random.default_rng(seed)
+    time = step * np.arange(samples)
+    levels = np.repeat(rng.uniform([-18, -0.5], [18, 0.5], (samples // 16 + 1, 2)), 16, axis=0)
+    given = {
+        "voltage": levels[:samples, 0],
+        "load": levels[:samples, 1],
+        "current": rng.normal(5.0, 3.0, samples),
+        "speed": rng.normal(30.0, 20.0, samples),
+    }
+    return Recording(name, time, **(given | columns))
+
+
+def continuous(m: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    """A and B of the linear motor, written down from the equations once more."""
+    A = np.array([[-m["R"] / m["L"], -m["Kb"] / m["L"]], [m["Kt"] / m["J"], -m["f"] / m["J"]]])
+    return A, np.array([[1 / m["L"], 0.0], [0.0, -1 / m["J"]]])
+
+
+def exact_steps(m: dict[str, float], run: Recording, start) -> np.ndarray:
+    """Current and speed (samples, 2) by scipy's matrix exponential of A and B together."""
+    A, B = continuous(m)
+    step = run.sample_time
+    both = linalg.expm(np.block([[A, B], [np.zeros((2, 4))]]) * step)
+    states = [np.asarray(start, float)]
+    for held in np.stack([run.voltage, run.load], 1)[:-1]:
+        states.append(both[:2, :2] @ states[-1] + both[:2, 2:] @ held)
+    return np.array(states)
+
+
+def alone(m: Motor, run: Recording, start=None) -> np.ndarray:
+    """Free run of one recording by the package, (samples, 2)."""
+    tape = Tape.from_recordings([run], unloaded=True)
+    initial = jnp.asarray(tape.initial if start is None else [start])
+    seen = free_run(m, tape, initial, jnp.zeros(1))
+    return np.stack([tape.samples_of(0, seen[:, c], len(run)) for c in range(2)], 1)
+
+
+def largest_error(found: np.ndarray, expected: np.ndarray) -> float:
+    """Of any sample of either output, relative to the largest value of that output."""
+    return float((np.abs(found - expected).max(0) / np.abs(expected).max(0)).max())
+
+
+# ------------------------------------------------------------------------------ the exact step
+
+
+class Linear(NamedTuple):
+    changes: dict[str, float]
+    step: float
+
+
+LINEAR = {
+    "paper": Linear({}, 1e-3),
+    "fast sampling": Linear({}, 1e-5),
+    "slow sampling": Linear({}, 0.1),
+    "very stiff": Linear({"L": PAPER["R"] * 1e-6}, 1e-3),
+    "very stiff, slow": Linear({"L": PAPER["R"] * 1e-6}, 0.1),
+    "oscillatory": Linear({"L": 5e-3, "J": 1e-4}, 1e-3),
+    "oscillatory, undersampled": Linear({"L": 5e-3, "J": 1e-4, "R": 0.02, "f": 1e-6}, 0.1),
+    "nearly equal poles": Linear({"L": 0.157378**2 * 0.000466 / (4 * 0.0492 * 0.0501)}, 1e-3),
+    "no friction": Linear({"f": 0.0}, 1e-3),
+    "heavy": Linear({"J": 50.0}, 1e-2),
+}
+
+
+@pytest.mark.parametrize("case", LINEAR.values(), ids=LINEAR.keys())
+def test_the_linear_motor_is_exact(x64, case):
+    run, start = recording(step=case.step), (3.0, -20.0)
+    expected = exact_steps(PAPER | case.changes, run, start)
+    assert largest_error(alone(motor(**case.changes), run, start), expected) < 1e-10
+
+
+def test_random_linear_motors_are_exact(x64):
+    """Forty motors drawn over four decades, each at a sample time of its own."""
+    rng = np.random.default_rng(1)
+    for k in range(40):
+        m = {n: x * 10 ** rng.uniform(-2, 2) for n, x in PAPER.items()}
+        run = recording(step=10 ** rng.uniform(-5, -1), seed=k)
+        expected = exact_steps(m, run, (1.0, 2.0))
+        assert largest_error(alone(motor(**m), run, (1.0, 2.0)), expected) < 1e-9, (m, run)
+
+
+def test_the_linear_motor_is_scipys_digital_filter(x64):
+    """Voltage to speed, from rest, by scipy's own discretisation and filter."""
+    run = recording(load=np.zeros(SAMPLES))
+    A, B = continuous(PAPER)
+    b, a = signal.ss2tf(*signal.cont2discrete((A, B[:, :1], np.eye(2), np.zeros((2, 1))), 1e-3)[:4])
+    expected = np.stack([signal.lfilter(row, a, run.voltage) for row in b], 1)
+    assert largest_error(alone(motor(), run, (0.0, 0.0)), expected) < 1e-9
+
+
+def test_phi_functions(x64):
+    """By scipy: phi_k(z) is a block of the exponential of z beside a chain of ones."""
+    rng = np.random.default_rng(2)
+    z = rng.standard_normal((2, 2, 30)) * 10.0 ** rng.uniform(-9, 1.5, 30)
+    z[:, :, 0] = 0.0
+    z[:, :, 1] = [[-1000.0, -3.0], [1e-2, -5e-4]]  # stiff: the electrical half has died away
+    half, whole = jax.jit(phi_functions, static_argnums=1)(jnp.asarray(z), 3)
+    for found, of in ((half, z / 2), (whole, z)):
+        for k, phi in enumerate(found):
+            for case in range(z.shape[-1]):
+                expected = _phi_by_scipy(of[:, :, case], k)
+                scale = np.abs(expected).max()
+                np.testing.assert_allclose(phi[:, :, case], expected, rtol=0, atol=1e-10 * scale)
+
+
+def _phi_by_scipy(z: np.ndarray, k: int) -> np.ndarray:
+    chain = np.zeros((2 * (k + 1), 2 * (k + 1)))
+    chain[:2, :2] = z
+    for j in range(k):
+        chain[2 * j : 2 * j + 2, 2 * j + 2 : 2 * j + 4] = np.eye(2)
+    return linalg.expm(chain)[:2, -2:]
+
+
+# -------------------------------------------------------------------- order with smooth effects
+
+HEAT = {"rise_per_W": 2e-3, "time_constant_s": 0.08}
+
+
+def heated(t, x, v, load):
+    """The motor whose resistance rises with the winding's temperature, written out."""
+    i, w, rise = x
+    m, R = PAPER, PAPER["R"] * (1 + x[2])
+    return [
+        (v - R * i - m["Kb"] * w) / m["L"],
+        (m["Kt"] * i - m["f"] * w - load) / m["J"],
+        (HEAT["rise_per_W"] * R * i**2 - rise) / HEAT["time_constant_s"],
+    ]
+
+
+def by_scipy(run: Recording, start) -> np.ndarray:
+    """Restarted at every sample, because the input jumps there."""
+    states = [np.array(start, float)]
+    for v, load in zip(run.voltage[:-1], run.load[:-1], strict=True):
+        held = solve_ivp(
+            heated, (0, run.sample_time), states[-1], "DOP853", args=(v, load), rtol=1e-11, atol=1e-11
+        )
+        states.append(held.y[:, -1])
+    return np.array(states)[:, :2]
+
+
+@pytest.fixture(scope="module")
+def heating():
+    """A coarse record, and what scipy makes of it: 64 samples of 4 ms."""
+    run = recording(samples=64, step=4e-3)
+    return run, by_scipy(run, (5.0, 10.0, 0.0))
+
+
+def finer(run: Recording, times: int) -> Recording:
+    """The same held inputs, sampled more often."""
+    fine = {q: np.repeat(getattr(run, q), times) for q in ("voltage", "load", "current", "speed")}
+    return Recording(run.name, run.sample_time / times * np.arange(times * len(run)), **fine)
+
+
+def test_converges_with_order_four(x64, heating):
+    run, expected = heating
+    hot = motor((ResistanceHeating(**{n: np.asarray(x) for n, x in HEAT.items()}),))
+    errors = []
+    for times in (1, 2, 4, 8):
+        found = alone(hot, finer(run, times), (5.0, 10.0))[::times]
+        errors.append(largest_error(found, expected))
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert errors[0] < 1e-3
+    assert errors[-1] < 1e-7
+    assert np.all(orders > 3.3), (errors, orders)
+
+
+def test_the_adaptive_reference_agrees_with_scipy(x64, heating):
+    run, expected = heating
+    hot = motor((ResistanceHeating(**{n: np.asarray(x) for n, x in HEAT.items()}),))
+    found = reference_solution(hot, run.time, run.voltage, run.load, jnp.array([5.0, 10.0]))
+    assert largest_error(np.asarray(found).T, expected) < 1e-8
+
+
+# ------------------------------------------------------------------- blocks joined by shooting
+
+EFFECTS = {
+    "linear": (),
+    "sticking": (CoulombFriction(np.asarray(0.15)),),
+    "heating": (ResistanceHeating(np.asarray(2e-3), np.asarray(0.3)),),
+}
+
+
+@pytest.mark.parametrize("effects", EFFECTS.values(), ids=EFFECTS.keys())
+def test_joined_blocks_are_one_sequential_run(x64, effects):
+    """`free_run` guesses where blocks begin and mends; `squared_errors` walks them one by one.
+
+    Against outputs measured as zero the latter is the sum of squares of the plain run; one sample
+    at a time it gives the samples themselves.
+    """
+    run = recording(current=np.zeros(SAMPLES), speed=np.zeros(SAMPLES))
+    tape = Tape.from_recordings([run])
+    seen = np.asarray(free_run(motor(effects), tape, jnp.asarray(tape.initial), jnp.zeros(1)))
+    one = population([PAPER])
+    one = jax.tree.map(lambda leaf: np.reshape(leaf, 1), Motor(*_fields(one), effects=effects))
+    for block, sample in ((0, 1), (0, 127), (1, 0), (1, 1), (2, 64), (3, 127)):
+        weight = np.zeros_like(tape.weight)
+        weight[block, :, sample] = 1.0
+        only = Tape(**{**_fields_of(tape), "weight": weight})
+        squares = np.array([float(e[0]) for e in squared_errors(one, only)])
+        np.testing.assert_allclose(np.abs(seen[block, :, sample]), np.sqrt(squares), rtol=1e-7)
+
+
+def _fields(m: Motor):
+    return [getattr(m, n) for n in PARAMETERS]
+
+
+def _fields_of(tape: Tape) -> dict:
+    return {name: getattr(tape, name) for name in tape.__dataclass_fields__}
+
+
+def test_runs_on_one_tape_are_each_as_alone(x64):
+    """Runs of different rate, length, start and load on one tape do not know of each other."""
+    m = motor((CoulombFriction(np.asarray(0.1)),))
+    runs = [
+        recording("slow", 200, 5e-3, seed=1),
+        recording("fast", 150, 2e-4, seed=2),
+        recording("short", 11, 1e-3, seed=3),
+        recording("slow again", 128, 5e-3, seed=4),
+    ]
+    tape = Tape.from_recordings(runs)
+    assert tape.value.shape[0] == 8  # one more than filled: the last block holds nothing
+    offsets = np.array([0.0, 0.05, -0.02, 0.0])
+    seen = free_run(m, tape, jnp.asarray(tape.initial), jnp.asarray(offsets))
+    for k, (run, offset) in enumerate(zip(runs, offsets, strict=True)):
+        loaded = Recording(run.name, run.time, run.voltage, run.current, run.speed, run.load + offset)
+        together = np.stack([tape.samples_of(k, seen[:, c], len(run)) for c in range(2)], 1)
+        np.testing.assert_allclose(together, alone(m, loaded), rtol=1e-7, atol=1e-7)
+
+
+# -------------------------------------------------------------------------- driven otherwise
+
+
+def mechanical(drive: np.ndarray, load: np.ndarray, step: float, start: float) -> np.ndarray:
+    """Speed under a held torque: J dw/dt = drive - f w - load has a closed form over each sample."""
+    rate, gain = np.exp(-PAPER["f"] / PAPER["J"] * step), 1 / PAPER["f"]
+    speed = [start]
+    for torque in (drive - load)[:-1]:
+        speed.append(rate * speed[-1] + (1 - rate) * gain * torque)
+    return np.array(speed)
+
+
+def test_a_run_driven_by_torque(x64):
+    run = recording(voltage=None, current=None, torque=np.sin(np.arange(SAMPLES) / 9))
+    expected = mechanical(run.torque, run.load, 1e-3, run.speed[0])
+    found = pmdc_jax.simulate(motor(), run)
+    np.testing.assert_allclose(found.speed, expected, rtol=1e-9, atol=1e-9)
+    assert found.current is None
+
+
+def test_a_run_driven_by_current(x64):
+    """The measured current flows on between its samples, so its mean over each drives."""
+    run = recording(voltage=None, current=8 * np.sin(np.arange(SAMPLES) / 9))
+    mean = (run.current + np.append(run.current[1:], run.current[-1])) / 2
+    expected = mechanical(PAPER["Kt"] * mean, run.load, 1e-3, run.speed[0])
+    found = pmdc_jax.simulate(motor(), run)
+    np.testing.assert_allclose(found.speed, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(found.current, run.current)
+
+
+# ------------------------------------------------------------------------------- squared errors
+
+CANDIDATES = 32
+
+
+@pytest.fixture(scope="module")
+def candidates():
+    rng = np.random.default_rng(5)
+    return [{n: x * np.exp(0.3 * rng.standard_normal()) for n, x in PAPER.items()} for _ in range(CANDIDATES)]
+
+
+def test_squared_errors_are_those_of_the_free_run(x64, candidates):
+    run = recording()
+    run.speed[40:60] = np.nan  # missing samples count for nothing
+    tape = Tape.from_recordings([run])
+    current, speed = squared_errors(population(candidates), tape)
+    for k, m in enumerate(candidates):
+        error = alone(motor(**m), run, tape.initial[0]) - np.stack([run.current, run.speed], 1)
+        expected = np.nansum(error**2, 0)
+        np.testing.assert_allclose([current[k], speed[k]], expected, rtol=1e-8)
+
+
+NONSENSE = {
+    "R": np.nan,
+    "L": 0.0,
+    "Kb": 1e200,
+    "Kt": -1e6,
+    "J": 1e-300,
+    "f": -1e9,
+}
+
+
+def test_a_nonsense_candidate_has_infinite_errors_and_spoils_no_other(x64, candidates):
+    tape = Tape.from_recordings([recording()])
+    clean = np.stack(squared_errors(population(candidates), tape))
+    spoiled = [dict(m) for m in candidates]
+    for k, (name, value) in enumerate(NONSENSE.items()):
+        spoiled[k][name] = value
+    found = np.stack(squared_errors(population(spoiled), tape))
+    assert not np.isnan(found).any()
+    assert np.all(found[:, : len(NONSENSE)] > 1e3 * clean[:, : len(NONSENSE)]), found
+    assert np.isinf(found[:, :2]).all()
+    np.testing.assert_array_equal(found[:, len(NONSENSE) :], clean[:, len(NONSENSE) :])
+
+
+# --------------------------------------------------------------------------------- even samples
+
+
+def test_even_samples_are_left_alone():
+    run = recording(step=1e-3)
+    noisy = Recording("r", run.time + 1e-7 * np.sin(np.arange(SAMPLES)), run.voltage, speed=run.speed)
+    even = uniform(noisy)
+    np.testing.assert_array_equal(even.voltage, run.voltage)
+    np.testing.assert_array_equal(even.speed, run.speed)
+    np.testing.assert_allclose(np.diff(even.time), even.sample_time, rtol=1e-9)
+
+
+STEPS = st.lists(st.floats(0.5, 1.5), min_size=20, max_size=60)
+
+
+@settings(max_examples=60, deadline=None)
+@given(steps=STEPS, seed=st.integers(0, 1000))
+def test_resampling_loses_no_volt_second(steps, seed):
+    """Jittered stamps: volt-seconds and newton-metre-seconds up to any grid point are kept."""
+    rng = np.random.default_rng(seed)
+    time = 7.0 + 1e-3 * np.append(0.0, np.cumsum(steps))
+    run = Recording(
+        "r", time, rng.normal(size=len(time)), speed=np.cos(time), load=rng.normal(size=len(time))
+    )
+    even = uniform(run)
+    assert np.ptp(np.diff(even.time)) < 1e-9
+    for before, after in ((run.voltage, even.voltage), (run.load, even.load)):
+        integral = np.append(0.0, np.cumsum(before[:-1] * np.diff(time)))
+        kept = np.append(0.0, np.cumsum(after[:-1] * np.diff(even.time)))
+        np.testing.assert_allclose(kept, np.interp(even.time, time, integral), atol=1e-12)
+
+
+def test_outputs_are_interpolated_but_not_across_gaps():
+    """Speed is a straight line in time, which interpolation keeps; ten lost samples stay lost."""
+    rng = np.random.default_rng(6)
+    time = np.delete(1e-3 * (np.arange(100) + rng.uniform(-0.2, 0.2, 100)), np.arange(50, 60))
+    even = uniform(Recording("r", time, np.ones(90), current=3 * time, speed=1 + 5 * time))
+    inside = (even.time > time[49]) & (even.time < time[50])
+    assert 9 <= inside.sum() <= 11
+    assert np.isnan(even.speed[inside]).all()
+    np.testing.assert_allclose(even.speed[~inside], 1 + 5 * even.time[~inside], rtol=1e-12)
+    np.testing.assert_allclose(even.voltage, 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_speed_from_angle(wrapped):
+    time = 1e-3 * np.arange(400)
+    angle, speed = 30 * time + np.sin(20 * time), 30 + 20 * np.cos(20 * time)
+    measured = angle % (2 * np.pi) if wrapped else angle
+    even = uniform(Recording("r", time, np.ones(400), angle=measured))
+    np.testing.assert_allclose(even.speed[1:-1], speed[1:-1], atol=1e-3 * np.abs(speed).max())
+
+
+def test_missing_angles_are_missing_speeds():
+    time = 1e-3 * np.arange(100)
+    angle = 30 * time
+    angle[40] = np.nan
+    even = uniform(Recording("r", time, np.ones(100), angle=angle))
+    known = ~np.isnan(even.speed)
+    assert known.sum() >= 97
+    np.testing.assert_allclose(even.speed[known], 30.0, rtol=1e-9)
+
+
+# ------------------------------------------------------------------------------ public function
+
+
+def test_simulate_keeps_the_time_stamps_and_starts_where_the_recording_does(candidates):
+    """At uneven stamps too, and whatever the caller's precision is."""
+    rng = np.random.default_rng(7)
+    time = 2.0 + 1e-3 * np.cumsum(rng.uniform(0.9, 1.1, 300))
+    run = Recording("r", time, np.full(300, 12.0), np.full(300, 4.0), np.full(300, 9.0), np.zeros(300))
+    assert not jax.config.jax_enable_x64
+    found = pmdc_jax.simulate(motor(), run)
+    assert not jax.config.jax_enable_x64
+    assert (found.current.dtype, found.speed.dtype) == (np.float64, np.float64)
+    np.testing.assert_array_equal(found.time, time)
+    assert (found.current[0], found.speed[0]) == (4.0, 9.0)
+    A, B = continuous(PAPER)
+    rest = np.linalg.solve(A, -B @ [12.0, 0.0])
+    expected = np.array([rest + linalg.expm(A * (t - time[0])) @ ([4.0, 9.0] - rest) for t in time])
+    np.testing.assert_allclose(found.speed, expected[:, 1], atol=0.05)
+
+
+def test_simulate_takes_plain_numbers():
+    """A motor written down with Python numbers is the natural first thing to try."""
+    run = recording()
+    plain = pmdc_jax.simulate(Motor(**PAPER), run)
+    np.testing.assert_array_equal(plain.speed, pmdc_jax.simulate(motor(), run).speed)
+
+
+def test_importing_changes_no_setting_and_prints_nothing():
+    code = (
+        "import jax\n"
+        "before = dict(jax.config.values)\n"
+        "import pmdc_jax, pmdc_jax.simulate, pmdc_jax.identify, pmdc_jax.cli, pmdc_jax.identify.binary_ga\n"
+        "changed = {k: v for k, v in jax.config.values.items() if k in before and before[k] != v}\n"
+        "assert not changed, changed\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
