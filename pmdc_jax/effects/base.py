@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 if TYPE_CHECKING:
     from ..motor import Motor
 
-Scalars = Float[Array | np.ndarray, "*batch"]
+Scalars = Float[Array | np.ndarray, "*#batch"]
 
 
 class State(NamedTuple):

@@ -116,8 +116,10 @@ def _compressed_jvp(primals, tangents):
 
 def _factor(flat: Float[Array, " columns"], args) -> Float[Array, "columns+1 columns+1"]:
     problem, scale, size = args
-    evaluation = evaluate(problem, _unflatten(problem, flat * scale))
-    matrix = normal_matrix(evaluation, problem.tape, problem.counts)
+    # optimistix promotes strictly; with the usual promotion what was traced before is found again
+    with jax.numpy_dtype_promotion("standard"):
+        evaluation = evaluate(problem, _unflatten(problem, flat * scale))
+        matrix = normal_matrix(evaluation, problem.tape, problem.counts)
     stretch = jnp.append(scale, 1.0)
     matrix = matrix * stretch[:, None] * stretch / size
     # a failed simulation must look bad, not equal to nothing

@@ -100,14 +100,12 @@ def sensitivities(
         passed = once(starts)
     else:
         # twice the same pass, for the price of compiling one: the first joins a linear motor's blocks exactly
-        def join(_, carry):
-            _, joined, _ = carry
-            passed = once(joined)
-            return joined, _stitch(passed, tape, joined, begins), passed
+        def join(starts, _):
+            passed = once(starts)
+            return _stitch(passed, tape, starts, begins), (starts, passed)
 
-        shapes = jax.eval_shape(once, begins)
-        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        starts, _, passed = jax.lax.fori_loop(0, 2, join, (begins, begins, nothing))
+        _, both = jax.lax.scan(join, begins, None, length=2)
+        starts, passed = jax.tree.map(lambda leaf: leaf[-1], both)
     joined, d_starts = _stitch_tangents(passed, tape, starts, begins, count)
 
     by_start = passed.d_seen[:, -states:]
