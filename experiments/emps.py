@@ -147,7 +147,7 @@ def picture(results: dict[str, Identification]):
     for fit, name in ((linear, FITS[1].name), (coulomb, FITS[2].name)):
         above.plot(fit.time[shown], fit.speed_simulated[shown], lw=1, label=name)
     above.set(xlabel="time [s]", ylabel="speed [m/s]", title="Validation record, free run")
-    above.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.5, 1.0))
+    above.legend(ncols=3, loc="upper center")
     above.set_ylim(-0.2, 0.22)
     regressors, force = inverse_dynamics(run)
     for name in (FITS[1].name, FITS[2].name):
@@ -155,7 +155,7 @@ def picture(results: dict[str, Identification]):
         error = force - regressors @ [estimate.get(term, 0.0) for term in TERMS]
         below.plot(regressors[:, 1], error, ".", ms=3, label=name)
     below.set(xlabel="speed [m/s]", ylabel="force left [N]", title="What the models leave of force")
-    below.set_ylim(-40, 40)
+    below.set_ylim(-40, 55)
     below.legend(ncols=2, loc="upper center", markerscale=2)
     return save(figure, "emps")
 
@@ -163,7 +163,7 @@ def picture(results: dict[str, Identification]):
 def main() -> None:
     """Fit all, print both tables, draw."""
     results = {fit.name: ours(fit) for fit in FITS}
-    console = Console(width=120)
+    console = Console(width=140)
     console.print(parameter_table(results))
     console.print(error_table(results))
     console.print(f"Picture: {picture(results)}")

@@ -21,8 +21,8 @@ STYLE = {
 
 def panels(rows: int, height: float, **options):
     """Figure and axes, one panel below the other; `height` of one in inches."""
-    with plt.rc_context(STYLE):
-        return plt.subplots(rows, 1, figsize=(8.0, rows * height), squeeze=True, **options)
+    plt.rcParams.update(STYLE)
+    return plt.subplots(rows, 1, figsize=(8.0, rows * height), **options)
 
 
 def save(figure: Figure, name: str) -> Path:

@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import qmc
 
 from ..errors import InputError
 from ..simulate import Tape, squared_errors
@@ -166,7 +165,9 @@ _motors = eqx.filter_jit(lambda parameters, coordinates: parameters(coordinates)
 
 def _scattered(seed: int, size: int, dimensions: int) -> np.ndarray:
     """A Latin hypercube: every parameter's range covered evenly, whatever the population."""
-    return qmc.LatinHypercube(dimensions, rng=np.random.default_rng(seed)).random(size)
+    rng = np.random.default_rng(seed)
+    strata = np.stack([rng.permutation(size) for _ in range(dimensions)], axis=1)
+    return (strata + rng.random(strata.shape)) / size
 
 
 def _collect(seen: list, low: np.ndarray, high: np.ndarray, interrupted: bool) -> Found:
