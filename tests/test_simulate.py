@@ -112,14 +112,14 @@ def test_the_linear_motor_is_exact(x64, case):
 def test_random_linear_motors_are_exact(x64):
     """Forty motors drawn over four decades, each at a sample time of its own.
 
-    Some turn many times a sample with hardly any damping; scipy's own exponential is no better there.
+    The sample time has six digits, as a logger's clock has: the tape keeps nine.
     """
     rng = np.random.default_rng(1)
     for k in range(40):
         m = {n: x * 10 ** rng.uniform(-2, 2) for n, x in PAPER.items()}
-        run = recording(step=10 ** rng.uniform(-5, -1), seed=k)
+        run = recording(step=float(f"{10 ** rng.uniform(-5, -1):.6g}"), seed=k)
         expected = exact_steps(m, run, (1.0, 2.0))
-        assert largest_error(alone(motor(**m), run, (1.0, 2.0)), expected) < 1e-8, (m, run.sample_time)
+        assert largest_error(alone(motor(**m), run, (1.0, 2.0)), expected) < 1e-9, m
 
 
 def test_the_linear_motor_is_scipys_digital_filter(x64):
@@ -175,7 +175,13 @@ def by_scipy(run: Recording, start) -> np.ndarray:
     states = [np.array(start, float)]
     for v, load in zip(run.voltage[:-1], run.load[:-1], strict=True):
         held = solve_ivp(
-            heated, (0, run.sample_time), states[-1], "DOP853", args=(v, load), rtol=1e-11, atol=1e-11
+            heated,
+            (0, run.sample_time),
+            states[-1],
+            "DOP853",
+            args=(v, load),
+            rtol=1e-11,
+            atol=1e-11,
         )
         states.append(held.y[:, -1])
     return np.array(states)[:, :2]
@@ -264,7 +270,9 @@ def test_runs_on_one_tape_are_each_as_alone(x64):
     offsets = np.array([0.0, 0.05, -0.02, 0.0])
     seen = free_run(m, tape, jnp.asarray(tape.initial), jnp.asarray(offsets))
     for k, (run, offset) in enumerate(zip(runs, offsets, strict=True)):
-        loaded = Recording(run.name, run.time, run.voltage, run.current, run.speed, run.load + offset)
+        loaded = Recording(
+            run.name, run.time, run.voltage, run.current, run.speed, run.load + offset
+        )
         together = np.stack([tape.samples_of(k, seen[:, c], len(run)) for c in range(2)], 1)
         np.testing.assert_allclose(together, alone(m, loaded), rtol=1e-7, atol=1e-7)
 
@@ -307,7 +315,10 @@ CANDIDATES = 32
 @pytest.fixture(scope="module")
 def candidates():
     rng = np.random.default_rng(5)
-    return [{n: x * np.exp(0.3 * rng.standard_normal()) for n, x in PAPER.items()} for _ in range(CANDIDATES)]
+    return [
+        {n: x * np.exp(0.3 * rng.standard_normal()) for n, x in PAPER.items()}
+        for _ in range(CANDIDATES)
+    ]
 
 
 def test_squared_errors_are_those_of_the_free_run(x64, candidates):
@@ -349,7 +360,9 @@ def test_a_nonsense_candidate_has_infinite_errors_and_spoils_no_other(x64, candi
 
 def test_even_samples_are_left_alone():
     run = recording(step=1e-3)
-    noisy = Recording("r", run.time + 1e-7 * np.sin(np.arange(SAMPLES)), run.voltage, speed=run.speed)
+    noisy = Recording(
+        "r", run.time + 1e-7 * np.sin(np.arange(SAMPLES)), run.voltage, speed=run.speed
+    )
     even = uniform(noisy)
     np.testing.assert_array_equal(even.voltage, run.voltage)
     np.testing.assert_array_equal(even.speed, run.speed)
@@ -417,7 +430,9 @@ def test_simulate_keeps_the_time_stamps_and_starts_where_the_recording_does():
     """
     rng, heavy = np.random.default_rng(7), PAPER | {"J": 0.01}
     time = 2.0 + 1e-3 * np.cumsum(rng.uniform(0.9, 1.1, 300))
-    run = Recording("r", time, np.full(300, 12.0), np.full(300, 4.0), np.full(300, 9.0), np.zeros(300))
+    run = Recording(
+        "r", time, np.full(300, 12.0), np.full(300, 4.0), np.full(300, 9.0), np.zeros(300)
+    )
     assert not jax.config.jax_enable_x64
     found = pmdc_jax.simulate(motor(**heavy), run)
     assert not jax.config.jax_enable_x64
@@ -428,7 +443,7 @@ def test_simulate_keeps_the_time_stamps_and_starts_where_the_recording_does():
     rest = np.linalg.solve(A, -B @ [12.0, 0.0])
     expected = np.array([rest + linalg.expm(A * (t - time[0])) @ ([4.0, 9.0] - rest) for t in time])
     curvature = heavy["Kt"] / heavy["J"] * 12.0 / heavy["L"]
-    assert np.ptp(expected[:, 1]) > 100
+    assert np.ptp(expected[:, 1]) > 50
     np.testing.assert_allclose(found.speed, expected[:, 1], rtol=0, atol=curvature * 1e-6 / 8)
 
 

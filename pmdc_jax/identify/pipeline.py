@@ -82,11 +82,6 @@ def identify(
         search_bounds(training), effects_named(effects), untouched | dict(known or {}), tie
     )
 
-    found = global_search(
-        parameters, Tape.from_recordings(training), noise, search, seed, progress=progress
-    )
-    searched = time.perf_counter()
-    report("refining the best candidates", float(found.best[-1]))
     # hold-outs lie on the tape too, but do not count: only what is their own is fitted to them
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(even, unloaded))
     problem = Problem(
@@ -96,6 +91,16 @@ def identify(
         free=jnp.ones(len(parameters.names), bool),
         counts=jnp.arange(len(runs)) < len(recordings),
     )
+    middle = (parameters.lower + parameters.upper) / 2
+    with ThreadPoolExecutor(1) as beside:
+        # a refinement that gives up at once: it is compiled on another core while the search runs
+        compiled = beside.submit(_refine, problem, _start(tape, middle), tolerance=1e3)
+        found = global_search(
+            parameters, Tape.from_recordings(training), noise, search, seed, progress=progress
+        )
+        searched = time.perf_counter()
+        report("refining the best candidates", float(found.best[-1]))
+        compiled.result()
     ends = _refine_all(problem, [_start(tape, c) for c in _distinct(found)])
     best, at_best, scale = polish(problem, ends[0])
     refined = time.perf_counter()
@@ -191,17 +196,17 @@ def _distinct(found: Found) -> list[np.ndarray]:
     return kept
 
 
+def _refine(problem: Problem, start: Unknowns, **options: float) -> Refined:
+    """Refine in a thread, to which the precision does not carry over by itself."""
+    with jax.enable_x64(True):
+        return refine(problem, start, **options)
+
+
 def _refine_all(problem: Problem, starts: Sequence[Unknowns]) -> list[Refined]:
     """Refine from several starts, one a core at a time; the best first."""
-
-    def one(start: Unknowns) -> Refined:
-        with jax.enable_x64(True):  # the setting belongs to the thread
-            return refine(problem, start)
-
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        # the first alone: it compiles for all
-        ends = [one(starts[0]), *pool.map(one, starts[1:])]
-    return sorted(ends, key=lambda end: end.fitness)
+        ends = pool.map(lambda start: _refine(problem, start), starts)
+        return sorted(ends, key=lambda end: end.fitness)
 
 
 def _tidy(best: Refined, info: Information, parameters: Parameters) -> Refined:
