@@ -3,7 +3,9 @@
 `python -m experiments.undcmotor`; data: see experiments/data.py.
 
 PRBS record at 50 Hz, volts and deg/s, no current. Identified on its first half; the second half is
-simulated freely from its first sample, with the load found on the first.
+simulated freely from its first sample, with the load found on the first. Without current only the
+gain, natural frequency and damping can be seen: three numbers for six parameters. The owners fit a
+delay of 20 ms; the linear motor has none, and its second order (an L far too large) stands in for it.
 """
 
 from typing import NamedTuple
@@ -84,6 +86,16 @@ def unseen(name: str, result: Identification) -> str:
     return "\n".join((f"{name}: {status}{_load(result)}", *reasons))
 
 
+def seen(name: str, result: Identification) -> str:
+    """What the record does say, whatever the split between the parameters."""
+    numerators, denominator = result.motor.transfer_function()
+    gain = float(numerators["voltage -> speed"][0] / denominator[2]) / DEGREE
+    slow, fast = sorted(-1 / np.roots(np.asarray(denominator)).real, reverse=True)
+    return (
+        f"{name}: {gain:.1f} deg/s per V, time constants {1e3 * slow:.1f} and {1e3 * fast:.1f} ms"
+    )
+
+
 def picture(results: dict[str, Identification]):
     """Measured and simulated speed on a stretch of the second half, and the errors."""
     from experiments.figures import panels, save
@@ -109,6 +121,7 @@ def main() -> None:
     console = Console(width=120)
     console.print(table(results))
     for fit in FITS:
+        console.print(seen(fit.name, results[fit.name]))
         console.print(unseen(fit.name, results[fit.name]))
     console.print(f"Picture: {picture(results)}")
 

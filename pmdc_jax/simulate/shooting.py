@@ -26,7 +26,7 @@ from .solver import HeldInput, Propagator, Walk, along_grids, held_step, pick_gr
 from .tape import BLOCK, Tape
 
 # The last pass corrects to first order what is left, so the joint error is about the square of this.
-JOINED = 1e-6
+JOINED = 1e-4
 
 # Columns of the sensitivities for a run's own unknowns: initial current, initial speed, load offset.
 LOCAL = 3
