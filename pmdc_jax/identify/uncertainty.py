@@ -11,6 +11,9 @@ from ..simulate import LOCAL
 
 # A direction known no better than this, as standard error of a logarithm, counts as unseen.
 FLAT = 0.5
+# Stretches into which a run is summed for its long-run variance. Measured on white noise and three slow ones, each
+# in 60 x 6 runs of 5,000 samples: 2,000 and 500 miss slow noise (standard errors down to a fifth), 50 scatters.
+STRETCHES = 100
 # How far along an unseen direction the truth may lie, as standard deviation of a logarithm: a factor of twenty.
 ANYWHERE = 3.0
 
@@ -75,10 +78,10 @@ def long_run_variance(terms: Float[np.ndarray, "samples n"]) -> Float[np.ndarray
     """Variance of the sum of correlated terms with mean zero.
 
     Prewhitened by one autoregression each, then a quadratic-spectral kernel with the automatic bandwidth of
-    Andrews (1991); on sums over short stretches, which keep the variance of the whole sum and make slow
-    correlation easier to see.
+    Andrews (1991); on sums over stretches, which keep the variance of the whole sum, while the slow part that
+    decides it comes out of the white noise that hides it from sample to sample.
     """
-    stretch = max(1, len(terms) // 2000)
+    stretch = max(1, len(terms) // STRETCHES)
     whole = len(terms) // stretch * stretch
     sums = terms[:whole].reshape(-1, stretch, terms.shape[1]).sum(1)
     memory = np.clip(_autoregression(sums), -0.97, 0.97)
