@@ -151,7 +151,7 @@ def _levenberg_marquardt(problem: Problem, start: Unknowns, scale, size, toleran
     return _unflatten(problem, solution.value * scale), 2 * solution.state.f_info.as_min() * size
 
 
-def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-4) -> Refined:
+def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-3) -> Refined:
     """Levenberg-Marquardt from a start, within the bounds.
 
     optimistix has no bounds, so they are an active set: a coordinate that ends beyond its bound is held there

@@ -44,7 +44,7 @@ def _evosax(name: str) -> Callable[[], type]:
 
 
 METHODS: Mapping[str, Method] = {
-    "cma_es": Method(_evosax("CMA_ES"), 32, 30, distribution=True),
+    "cma_es": Method(_evosax("CMA_ES"), 32, 24, distribution=True),
     "paper_ga": Method(_binary_ga, 20, 200),
     "differential_evolution": Method(_evosax("DifferentialEvolution"), 128, 80),
     "particle_swarm": Method(_evosax("PSO"), 128, 40),

@@ -90,22 +90,10 @@ def sensitivities(
     columns = count + 1 + states
     d_prepared = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_prepared)
 
-    def once(starts):
-        return _pass(prepared, d_prepared, columns, tape, starts, load_offset)
-
     # the derivatives by the parameters must be those at the joined starts
-    if motor.effects:
-        guess, last = _join(prepared, tape, initial, load_offset)
-        starts = _stitch(last, tape, guess, begins)
-        passed = once(starts)
-    else:
-        # twice the same pass, for the price of compiling one: the first joins a linear motor's blocks exactly
-        def join(starts, _):
-            passed = once(starts)
-            return _stitch(passed, tape, starts, begins), (starts, passed)
-
-        _, both = jax.lax.scan(join, begins, None, length=2)
-        starts, passed = jax.tree.map(lambda leaf: leaf[-1], both)
+    guess, last = _join(prepared, tape, initial, load_offset)
+    starts = _stitch(last, tape, guess, begins)
+    passed = _pass(prepared, d_prepared, columns, tape, starts, load_offset)
     joined, d_starts = _stitch_tangents(passed, tape, starts, begins, count)
 
     by_start = passed.d_seen[:, -states:]
