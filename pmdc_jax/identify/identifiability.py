@@ -35,36 +35,36 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
     listed = _listed(sorted(names))
     if electrical and not measured and names & {"R", "L", "Kb", "Kt"}:
         return (
-            f"no run has both voltage and current, so {listed} trade off against each other",
+            f"No run has both voltage and current, so {listed} trade off against each other",
             "Record the current too, or give values with --known",
         )
     if {"Kt", "J"} <= names and not loaded and not any(r.torque is not None for r in recordings):
         return (
-            "no run has a known load torque, so only the ratios of Kt, J and f are seen",
+            "No run has a known load torque, so only the ratios of Kt, J and f are seen",
             "Add a run with a known load torque, or tie Kt = Kb with --tie Kt=Kb",
         )
     if names == {"L"}:
         return (
-            "the sampling is too slow, or the voltage too smooth, to show the electrical time constant",
+            "The sampling is too slow, or the voltage too smooth, to show the electrical time constant",
             "Record voltage steps at a sample time below L / R, or give L with --known",
         )
     if names == {"f"}:
         return (
-            "viscous friction changes these runs by less than their noise",
+            "Viscous friction changes these runs by less than their noise",
             "Record steady running at several speeds, light and long",
         )
     if "J" in names and not names & {"Kt", "Kb"}:
         return (
-            "speed changes too little for its inertia to show",
+            "Speed changes too little for its inertia to show",
             "Add a run with voltage steps or a fast changing voltage",
         )
     if {"R", "Kb"} & names:
         return (
-            f"voltage, current and speed keep the same proportions, so {listed} trade off against each other",
+            f"Voltage, current and speed keep the same proportions, so {listed} trade off against each other",
             "Add runs at other loads, at stall, or with voltage steps",
         )
     return (
-        f"the runs do not tell {listed} apart",
+        f"The runs do not tell {listed} apart",
         "Add a run with more excitation: voltage steps, both directions, several speeds and loads",
     )
 

@@ -27,9 +27,9 @@ class Parameters(eqx.Module):
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     effects: tuple[type[AbstractEffect], ...] = eqx.field(static=True)
     ties: tuple[tuple[str, str], ...] = eqx.field(static=True)
-    known: dict[str, Float[Array, ""]]
-    lower: Float[Array, " parameters"]
-    upper: Float[Array, " parameters"]
+    known: dict[str, Float[Array | np.ndarray, ""]]
+    lower: Float[Array | np.ndarray, " parameters"]
+    upper: Float[Array | np.ndarray, " parameters"]
 
     @classmethod
     def of(

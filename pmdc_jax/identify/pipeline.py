@@ -119,7 +119,7 @@ def identify(
         return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], REACH)
 
     unknowns, ended = fit_own(problem, best.unknowns)
-    roles: list[Role] = ["train"] * len(recordings) + ["holdout"] * len(holdout)
+    roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
     fit = _fits(even, roles, tape, np.asarray(ended.seen), np.asarray(unknowns.local))
     return Identification(
         motor=motor,
@@ -180,7 +180,7 @@ def _untouched(recordings: Sequence[Recording]) -> dict[str, float]:
     return {name: 1.0 for name in PARAMETERS if name not in known}
 
 
-def _start(tape: Tape, coordinates: np.ndarray) -> Unknowns:
+def _start(tape: Tape, coordinates: jax.Array | np.ndarray) -> Unknowns:
     local = np.concatenate([np.asarray(tape.initial), np.zeros((tape.runs, 1))], axis=1)
     return Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
 

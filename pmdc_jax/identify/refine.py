@@ -202,36 +202,57 @@ def polish(problem: Problem, end: Refined) -> Polished:
     more than `WORTH` noise variances. A coordinate held at a bound is let go where the gradient points back inside.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
-    held, unknowns, share = set(end.at_bound), end.unknowns, 1.0
-    best, converged, evaluation = np.inf, False, None
-    noise = np.asarray(problem.noise)
-    counted = np.asarray(problem.counts)[np.asarray(problem.tape.run)]
+    trial, held, share = end.unknowns, set(end.at_bound), 1.0
+    best, converged = _weighed(problem, trial), False
+    reached = best
     for _ in range(POLISH):
-        evaluation = evaluate(problem, unknowns)
-        noise, stretch = _own_noise(problem, evaluation, counted)
-        scaled = evaluation._replace(
-            residuals=evaluation.residuals * stretch[:, None],
-            jacobian=evaluation.jacobian * stretch[:, None, None],
-        )
-        matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
-        held = {k for k in held if (matrix[k, -1] > 0) == (unknowns.coordinates[k] <= low[k])}
-        squares = float(np.log(np.maximum(noise, 1e-300)).sum())
-        step, gain = gauss_newton(matrix, held, len(low))
-        if squares > best + 1e-9 and share > 1e-3:
+        if reached.cost > best.cost + 1e-9 and share > 1e-3:
             share /= 4  # the last step was too long
-        else:
-            best, origin, direction, share = squares, unknowns, step, 1.0
-            if gain <= WORTH * matrix[-1, -1] / _samples(problem):
+        elif reached.cost <= best.cost + 1e-9:
+            best, share = reached, 1.0
+            start = np.asarray(best.unknowns.coordinates)
+            held = {k for k in held if (best.matrix[k, -1] > 0) == (start[k] <= low[k])}
+            step, gain = gauss_newton(best.matrix, held, len(low))
+            if gain <= WORTH * best.matrix[-1, -1] / _samples(problem):
                 converged = True
                 break
-        moved = np.asarray(_flatten(origin)) + share * direction
+        else:
+            break
+        moved = np.asarray(_flatten(best.unknowns)) + share * step
         inside = np.clip(moved[: len(low)], low, high)
         held |= set(np.flatnonzero(inside != moved[: len(low)]).tolist())
         moved[: len(low)] = inside
-        unknowns = _unflatten(problem, jnp.asarray(moved))
-    assert evaluation is not None
-    fitness = float(np.square(np.asarray(evaluation.residuals)[counted]).sum()) / _samples(problem)
-    return Polished(Refined(unknowns, fitness, tuple(sorted(held)), converged), scaled, noise)
+        reached = _weighed(problem, _unflatten(problem, jnp.asarray(moved)))
+    refined = Refined(best.unknowns, best.fitness, tuple(sorted(held)), converged)
+    return Polished(refined, best.evaluation, best.noise)
+
+
+class _Weighed(NamedTuple):
+    """A point, evaluated, each output weighed by its own residuals."""
+
+    unknowns: Unknowns
+    evaluation: Evaluation
+    noise: np.ndarray
+    matrix: np.ndarray
+    cost: (
+        float  # sum of the logarithms of the noise, which the maximum of the likelihood makes least
+    )
+    fitness: float
+
+
+def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
+    counted = np.asarray(problem.counts)[np.asarray(problem.tape.run)]
+    evaluation = evaluate(problem, unknowns)
+    noise, stretch = _own_noise(problem, evaluation, counted)
+    squares = float(np.square(np.asarray(evaluation.residuals)[counted]).sum())
+    scaled = evaluation._replace(
+        residuals=evaluation.residuals * stretch[:, None],
+        jacobian=evaluation.jacobian * stretch[:, None, None],
+    )
+    matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
+    cost = float(np.log(np.maximum(noise, 1e-300)).sum())
+    cost = cost if np.isfinite(cost) else np.inf
+    return _Weighed(unknowns, scaled, noise, matrix, cost, squares / _samples(problem))
 
 
 def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 3) -> tuple[Unknowns, Evaluation]:

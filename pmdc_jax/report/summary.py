@@ -37,7 +37,7 @@ def summary(identification: Identification) -> list[str]:
         sentences.append(f"{who} at the bound of the search: a limit, not an estimate.")
     if not identification.converged:
         sentences.append(
-            "The search did not converge: treat every number with care, or try another seed."
+            "The refinement did not converge: treat every number with care, or try another seed."
         )
     return sentences
 

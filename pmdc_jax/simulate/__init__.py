@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import attrs
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -38,6 +39,7 @@ def simulate(motor: Motor, recording: Recording) -> Recording:
     **Returns**: the recording with current (A) and speed (rad/s) simulated at the same time stamps. A run that
     is not driven by voltage has no simulated current.
     """
+    motor = jax.tree.map(jnp.asarray, motor)
     even = uniform(recording)
     tape = Tape.from_recordings([even], unloaded=True)
     outputs = free_run(motor, tape, jnp.asarray(tape.initial), jnp.zeros(1))

@@ -12,7 +12,7 @@ Matrix = Float[Array, "2 2 *batch"]
 
 # Taylor order and halvings: exact to rounding for |A h| up to 0.25 * 2**HALVINGS
 ORDER = 10
-HALVINGS = 12
+HALVINGS = 20
 
 
 def product(a: Matrix, b: Matrix) -> Matrix:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
+from operator import add
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..effects.base import Grip, State
+from ..effects.base import Grip, Scalars, State
 from ..motor import Drive, Motor
 from .exponential import Matrix, phi_functions, product
 
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
     from .tape import Tape
 
 Held = Float[Array, "*batch"]
+Pair = tuple[Scalars, Scalars]  # of current and speed
 
 
 class Stages(NamedTuple):
@@ -86,7 +90,7 @@ def held_step(
     A, _ = motor.state_space(drive)
 
     def rates(x, extra):
-        rate = motor.derivative(State(*x, extra), value, load, drive, moving)
+        rate = motor.derivative(State(x[0], x[1], extra), value, load, drive, moving)
         return _add((rate.current, rate.speed), _times(-A, x)), rate.extra
 
     halfway = _times(half, x)
@@ -108,8 +112,8 @@ def held_step(
 
 
 def _cross(
-    row: int, grip: Grip | None, before: tuple, after: tuple, push: Float[Array, "2 *batch"]
-):
+    row: int, grip: Grip | None, before: Pair, after: Pair, push: Float[Array, "2 *batch"]
+) -> Pair:
     """Mend a step in which the state that a dry element holds comes to zero.
 
     For a share of the step the state moved on as it did before; for the rest of it the element takes
@@ -135,7 +139,7 @@ def _cross(
     sticks = crosses & (taken == needed)
     mended = [after[k] + push[k] * change for k in range(2)]
     mended[row] = jnp.where(sticks, 0.0, mended[row])
-    return tuple(mended)
+    return mended[0], mended[1]
 
 
 class Walk(NamedTuple):
@@ -192,23 +196,29 @@ def walk(solver: HeldInput, start: Walk, steps: int, saveat: diffrax.SaveAt) -> 
 def along_grids(motor: Motor, tape: Tape) -> Propagator:
     """The propagator on every grid of the tape, stacked in front."""
     grids = [
-        propagator(motor, tape.sample_time[g], Drive(*(share[g] for share in tape.drive)))
+        propagator(
+            motor, tape.sample_time[g], Drive(*(jnp.asarray(share)[g] for share in tape.drive))
+        )
         for g in range(tape.sample_time.shape[0])
     ]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *grids)
 
 
-def pick_grid(grids: Propagator, tape: Tape, grid: Int[Array, "..."]) -> tuple[Propagator, Drive]:
+def pick_grid(
+    grids: Propagator, tape: Tape, grid: Int[Array | np.ndarray, "..."]
+) -> tuple[Propagator, Drive]:
     """Propagator and drive of one grid, or of one grid for each block."""
     return jax.tree.map(lambda leaf: leaf[grid], (grids, tape.drive))
 
 
-def _times(matrix: Matrix, x: tuple) -> tuple:
-    return tuple(matrix[i, 0] * x[0] + matrix[i, 1] * x[1] for i in range(2))
+def _times(matrix: Matrix, x: Pair) -> Pair:
+    first, second = (matrix[i, 0] * x[0] + matrix[i, 1] * x[1] for i in range(2))
+    return first, second
 
 
-def _add(*vectors: tuple) -> tuple:
-    return tuple(sum(entries) for entries in zip(*vectors, strict=True))
+def _add(*vectors: Pair) -> Pair:
+    first, second = (reduce(add, entries) for entries in zip(*vectors, strict=True))
+    return first, second
 
 
 def _shifted(extra: dict, weight: Held, rates: dict) -> dict:

@@ -14,6 +14,9 @@ from ..motor import Drive
 if TYPE_CHECKING:
     from ..recording import Recording
 
+# on the host as laid out, or on the device
+Samples = Array | np.ndarray
+
 # Samples in a block. Blocks are walked one after another for a population, side by side for one motor: long
 # enough that a block forgets most of how it began, short enough that filling up the last one costs little.
 BLOCK = 128
@@ -26,17 +29,17 @@ class Tape(eqx.Module):
     step. The drive and the load of sample k hold until sample k + 1.
     """
 
-    value: Float[Array, "blocks samples"]  # what drives: V, A or N m
-    load: Float[Array, "blocks samples"]  # N m, zero where unknown
-    measured: Float[Array, "blocks 2 samples"]  # current A, speed rad/s; zero where missing
-    weight: Float[Array, "blocks 2 samples"]  # 1 where measured, else 0
-    run: Int[Array, " blocks"]
-    begins: Bool[Array, " blocks"]
-    grid: Int[Array, " blocks"]
-    sample_time: Float[Array, " grids"]  # s
-    drive: Drive  # each Float[Array, " grids"]
-    initial: Float[Array, "runs 2"]  # first guess of current A and speed rad/s at the first sample
-    load_unknown: Bool[Array, " runs"]
+    value: Float[Samples, "blocks samples"]  # what drives: V, A or N m
+    load: Float[Samples, "blocks samples"]  # N m, zero where unknown
+    measured: Float[Samples, "blocks 2 samples"]  # current A, speed rad/s; zero where missing
+    weight: Float[Samples, "blocks 2 samples"]  # 1 where measured, else 0
+    run: Int[Samples, " blocks"]
+    begins: Bool[Samples, " blocks"]
+    grid: Int[Samples, " blocks"]
+    sample_time: Float[Samples, " grids"]  # s
+    drive: Drive  # each Float[Samples, " grids"]
+    initial: Float[Samples, "runs 2"]  # first guess of current A and speed rad/s
+    load_unknown: Bool[Samples, " runs"]
 
     @classmethod
     def from_recordings(cls, recordings: Sequence[Recording], unloaded: bool = False) -> Tape:
@@ -85,7 +88,7 @@ class Tape(eqx.Module):
         return self.initial.shape[0]
 
     def samples_of(
-        self, run: int, signal: Float[Array, "blocks samples"], length: int
+        self, run: int, signal: Float[Samples, "blocks samples"], length: int
     ) -> np.ndarray:
         """The `length` samples of one run, cut out of a signal laid out like the tape."""
         return np.asarray(signal)[np.asarray(self.run) == run].reshape(-1)[:length]
