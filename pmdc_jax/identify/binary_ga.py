@@ -21,6 +21,8 @@ from jaxtyping import Array, Bool, Float
 class State(BaseState):
     """Population in the unit cube and its fitness."""
 
+    best_fitness: float | jax.Array
+    generation_counter: int | jax.Array
     population: jax.Array
     fitness: jax.Array
 
@@ -29,8 +31,8 @@ class State(BaseState):
 class Params(BaseParams):
     """Probabilities of the paper: crossover 0.75, mutation of a bit 0.04."""
 
-    crossover_rate: float = 0.75
-    mutation_rate: float = 0.04
+    crossover_rate: float | jax.Array = 0.75
+    mutation_rate: float | jax.Array = 0.04
 
 
 class BinaryGA(PopulationBasedAlgorithm):

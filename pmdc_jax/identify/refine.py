@@ -204,7 +204,7 @@ def polish(problem: Problem, end: Refined) -> Polished:
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
     trial, held, share = end.unknowns, set(end.at_bound), 1.0
     best, converged = _weighed(problem, trial), False
-    reached = best
+    reached, step = best, np.zeros(len(_flatten(trial)))
     for _ in range(POLISH):
         if reached.cost > best.cost + 1e-9 and share > 1e-3:
             share /= 4  # the last step was too long

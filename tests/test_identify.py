@@ -1,0 +1,515 @@
+"""Identification on data of the independent bench: right, sure of itself as far as it may be, or silent.
+
+Almost every case has two runs of 1,000 samples, so that few shapes are compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import attrs
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from benchmarks import virtual_bench as vb
+from pmdc_jax import InputError, identify
+from pmdc_jax.identify import refine as refine_module
+from pmdc_jax.identify.binary_ga import BinaryGA
+from pmdc_jax.identify.identification import Identification
+from pmdc_jax.identify.parameters import Parameters
+from pmdc_jax.identify.refine import Problem, Unknowns, evaluate, polish, refine
+from pmdc_jax.identify.search import METHODS, search
+from pmdc_jax.identify.uncertainty import information, long_run_variance
+from pmdc_jax.motor import PARAMETERS
+from pmdc_jax.recording import Recording
+from pmdc_jax.simulate import Tape
+
+PAPER = vb.paper_motor()
+NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
+SAMPLES = 1000
+
+
+def recording(name: str, columns: vb.Columns) -> Recording:
+    quantities = ("time_s", "voltage_V", "current_A", "speed_rad_s")
+    return Recording(name, *(columns[q] for q in quantities), load=columns.get("load_torque_Nm"))
+
+
+def light_and_loaded(seed: int, motor=PAPER, step=1e-3, noise=NOISE, **known) -> list[Recording]:
+    """A run with a two-level voltage and no load, and one with steps of both, at hand-held `step`."""
+    rng = np.random.default_rng(seed)
+    duration = SAMPLES * step
+    light = vb.prbs(rng, duration, step, hold=10 * step)
+    loaded = vb.loaded(rng, duration, step, hold=duration / 16)
+    return [
+        recording(name, vb.record(motor, excitation, rng, noise, **known))
+        for name, excitation in (("light", light), ("loaded", loaded))
+    ]
+
+
+def unloaded(seed: int, motor=PAPER) -> list[Recording]:
+    """Two light runs in whose records no load is mentioned."""
+    rng = np.random.default_rng(seed)
+    excitations = {"first": vb.prbs(rng, 1.0), "second": vb.prbs(rng, 1.0, offset=-4.0)}
+    return [
+        recording(name, vb.record(motor, e, rng, NOISE, load_known=False))
+        for name, e in excitations.items()
+    ]
+
+
+def assert_right(
+    found: Identification, truth, names: Sequence[str] = tuple(PARAMETERS), percent: float = 1.0
+) -> None:
+    """Within 3.5 standard errors and some per cent of the truth, and claimed to be known."""
+    for name in names:
+        estimate, true = found.parameters[name], getattr(truth, name)
+        assert estimate.status in ("identified", "tied"), (name, estimate)
+        assert abs(estimate.value - true) < 3.5 * estimate.stderr, (name, true, estimate)
+        assert abs(estimate.value / true - 1) < percent / 100, (name, true, estimate)
+        low, high = estimate.ci95
+        assert low < estimate.value < high
+
+
+# ------------------------------------------------------------------------ with default options
+
+MOTORS = {
+    "paper": PAPER,
+    "drawn": vb.drawn_motor(np.random.default_rng(1)),
+    "drawn widely": vb.drawn_motor(np.random.default_rng(2), spread=0.6),
+}
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[Recording]:
+    return light_and_loaded(0)
+
+
+@pytest.fixture(scope="module")
+def found(runs) -> Identification:
+    return identify(runs)
+
+
+@pytest.mark.parametrize("motor", MOTORS.values(), ids=MOTORS.keys())
+def test_recovers_the_motor(motor):
+    result = identify(light_and_loaded(3, motor))
+    assert_right(result, motor)
+    assert result.converged
+    assert result.unidentified_directions == ()
+    assert result.messages == ()
+    assert result.noise["current_A"] == pytest.approx(NOISE.current_A, rel=0.1)
+    assert result.noise["speed_rad_s"] == pytest.approx(NOISE.speed_rad_s, rel=0.1)
+    for fit in result.fit.values():
+        assert fit.current_rmse == pytest.approx(NOISE.current_A, rel=0.1)
+        assert fit.speed_rmse == pytest.approx(NOISE.speed_rad_s, rel=0.1)
+        assert fit.speed_fit_percent > 95
+
+
+def test_runs_may_begin_in_motion():
+    motor, start = PAPER, (20.0, 150.0, 0.0)
+    result = identify(light_and_loaded(4, motor, start=start))
+    assert_right(result, motor)
+    for fit in result.fit.values():
+        assert fit.current_simulated[0] == pytest.approx(start[0], abs=5 * NOISE.current_A)
+        assert fit.speed_simulated[0] == pytest.approx(start[1], abs=2 * NOISE.speed_rad_s)
+
+
+def test_the_same_seed_gives_the_same_answer_bit_for_bit(runs, found):
+    again = identify(runs)
+    assert again.parameters == found.parameters
+    np.testing.assert_array_equal(again.covariance, found.covariance)
+    np.testing.assert_array_equal(again.search.best, found.search.best)
+
+
+def test_another_seed_gives_the_same_motor(runs, found):
+    other = identify(runs, seed=1)
+    assert not np.array_equal(other.search.best, found.search.best)
+    for name, estimate in found.parameters.items():
+        assert abs(other.parameters[name].value - estimate.value) < 0.1 * estimate.stderr
+
+
+def test_leaves_jax_as_it_was(found):
+    assert found.motor.R.dtype == np.float64
+    assert not jax.config.jax_enable_x64
+    assert jnp.zeros(1).dtype == jnp.float32
+
+
+def test_hold_outs_do_not_touch_the_fit(runs):
+    """Whatever they hold; and their own fit is judged with the motor of the others."""
+    light, loaded = runs
+    spoiled = attrs.evolve(light, speed=light.speed * 1.2 + 5.0)
+    fair, unfair = (identify([loaded], holdout=[held]) for held in (light, spoiled))
+    assert_right(fair, PAPER)
+    for name, estimate in fair.parameters.items():
+        assert unfair.parameters[name].value == pytest.approx(estimate.value, rel=1e-9)
+    assert [f.role for f in fair.fit.values()] == ["train", "holdout"]
+    assert fair.fit["light"].speed_rmse == pytest.approx(NOISE.speed_rad_s, rel=0.1)
+    assert unfair.fit["light"].speed_rmse > 10 * NOISE.speed_rad_s
+
+
+# -------------------------------------------------------------- what the recordings cannot tell
+
+
+@pytest.mark.parametrize("declared", [True, False], ids=["declared", "unknown constant load"])
+def test_without_a_known_load_only_ratios_are_claimed(declared):
+    result = identify(unloaded(5), unloaded=declared)
+    assert_right(result, PAPER, ("R", "L", "Kb"))
+    for name in ("Kt", "J", "f"):
+        estimate = result.parameters[name]
+        assert estimate.status == "not_identifiable"
+        assert (estimate.stderr, estimate.ci95) == (None, None)
+    (direction,) = result.unidentified_directions
+    assert set(direction.parameters) == {"Kt", "J", "f"}
+    assert "load" in direction.why
+    assert "tie" in direction.mend
+    # the ratios are right all the same, and Kt is what it is in SI
+    motor = result.motor
+    assert float(motor.Kt / motor.J) == pytest.approx(PAPER.Kt / PAPER.J, rel=0.01)
+    assert float(motor.f / motor.J) == pytest.approx(PAPER.f / PAPER.J, rel=0.03)
+    assert float(motor.Kt) == pytest.approx(float(motor.Kb), rel=1e-6)
+
+
+def test_the_tie_makes_an_unloaded_motor_whole():
+    truth = replace(PAPER, Kt=PAPER.Kb)
+    result = identify(unloaded(6, truth), tie=(("Kt", "Kb"),), unloaded=True)
+    assert_right(result, truth, percent=3.0)
+    assert result.parameters["Kt"].status == "tied"
+    assert result.parameters["Kt"].value == result.parameters["Kb"].value
+    assert result.unidentified_directions == ()
+
+
+def test_a_known_constant_makes_an_unloaded_motor_whole():
+    result = identify(unloaded(7), known={"Kt": PAPER.Kt}, unloaded=True)
+    assert_right(result, PAPER, ("R", "L", "Kb", "J", "f"), percent=3.0)
+    known = result.parameters["Kt"]
+    assert (known.value, known.stderr, known.status) == (PAPER.Kt, 0.0, "known")
+
+
+def test_one_run_may_lack_the_current(runs):
+    light, loaded = runs
+    assert_right(identify([attrs.evolve(light, current=None), loaded]), PAPER)
+    result = identify([light, attrs.evolve(loaded, current=None)])
+    assert_right(result, PAPER)
+    assert result.fit["loaded"].current_rmse is None
+
+
+def test_without_any_current_the_constants_are_not_claimed(runs):
+    """Speed under voltage and load knows four numbers: of R, L, Kb, Kt, J, f no more than ratios."""
+    result = identify([attrs.evolve(run, current=None) for run in runs])
+    for name in ("R", "Kb", "Kt", "J"):
+        estimate = result.parameters[name]
+        right = estimate.stderr and abs(estimate.value / getattr(PAPER, name) - 1) < 0.05
+        assert estimate.status == "not_identifiable" or right, (name, estimate)
+    assert result.parameters["R"].status == "not_identifiable"
+    assert any("current" in d.why for d in result.unidentified_directions)
+    assert result.fit["loaded"].speed_rmse == pytest.approx(NOISE.speed_rad_s, rel=0.1)
+
+
+def test_current_and_speed_tell_the_mechanical_half():
+    """Without voltage: slow enough for the sampled current to be the current between samples."""
+    rng = np.random.default_rng(8)
+    drives = [vb.drive(rng, 2.0, 2e-3), vb.drive(rng, 2.0, 2e-3, load=0.9)]
+    runs = [
+        attrs.evolve(recording(name, vb.record(PAPER, e, rng, NOISE)), voltage=None)
+        for name, e in zip(("a", "b"), drives, strict=True)
+    ]
+    result = identify(runs)
+    assert_right(result, PAPER, ("Kt", "J"), percent=1.0)
+    assert_right(result, PAPER, ("f",), percent=10.0)
+    for name in ("R", "L", "Kb"):
+        estimate = result.parameters[name]
+        assert (estimate.value, estimate.status) == (None, "not_identifiable")
+    assert result.fit["a"].current_rmse is None
+
+
+def driven_by_torque(name: str, rng: np.random.Generator) -> Recording:
+    """Known torque and an encoder: angle by the closed form of J dw/dt = torque - f w."""
+    step = 1e-3
+    torque = np.repeat(rng.uniform(-0.5, 0.5, SAMPLES // 20), 20)
+    rate, decay = PAPER.f / PAPER.J, np.exp(-PAPER.f / PAPER.J * step)
+    angle, speed = [0.0], 30.0
+    for driving in torque[:-1]:
+        final = driving / PAPER.f
+        angle.append(angle[-1] + final * step + (speed - final) * (1 - decay) / rate)
+        speed = final + (speed - final) * decay
+    measured = np.array(angle) + 2e-4 * rng.standard_normal(SAMPLES)
+    return Recording(
+        name, step * np.arange(SAMPLES), torque=torque, angle=measured, load=0 * torque
+    )
+
+
+def test_torque_and_angle_tell_inertia_and_friction():
+    rng = np.random.default_rng(9)
+    result = identify([driven_by_torque("a", rng), driven_by_torque("b", rng)])
+    assert_right(result, PAPER, ("J",), percent=1.0)
+    assert_right(result, PAPER, ("f",), percent=5.0)
+    for name in ("R", "L", "Kb", "Kt"):
+        assert result.parameters[name].status == "not_identifiable"
+
+
+def test_an_inductance_too_fast_to_see_is_no_confident_number():
+    """Sampled ten electrical time constants apart; the rest of the motor is there all the same."""
+    result = identify(light_and_loaded(10, step=20e-3))
+    assert_right(result, PAPER, ("R", "Kb", "Kt", "J", "f"), percent=2.0)
+    L = result.parameters["L"]
+    silent = L.status in ("not_identifiable", "at_bound")
+    assert silent or L.ci95[0] < PAPER.L < L.ci95[1] or abs(L.value - PAPER.L) < 3.5 * L.stderr, L
+
+
+# ------------------------------------------------------------------------- refine and polish
+
+
+def problem_of(runs: list[Recording], bounds=None) -> Problem:
+    wide = {n: (getattr(PAPER, n) / 100, getattr(PAPER, n) * 100) for n in PARAMETERS}
+    return Problem(
+        Parameters.of(wide | (bounds or {})),
+        jax.tree.map(jnp.asarray, Tape.from_recordings(runs)),
+        jnp.array([NOISE.current_A, NOISE.speed_rad_s]),
+        free=jnp.ones(6, bool),
+        counts=jnp.ones(2, bool),
+    )
+
+
+def start_at(problem: Problem, factor: float = 1.0) -> Unknowns:
+    """The paper's motor, or some factor off, and each run as it begins in its record."""
+    coordinates = np.log([factor * getattr(PAPER, n) for n in PARAMETERS])
+    local = np.concatenate([problem.tape.initial, np.zeros((2, 1))], 1)
+    return Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
+
+
+def test_a_bound_in_the_way_is_reported(x64, runs):
+    """R may not reach its true value from below, J not from above; both end where they are stopped."""
+    limits = {"R": (0.01, 0.14), "J": (6e-4, 1e-2)}
+    problem = problem_of(runs, limits)
+    start = start_at(problem)
+    inside = start.coordinates.at[0].set(np.log(0.05)).at[4].set(np.log(2e-3))
+    end = polish(problem, refine(problem, start._replace(coordinates=inside))).refined
+    assert end.at_bound == (0, 4)
+    values = np.exp(np.asarray(end.unknowns.coordinates))
+    np.testing.assert_allclose(values[[0, 4]], [0.14, 6e-4], rtol=1e-12)
+    assert end.fitness > 4  # a perfect model has 2
+
+
+def test_a_bound_that_only_was_in_the_way_lets_go(x64, runs):
+    """A coordinate that starts at its bound, the optimum being inside, is not reported."""
+    problem = problem_of(runs, {"R": (0.1, 1.0)})
+    start = start_at(problem)
+    held = start._replace(coordinates=start.coordinates.at[0].set(np.log(0.1)))
+    end = refine(problem, held)
+    polished = polish(problem, end._replace(at_bound=(0,))).refined
+    assert polished.at_bound == ()
+    assert polished.converged
+    assert np.exp(polished.unknowns.coordinates[0]) == pytest.approx(PAPER.R, rel=1e-2)
+
+
+def squares(problem: Problem, unknowns: Unknowns) -> float:
+    return float(jnp.sum(evaluate(problem, unknowns).residuals ** 2))
+
+
+def test_converged_means_that_nothing_near_is_better(x64, runs):
+    """By trial: a twentieth of a standard error along any parameter, either way, gains nothing."""
+    problem = problem_of(runs)
+    polished = polish(problem, refine(problem, start_at(problem, 1.5)))
+    best, evaluation = polished.refined, polished.evaluation
+    assert best.converged
+    problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(polished.noise))
+    info = information(
+        evaluation.residuals, evaluation.jacobian, problem.tape.run, np.ones(6, bool), 2
+    )
+    lowest = squares(problem, best.unknowns)
+    for k, spread in enumerate(np.sqrt(np.diag(info.covariance))):
+        for sign in (-1, 1):
+            moved = best.unknowns.coordinates.at[k].add(sign * 0.05 * spread)
+            assert squares(problem, best.unknowns._replace(coordinates=moved)) > lowest
+
+
+def test_a_refinement_that_is_cut_short_does_not_claim_convergence(x64, runs, monkeypatch):
+    problem = problem_of(runs)
+    there = refine(problem, start_at(problem))
+    far = there._replace(unknowns=start_at(problem, 1.3))
+    monkeypatch.setattr(refine_module, "POLISH", 1)
+    assert not polish(problem, far).refined.converged
+    monkeypatch.setattr(refine_module, "POLISH", 12)
+    assert polish(problem, there).refined.converged
+
+
+def test_a_failed_simulation_is_no_optimum(x64, runs):
+    """Where the model overflows, refinement must not stop and call it good."""
+    problem = problem_of(runs, {"f": (1e-9, 1e300)})
+    start = start_at(problem)
+    wild = start._replace(coordinates=start.coordinates.at[5].set(np.log(1e299)))
+    end = refine(problem, wild)
+    polished = polish(problem, end).refined
+    assert not polished.converged or polished.fitness < 3
+
+
+COVERAGE = {
+    "white": NOISE,
+    "coloured torque": replace(NOISE, torque_Nm=0.02, torque_correlation_s=0.01),
+}
+
+
+@pytest.mark.parametrize("noise", COVERAGE.values(), ids=COVERAGE.keys())
+def test_standard_errors_are_the_size_of_the_errors(x64, noise):
+    """Twelve repeats of six parameters: errors over standard errors have a spread of about one."""
+    scores = []
+    for seed in range(12):
+        problem = problem_of(light_and_loaded(100 + seed, noise=noise))
+        end = refine(problem, start_at(problem))
+        polished = polish(problem, end)
+        evaluation, unknowns = polished.evaluation, polished.refined.unknowns
+        info = information(
+            evaluation.residuals, evaluation.jacobian, problem.tape.run, np.ones(6, bool), 2
+        )
+        error = np.asarray(unknowns.coordinates - start_at(problem).coordinates)
+        scores.append(error / np.sqrt(np.diag(info.covariance)))
+    spread = np.sqrt(np.mean(np.square(scores)))
+    assert 0.6 < spread < 1.5, (spread, np.sqrt(np.mean(np.square(scores), 0)))
+
+
+# ------------------------------------------------------------------------------- the search
+
+
+@pytest.fixture(scope="module")
+def problem(runs) -> tuple[Parameters, Tape, np.ndarray]:
+    """What a search needs, by the paper's motor a factor of ten either way."""
+    bounds = {n: (getattr(PAPER, n) / 10, getattr(PAPER, n) * 10) for n in PARAMETERS}
+    noise = np.array([NOISE.current_A, NOISE.speed_rad_s])
+    return Parameters.of(bounds), Tape.from_recordings(runs), noise
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_searches(x64, problem, method):
+    parameters = problem[0]
+    generations = 12
+    result = search(*problem, method, seed=1, population=32, generations=generations)
+    assert result.best[-1] < result.best[0] / 2
+    assert len(result.best) == len(result.median) == generations
+    assert result.evaluations >= 32 * generations
+    assert np.all(np.diff(result.fitness) >= 0)
+    assert result.fitness[0] == result.best[-1]
+    assert np.all(result.candidates >= parameters.lower - 1e-12)
+    assert np.all(result.candidates <= parameters.upper + 1e-12)
+    assert not result.interrupted
+
+
+def test_an_unknown_method_is_refused(problem):
+    with pytest.raises(InputError, match="annealing"):
+        search(*problem, "annealing")
+
+
+def test_the_paper_ga_finds_more_than_scattering_does(x64, problem):
+    """As many candidates drawn blindly are the control."""
+    blind = search(*problem, "paper_ga", seed=2, population=32 * 12, generations=1)
+    bred = search(*problem, "paper_ga", seed=2, population=32, generations=12)
+    assert blind.evaluations == bred.evaluations
+    assert bred.best[-1] < blind.best[-1]
+
+
+def test_the_binary_code_round_trips():
+    """Any chromosome is the code of what it decodes to; any number is coded to half a level."""
+    algorithm = BinaryGA(8, jnp.zeros(6))
+    rng = np.random.default_rng(3)
+    chromosomes = jnp.asarray(rng.integers(0, 2, (8, 60)) > 0)
+    decoded = algorithm._decode(chromosomes)
+    assert decoded.shape == (8, 6)
+    assert np.all((decoded >= 0) & (decoded <= 1))
+    np.testing.assert_array_equal(algorithm._encode(decoded), chromosomes)
+    numbers = jnp.asarray(rng.uniform(size=(8, 6)), jnp.float32)
+    coded = algorithm._decode(algorithm._encode(numbers))
+    assert np.abs(coded - numbers).max() <= 0.5 / 1023 + 1e-6
+    ends = jnp.array([[0.0] * 6, [1.0] * 6])
+    np.testing.assert_array_equal(algorithm._decode(algorithm._encode(ends)), ends)
+
+
+def test_the_best_of_a_generation_survives():
+    algorithm = BinaryGA(20, jnp.zeros(6))
+    settings = algorithm.default_params
+    key = jax.random.key(0)
+    population = algorithm._decode(jax.random.bernoulli(key, shape=(20, 60)))
+    fitness = jnp.arange(20.0)[::-1]
+    state = algorithm.init(key, population, fitness, settings)
+    children, _ = algorithm.ask(key, state, settings)
+    np.testing.assert_allclose(children[0], population[-1], atol=1e-7)
+    assert len(np.unique(np.asarray(children), axis=0)) > 10
+
+
+def test_an_interrupted_search_still_answers(runs):
+    def progress(what, fitness=None, share=None):
+        if share and share > 0.3:
+            raise KeyboardInterrupt
+
+    result = identify(runs, progress=progress)
+    assert_right(result, PAPER)
+    assert any("interrupted" in message for message in result.messages)
+
+
+def test_progress_is_told(runs):
+    told = []
+    identify(
+        runs, progress=lambda what, fitness=None, share=None: told.append((what, fitness, share))
+    )
+    shares = [share for _, _, share in told if share is not None]
+    fitness = [f for _, f, share in told if share is not None]
+    assert shares == sorted(shares)
+    assert 0 < shares[0] < shares[-1] <= 1
+    assert fitness == sorted(fitness, reverse=True)
+    assert any("refining" in what for what, _, _ in told)
+
+
+# ------------------------------------------------------------------------- long-run variance
+
+
+@pytest.mark.parametrize("memory", [-0.5, 0.0, 0.5, 0.9, 0.97])
+def test_long_run_variance_of_an_autoregression(memory):
+    """The sum of n terms of x_k = a x_(k-1) + e_k has variance n / (1 - a)^2."""
+    rng, n = np.random.default_rng(4), 4000
+    ratios = []
+    for _ in range(30):
+        terms = lfilter([1.0], [1.0, -memory], rng.standard_normal((n + 500, 3)), axis=0)[500:]
+        ratios.append(np.diag(long_run_variance(terms)) * (1 - memory) ** 2 / n)
+    # A correlation as long as the stretches that are summed (here 40 samples) is seen through few of them; what
+    # error that leaves must be on the safe side, at most a fifth of a standard error.
+    assert 0.9 < np.mean(ratios) < (1.1 if memory < 0.9 else 1.44)
+
+
+def test_long_run_covariance_between_terms():
+    """Two terms that share half their innovations; a symmetric positive matrix."""
+    rng, n = np.random.default_rng(5), 4000
+    matrices = []
+    for _ in range(30):
+        shared, own = rng.standard_normal((n, 1)), rng.standard_normal((n, 2))
+        terms = lfilter([1.0], [1.0, -0.6], shared + own, axis=0)
+        matrices.append(long_run_variance(terms) * 0.4**2 / n)
+        assert np.linalg.eigvalsh(matrices[-1]).min() > 0
+        np.testing.assert_allclose(matrices[-1], matrices[-1].T, rtol=1e-9)
+    np.testing.assert_allclose(np.mean(matrices, 0), [[2, 1], [1, 2]], atol=0.2)
+
+
+# ------------------------------------------------------------------------------ bad arguments
+
+BAD = {
+    "no run": (lambda r: identify([]), "no recording"),
+    "twice the same name": (lambda r: identify([r[0], r[0]]), "two runs have this name"),
+    "in training and hold-out": (lambda r: identify(r, holdout=[r[0]]), "two runs"),
+    "unknown parameter tied": (lambda r: identify(r, tie=(("Kt", "Ke"),)), "Ke"),
+    "tied to itself": (lambda r: identify(r, tie=(("Kt", "Kt"),)), "circle"),
+    "tied in a circle": (lambda r: identify(r, tie=(("Kt", "Kb"), ("Kb", "Kt"))), "circle"),
+    "tied twice": (lambda r: identify(r, tie=(("Kt", "Kb"), ("Kt", "R"))), "tie"),
+    "known and tied": (lambda r: identify(r, known={"Kt": 0.05}, tie=(("Kt", "Kb"),)), "known"),
+    "unknown known": (lambda r: identify(r, known={"Ke": 0.05}), "Ke"),
+    "negative known": (lambda r: identify(r, known={"R": -1.0}), "positive"),
+    "infinite known": (lambda r: identify(r, known={"R": float("inf")}), "R"),
+    "not a number known": (lambda r: identify(r, known={"R": float("nan")}), "positive"),
+    "unknown effect": (lambda r: identify(r, effects=("magic",)), "magic"),
+    "unknown search": (lambda r: identify(r, search="magic"), "magic"),
+}
+
+
+@pytest.mark.parametrize(("call", "says"), BAD.values(), ids=BAD.keys())
+def test_bad_arguments_are_refused(runs, call, says):
+    with pytest.raises(InputError, match=says):
+        call(runs)

@@ -1,0 +1,69 @@
+"""Imports run downwards only, as the folder listing suggests."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "pmdc_jax"
+
+# what a part may import at run time, beside what lies in itself; parts not named may import anything
+BELOW = {
+    "errors": set(),
+    "precision": set(),
+    "units": {"errors"},
+    "columns": {"errors", "units"},
+    "tables": {"errors"},
+    "recording": {"columns", "errors", "tables", "units"},
+    "effects": set(),
+    "motor": {"effects"},
+    "simulate": {"effects", "motor", "precision", "recording"},
+    "check": {"alignment", "plausibility", "recording"},
+    "identify": {"check", "effects", "errors", "motor", "precision", "recording", "simulate"},
+}
+
+
+def part_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def imported_parts(path: Path) -> set[str]:
+    """Parts of the package that a module imports when it runs, not for its annotations alone."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            node.body = []
+    depth = len(path.relative_to(PACKAGE).parts)
+    parts = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.level == depth:
+            names = [node.module] if node.module else [alias.name for alias in node.names]
+            parts |= {name.split(".")[0] for name in names}
+    return parts
+
+
+@pytest.mark.parametrize("part", BELOW)
+def test_imports_run_downwards(part):
+    modules = [path for path in PACKAGE.rglob("*.py") if part_of(path) == part]
+    assert modules, f"{part} is gone: mend the table"
+    for module in modules:
+        assert imported_parts(module) <= BELOW[part] | {part}, module.name
+
+
+def test_there_is_no_drawer_for_odds_and_ends():
+    names = {path.stem for path in PACKAGE.rglob("*.py")}
+    assert not names & {"utils", "helpers", "manager", "common", "misc"}
+
+
+def test_importing_changes_nothing_and_prints_nothing():
+    code = (
+        "import sys, pmdc_jax; assert 'jax' not in sys.modules; import jax;"
+        "before = dict(jax.config.values); import pmdc_jax.identify, pmdc_jax.simulate;"
+        "assert dict(jax.config.values) == before"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
