@@ -90,10 +90,9 @@ def seen(name: str, result: Identification) -> str:
     """What the record does say, whatever the split between the parameters."""
     numerators, denominator = result.motor.transfer_function()
     gain = float(numerators["voltage -> speed"][0] / denominator[2]) / DEGREE
-    slow, fast = sorted(-1 / np.roots(np.asarray(denominator)).real, reverse=True)
-    return (
-        f"{name}: {gain:.1f} deg/s per V, time constants {1e3 * slow:.1f} and {1e3 * fast:.1f} ms"
-    )
+    inertial, resistive, stiff = (float(c) for c in denominator)
+    frequency, damping = np.sqrt(stiff / inertial), resistive / 2 / np.sqrt(inertial * stiff)
+    return f"{name}: {gain:.1f} deg/s per V, {frequency:.1f} rad/s, damping ratio {damping:.2f}"
 
 
 def picture(results: dict[str, Identification]):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from evosax.algorithms.population_based.base import (
@@ -21,8 +23,9 @@ from jaxtyping import Array, Bool, Float
 class State(BaseState):
     """Population in the unit cube and its fitness."""
 
-    best_fitness: float | jax.Array
-    generation_counter: int | jax.Array
+    # numbers to the base class, traced arrays under jit
+    best_fitness: Any
+    generation_counter: Any
     population: jax.Array
     fitness: jax.Array
 
