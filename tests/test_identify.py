@@ -40,7 +40,7 @@ def recording(name: str, columns: vb.Columns) -> Recording:
 
 
 def light_and_loaded(seed: int, motor=PAPER, step=1e-3, noise=NOISE, **known) -> list[Recording]:
-    """A run with a two-level voltage and no load, and one with steps of both, at hand-held `step`."""
+    """A run with a two-level voltage and no load, and one with steps of both voltage and load."""
     rng = np.random.default_rng(seed)
     duration = SAMPLES * step
     light = vb.prbs(rng, duration, step, hold=10 * step)
@@ -142,7 +142,7 @@ def test_hold_outs_do_not_touch_the_fit(runs):
     light, loaded = runs
     spoiled = attrs.evolve(light, speed=light.speed * 1.2 + 5.0)
     fair, unfair = (identify([loaded], holdout=[held]) for held in (light, spoiled))
-    assert_right(fair, PAPER)
+    assert_right(fair, PAPER, percent=4.0)
     for name, estimate in fair.parameters.items():
         assert unfair.parameters[name].value == pytest.approx(estimate.value, rel=1e-9)
     assert [f.role for f in fair.fit.values()] == ["train", "holdout"]
@@ -190,35 +190,43 @@ def test_a_known_constant_makes_an_unloaded_motor_whole():
 
 def test_one_run_may_lack_the_current(runs):
     light, loaded = runs
-    assert_right(identify([attrs.evolve(light, current=None), loaded]), PAPER)
+    assert_right(identify([attrs.evolve(light, current=None), loaded]), PAPER, percent=2.0)
     result = identify([light, attrs.evolve(loaded, current=None)])
-    assert_right(result, PAPER)
+    assert_right(result, PAPER, percent=2.0)
     assert result.fit["loaded"].current_rmse is None
 
 
 def test_without_any_current_the_constants_are_not_claimed(runs):
-    """Speed under voltage and load knows four numbers: of R, L, Kb, Kt, J, f no more than ratios."""
+    """(Kt/R) (v - Kb w) - f w - T = J dw/dt: Kt/R, J and a sum of Kb and f show, and hardly more."""
     result = identify([attrs.evolve(run, current=None) for run in runs])
-    for name in ("R", "Kb", "Kt", "J"):
-        estimate = result.parameters[name]
-        right = estimate.stderr and abs(estimate.value / getattr(PAPER, name) - 1) < 0.05
-        assert estimate.status == "not_identifiable" or right, (name, estimate)
-    assert result.parameters["R"].status == "not_identifiable"
-    assert any("current" in d.why for d in result.unidentified_directions)
     assert result.fit["loaded"].speed_rmse == pytest.approx(NOISE.speed_rad_s, rel=0.1)
+    for name in ("R", "L", "Kt"):
+        assert result.parameters[name].status == "not_identifiable"
+    assert any("current" in d.why for d in result.unidentified_directions)
+    assert_right(result, PAPER, ("J",), percent=3.0)
+    for name in ("Kb", "f"):
+        if result.parameters[name].status != "not_identifiable":
+            assert_right(result, PAPER, (name,), percent=50.0)
+    m = result.motor
+    assert float(m.Kt / m.R) == pytest.approx(PAPER.Kt / PAPER.R, rel=0.01)
+    braking = PAPER.Kt * PAPER.Kb / PAPER.R + PAPER.f
+    assert float(m.Kt * m.Kb / m.R + m.f) == pytest.approx(braking, rel=0.01)
 
 
 def test_current_and_speed_tell_the_mechanical_half():
-    """Without voltage: slow enough for the sampled current to be the current between samples."""
-    rng = np.random.default_rng(8)
-    drives = [vb.drive(rng, 2.0, 2e-3), vb.drive(rng, 2.0, 2e-3, load=0.9)]
-    runs = [
-        attrs.evolve(recording(name, vb.record(PAPER, e, rng, NOISE)), voltage=None)
-        for name, e in zip(("a", "b"), drives, strict=True)
-    ]
+    """Without voltage: sampled fast enough for the current to be a straight line between samples.
+
+    Its rise at switching on is cut off; and its noise, being that of an input here, is kept small.
+    """
+    rng, cut, runs = np.random.default_rng(8), 100, []
+    for name, load in (("a", 0.6), ("b", 0.9)):
+        excitation = vb.drive(rng, (SAMPLES + cut) * 5e-4, 5e-4, load=load)
+        columns = vb.record(PAPER, excitation, rng, replace(NOISE, current_A=0.02))
+        smooth = recording(name, {q: values[cut:] for q, values in columns.items()})
+        runs.append(attrs.evolve(smooth, voltage=None))
     result = identify(runs)
     assert_right(result, PAPER, ("Kt", "J"), percent=1.0)
-    assert_right(result, PAPER, ("f",), percent=10.0)
+    assert_right(result, PAPER, ("f",), percent=30.0)
     for name in ("R", "L", "Kb"):
         estimate = result.parameters[name]
         assert (estimate.value, estimate.status) == (None, "not_identifiable")
@@ -250,13 +258,21 @@ def test_torque_and_angle_tell_inertia_and_friction():
         assert result.parameters[name].status == "not_identifiable"
 
 
+def test_slow_sampling():
+    """Ten electrical time constants a sample, two thirds of the mechanical one."""
+    assert_right(identify(light_and_loaded(10, step=20e-3)), PAPER, percent=2.0)
+
+
 def test_an_inductance_too_fast_to_see_is_no_confident_number():
-    """Sampled ten electrical time constants apart; the rest of the motor is there all the same."""
-    result = identify(light_and_loaded(10, step=20e-3))
-    assert_right(result, PAPER, ("R", "Kb", "Kt", "J", "f"), percent=2.0)
+    """25 electrical time constants a sample; the rest of the motor is there all the same."""
+    truth = replace(PAPER, L=PAPER.L / 50)
+    result = identify(light_and_loaded(10, truth))
+    assert_right(result, truth, ("R", "Kb", "Kt", "J", "f"), percent=2.0)
     L = result.parameters["L"]
-    silent = L.status in ("not_identifiable", "at_bound")
-    assert silent or L.ci95[0] < PAPER.L < L.ci95[1] or abs(L.value - PAPER.L) < 3.5 * L.stderr, L
+    if L.status == "identified":
+        assert L.ci95[0] < truth.L < L.ci95[1], L
+    else:
+        assert (L.stderr, L.ci95) == (None, None)
 
 
 # ------------------------------------------------------------------------- refine and polish
@@ -386,7 +402,7 @@ def test_every_method_searches(x64, problem, method):
     parameters = problem[0]
     generations = 12
     result = search(*problem, method, seed=1, population=32, generations=generations)
-    assert result.best[-1] < result.best[0] / 2
+    assert result.best[-1] < 0.9 * result.best[0]
     assert len(result.best) == len(result.median) == generations
     assert result.evaluations >= 32 * generations
     assert np.all(np.diff(result.fitness) >= 0)
@@ -463,17 +479,28 @@ def test_progress_is_told(runs):
 # ------------------------------------------------------------------------- long-run variance
 
 
-@pytest.mark.parametrize("memory", [-0.5, 0.0, 0.5, 0.9, 0.97])
-def test_long_run_variance_of_an_autoregression(memory):
+@pytest.mark.parametrize(
+    ("memory", "samples"),
+    [(-0.5, 4000), (0.0, 4000), (0.5, 4000), (0.9, 20_000), (0.97, 20_000)],
+)
+def test_long_run_variance_of_an_autoregression(memory, samples):
     """The sum of n terms of x_k = a x_(k-1) + e_k has variance n / (1 - a)^2."""
-    rng, n = np.random.default_rng(4), 4000
-    ratios = []
-    for _ in range(30):
-        terms = lfilter([1.0], [1.0, -memory], rng.standard_normal((n + 500, 3)), axis=0)[500:]
-        ratios.append(np.diag(long_run_variance(terms)) * (1 - memory) ** 2 / n)
-    # A correlation as long as the stretches that are summed (here 40 samples) is seen through few of them; what
-    # error that leaves must be on the safe side, at most a fifth of a standard error.
-    assert 0.9 < np.mean(ratios) < (1.1 if memory < 0.9 else 1.44)
+    rng, ratios = np.random.default_rng(4), []
+    for _ in range(40):
+        terms = lfilter([1.0], [1.0, -memory], rng.standard_normal((samples + 500, 3)), axis=0)
+        variance = np.diag(long_run_variance(terms[500:]))
+        ratios.append(variance * (1 - memory) ** 2 / samples)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("memory", [0.9, 0.97])
+def test_few_and_slow_terms_make_it_cautious(memory):
+    """A hundred correlation times or less: too large rather than too small, but not by much."""
+    rng, ratios = np.random.default_rng(4), []
+    for _ in range(40):
+        terms = lfilter([1.0], [1.0, -memory], rng.standard_normal((4500, 3)), axis=0)[500:]
+        ratios.append(np.diag(long_run_variance(terms)) * (1 - memory) ** 2 / 4000)
+    assert 0.95 < np.mean(ratios) < 1.6
 
 
 def test_long_run_covariance_between_terms():

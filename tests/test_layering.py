@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,33 @@ def test_imports_run_downwards(part):
     assert modules, f"{part} is gone: mend the table"
     for module in modules:
         assert imported_parts(module) <= BELOW[part] | {part}, module.name
+
+
+def modules_imported(path: Path) -> set[Path]:
+    """Modules of the package that this one imports, at the top or inside a function."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            node.body = []
+    found = set()
+    for node in ast.walk(tree):
+        assert not (isinstance(node, ast.Import) and "pmdc_jax" in ast.unparse(node)), path
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
+            found |= {base / alias.name for alias in node.names} | {base}
+    files = {base.with_suffix(".py") for base in found} | {base / "__init__.py" for base in found}
+    return {file for file in files if file.exists()} - {path}
+
+
+def test_there_are_no_import_cycles():
+    """A package's own `__init__` counts as the parts it gathers, not as a part that they import."""
+    graph = {path: modules_imported(path) for path in PACKAGE.rglob("*.py")}
+    assert sum(map(len, graph.values())) > 50, "the imports are no longer found"
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        names = [str(path.relative_to(PACKAGE)) for path in error.args[1]]
+        pytest.fail("cycle: " + " < ".join(names))
 
 
 def test_there_is_no_drawer_for_odds_and_ends():

@@ -151,13 +151,16 @@ def _refuse(recordings, holdout, tie, known) -> None:
             raise InputError(name, "two runs have this name", "Rename one, or name it only once")
     check_names("--tie", [name for pair in tie for name in pair])
     check_names("--known", list(known or {}))
+    targets = [target for target, _ in tie]
     for target, source in tie:
+        if targets.count(target) > 1:
+            raise InputError("--tie", f"{target} is tied twice", "Drop one")
         if target == source or target in (known or {}) or target in {b for _, b in tie}:
             raise InputError(
                 "--tie", f"{target}={source} ties in a circle or a known value", "Drop one"
             )
     for name, value in (known or {}).items():
-        if not value > 0:
+        if not 0 < value < np.inf:
             raise InputError("--known", f"{name}={value} is not positive", "Give a value in SI")
 
 

@@ -53,10 +53,17 @@ def _refitted(
         matrix = np.array(normal_matrix(evaluate(problem, unknowns), problem.tape, problem.counts))
         step, _ = gauss_newton(matrix, {index}, len(start.coordinates))
         count = len(start.coordinates)
+        inside = np.clip(
+            np.asarray(unknowns.coordinates) + step[:count],
+            problem.parameters.lower,
+            problem.parameters.upper,
+        )
         unknowns = Unknowns(
-            unknowns.coordinates + jnp.asarray(step[:count]),
+            jnp.asarray(inside),
             unknowns.local + jnp.asarray(step[count:]).reshape(unknowns.local.shape),
         )
     evaluation = evaluate(problem, unknowns)
     counted = np.asarray(problem.counts)[np.asarray(problem.tape.run)]
-    return unknowns, float(np.square(np.asarray(evaluation.residuals)[counted]).sum())
+    with np.errstate(over="ignore"):  # a trial far off may be infinitely bad
+        squares = float(np.square(np.asarray(evaluation.residuals)[counted]).sum())
+    return unknowns, squares if np.isfinite(squares) else 1e300

@@ -24,8 +24,8 @@ def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
     """phi_0 to phi_count of z / 2 and of z.
 
     phi_0(z) = exp(z), phi_k(z) = sum_j z^j / (j + k)!. A Taylor series of a scaled-down z, doubled up again by
-    phi_p(2 z) = 2^-p (phi_0 phi_p + sum_{j=1..p} phi_j / (p - j)!), and phi_0 = 1 + z phi_1 so that slow
-    modes lose no digits.
+    phi_p(2 z) = 2^-p (phi_0 phi_p + sum_{j=1..p} phi_j / (p - j)!). Doubled is phi_0 - 1, not phi_0, so that slow
+    modes lose no digits and stiff ones stay dead.
 
     **Source**: Hochbruck, Ostermann, "Exponential integrators", Acta Numerica 19 (2010), section 2;
     Skaflestad, Wright, Applied Numerical Mathematics 59 (2009), equation (2.5), doi:10.1016/j.apnum.2008.03.021.
@@ -39,22 +39,21 @@ def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
             term = one / float(math.factorial(j + k)) + product(small, term)
         return term
 
-    def double(half, scaled):
-        f0 = one + product(scaled, half[0])
-        return tuple(
+    def double(carry):
+        decay, *half = carry
+        f0 = one + decay
+        doubled = [
             sum(
                 (half[j - 1] / float(math.factorial(p - j)) for j in range(1, p + 1)),
                 start=product(f0, half[p - 1]),
             )
             / 2**p
             for p in range(1, count + 1)
-        )
+        ]
+        return (2 * decay + product(decay, decay), *doubled)
 
-    def doubling(_, carry):
-        half, scaled = carry
-        return double(half, scaled), 2 * scaled
-
-    start = (tuple(series(k) for k in range(1, count + 1)), small)
-    half, scaled = jax.lax.fori_loop(0, HALVINGS - 1, doubling, start)
-    full = double(half, scaled)
-    return [one + product(scaled, half[0]), *half], [one + product(z, full[0]), *full]
+    phis = [series(k) for k in range(1, count + 1)]
+    start = (product(small, phis[0]), *phis)
+    half = jax.lax.fori_loop(0, HALVINGS - 1, lambda _, carry: double(carry), start)
+    full = double(half)
+    return [one + half[0], *half[1:]], [one + full[0], *full[1:]]
