@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from typing import NamedTuple
@@ -32,8 +33,8 @@ def motor(effects=(), **changes) -> Motor:
     return Motor(**{n: np.asarray(x, float) for n, x in (PAPER | changes).items()}, effects=effects)
 
 
-def population(motors: list[dict[str, float]], effects=()) -> Motor:
-    return Motor(**{n: np.array([m[n] for m in motors]) for n in PARAMETERS}, effects=effects)
+def population(motors: list[dict[str, float]]) -> Motor:
+    return Motor(**{n: np.array([m[n] for m in motors]) for n in PARAMETERS})
 
 
 def recording(name="run", samples=SAMPLES, step=1e-3, seed=0, **columns) -> Recording:
@@ -238,22 +239,13 @@ def test_joined_blocks_are_one_sequential_run(x64, effects):
     run = recording(current=np.zeros(SAMPLES), speed=np.zeros(SAMPLES))
     tape = Tape.from_recordings([run])
     seen = np.asarray(free_run(motor(effects), tape, jnp.asarray(tape.initial), jnp.zeros(1)))
-    one = population([PAPER])
-    one = jax.tree.map(lambda leaf: np.reshape(leaf, 1), Motor(*_fields(one), effects=effects))
+    one = jax.tree.map(lambda leaf: np.reshape(leaf, 1), motor(effects))
     for block, sample in ((0, 1), (0, 127), (1, 0), (1, 1), (2, 64), (3, 127)):
         weight = np.zeros_like(tape.weight)
         weight[block, :, sample] = 1.0
-        only = Tape(**{**_fields_of(tape), "weight": weight})
+        only = dataclasses.replace(tape, weight=weight)
         squares = np.array([float(e[0]) for e in squared_errors(one, only)])
         np.testing.assert_allclose(np.abs(seen[block, :, sample]), np.sqrt(squares), rtol=1e-7)
-
-
-def _fields(m: Motor):
-    return [getattr(m, n) for n in PARAMETERS]
-
-
-def _fields_of(tape: Tape) -> dict:
-    return {name: getattr(tape, name) for name in tape.__dataclass_fields__}
 
 
 def test_runs_on_one_tape_are_each_as_alone(x64):

@@ -25,7 +25,7 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
     friction = torque / speed
     return {
         "R": _around(R),
-        "L": (R * step / 20, R * np.sqrt(step * duration)),
+        "L": (R * step / 300, R * np.sqrt(step * duration)),
         "Kb": _around(Kb),
         "Kt": _around(Kb),
         "J": (inertia / CRUDE**2, inertia * CRUDE**2),
