@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .effects import EFFECTS
+from .effects import EFFECTS, AbstractEffect
 from .errors import InputError
 from .motor import PARAMETERS, Motor
 
@@ -72,27 +73,54 @@ def load_motor(path: str | Path) -> Motor:
     if not isinstance(content, dict) or not isinstance(content.get("parameters"), dict):
         raise InputError(where, 'has no "parameters"', "Write one with pmdc identify --save")
     constants = _numbers(where, content["parameters"], PARAMETERS, "parameters")
-    effects = []
-    for entry in content.get("effects", []):
-        name = entry.get("name") if isinstance(entry, dict) else entry
+    return Motor(**constants, effects=_effects(where, content.get("effects", [])))
+
+
+def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:
+    """The effects of a file, each `{"name": ..., "parameters": {...}}` and none of them twice."""
+    if not isinstance(entries, list):
+        raise InputError(where, f'"effects" is {entries!r}, not a list', "Write [] for none")
+    effects: dict[str, AbstractEffect] = {}
+    for entry in entries:
+        name = entry.get("name") if isinstance(entry, dict) else None
+        if not isinstance(name, str):
+            raise InputError(
+                where,
+                f"effect {entry!r} is not an object with a name",
+                'Write {"name": ..., "parameters": {...}}',
+            )
         if name not in EFFECTS:
             raise InputError(
                 where, f"effect {name!r} is not known", f"Choose of {', '.join(EFFECTS)}"
             )
+        if name in effects:
+            raise InputError(where, f"effect {name} is there twice", "Keep one of the two")
         fields = _numbers(where, entry.get("parameters", {}), EFFECTS[name].ranges, name)
-        effects.append(EFFECTS[name](**fields))
-    return Motor(**constants, effects=tuple(effects))
+        effects[name] = EFFECTS[name](**fields)
+    return tuple(effects.values())
 
 
-def _numbers(where: str, given: dict, wanted, of: str) -> dict[str, np.ndarray]:
+def _numbers(where: str, given: object, wanted, of: str) -> dict[str, np.ndarray]:
+    if not isinstance(given, dict):
+        raise InputError(where, f"{of}: parameters are {given!r}", "Give an object of numbers")
     numbers = {}
     for name in wanted:
         value = given.get(name)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-            raise InputError(
-                where, f"{of}: {name} is {value!r}, not a number", "Give a number in SI"
-            )
+        if not _is_finite_number(value):
+            shown = repr(value) if len(repr(value)) < 40 else "beyond what a double holds"
+            raise InputError(where, f"{of}: {name} is {shown}, not a number", "Give a number in SI")
         if name in PARAMETERS and not (value > 0 or (name == "f" and value == 0)):
             raise InputError(where, f"{of}: {name} is {value}, not positive", "Give a value in SI")
+        if name not in PARAMETERS and wanted[name].scale == "log" and value < 0:
+            raise InputError(where, f"{of}: {name} is {value}, below 0", "Give a value in SI")
         numbers[name] = np.asarray(float(value))
     return numbers
+
+
+def _is_finite_number(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # JSON holds whole numbers of any length
+        return False
