@@ -196,9 +196,6 @@ def test_one_run_may_lack_the_current(runs):
     assert result.fit["loaded"].current_rmse is None
 
 
-@pytest.mark.xfail(
-    reason="known weakness: along a flat valley f and Kb are not always told apart", strict=False
-)
 def test_without_any_current_the_constants_are_not_claimed(runs):
     """(Kt/R) (v - Kb w) - f w - T = J dw/dt: Kt/R, J and a sum of Kb and f show, and hardly more."""
     result = identify([attrs.evolve(run, current=None) for run in runs])
@@ -261,10 +258,6 @@ def test_torque_and_angle_tell_inertia_and_friction():
         assert result.parameters[name].status == "not_identifiable"
 
 
-@pytest.mark.xfail(
-    reason="known weakness: on one slow short run the search may end in another optimum",
-    strict=False,
-)
 def test_slow_sampling():
     """Ten electrical time constants a sample, two thirds of the mechanical one."""
     assert_right(identify(light_and_loaded(10, step=20e-3)), PAPER, percent=2.0)

@@ -7,14 +7,16 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from statistics import NormalDist
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
+import attrs
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..check import check
+from ..effects import AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS, Motor
 from ..precision import double_precision
@@ -22,11 +24,11 @@ from ..recording import Finding, Recording
 from ..simulate import Tape, uniform
 from .bounds import search_bounds
 from .identifiability import explain
-from .identification import Direction, Estimate, Identification, Role, RunFit, Search, Status
+from .identification import Estimate, Identification, Role, RunFit, Search, Status
 from .noise import white_noise
 from .parameters import Parameters, check_names, effects_named, unit_of
 from .profile import QUADRATIC, profile_interval
-from .refine import Problem, Refined, Unknowns, fit_own, polish, refine
+from .refine import Polished, Problem, Refined, Unknowns, fit_own, polish, refine
 from .search import Found
 from .search import search as global_search
 from .uncertainty import FLAT, Information, information
@@ -38,6 +40,10 @@ STARTS = 4
 REACH = NormalDist().inv_cdf(0.975)  # of a 95 % interval, in standard errors
 # Two refinements found the same optimum if their fitness agrees to this share.
 SAME = 1e-4
+# A fit worse than this many times the noise asks for another search, up to so many.
+POOR = 1.5
+SEARCHES = 5
+TIDYINGS = 3
 # Starts nearer to each other than this, in natural logarithms, are one.
 DISTINCT = 0.3
 
@@ -70,48 +76,132 @@ def identify(
     began = time.perf_counter()
     report = progress or (lambda *args, **kwargs: None)
     report("checking the recordings")
+    given = prepare(
+        recordings, holdout, tie=tie, known=known, unloaded=unloaded, effects=effects_named(effects)
+    )
+    solved = solve(given, search, seed, progress)
+    report("judging the uncertainty", solved.polished.refined.fitness)
+    found = judge(given, solved)
+    seconds = {**solved.seconds, "total": time.perf_counter() - began}
+    return attrs.evolve(found, seconds=seconds)
+
+
+class Prepared(NamedTuple):
+    """Checked recordings, training runs first, and the least-squares problem they make."""
+
+    runs: list[Recording]  # evenly sampled
+    roles: list[Role]
+    findings: tuple[Finding, ...]
+    untouched: Mapping[str, float]
+    known: Mapping[str, float]
+    ties: tuple[tuple[str, str], ...]
+    problem: Problem
+
+    @property
+    def training(self) -> list[Recording]:
+        """The runs that are fitted."""
+        return [run for run, role in zip(self.runs, self.roles, strict=True) if role == "train"]
+
+    def with_effects(self, effects: Sequence[type[AbstractEffect]]) -> Prepared:
+        """The same runs for a motor with other effects."""
+        parameters = Parameters.of(
+            search_bounds(self.training), effects, {**self.untouched, **self.known}, self.ties
+        )
+        problem = Problem(
+            parameters,
+            self.problem.tape,
+            self.problem.noise,
+            free=jnp.ones(len(parameters.names), bool),
+            counts=self.problem.counts,
+        )
+        return self._replace(problem=problem)
+
+
+def prepare(
+    recordings: Sequence[Recording],
+    holdout: Sequence[Recording],
+    *,
+    tie: Sequence[tuple[str, str]] = (),
+    known: Mapping[str, float] | None = None,
+    unloaded: bool = False,
+    effects: Sequence[type[AbstractEffect]] = (),
+) -> Prepared:
+    """Check the recordings and lay them out; raises `InputError` where they cannot give an answer."""
     _refuse(recordings, holdout, tie, known)
     findings = check([*recordings, *holdout])
     _refuse_errors(findings)
-    runs = [*recordings, *holdout]
-    even = [uniform(r) for r in runs]
-    training = even[: len(recordings)]
+    runs = [uniform(r) for r in (*recordings, *holdout)]
+    training = runs[: len(recordings)]
     noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in ("current", "speed")])
     untouched = _untouched(training)
-    parameters = Parameters.of(
-        search_bounds(training), effects_named(effects), untouched | dict(known or {}), tie
-    )
-
+    parameters = Parameters.of(search_bounds(training), effects, untouched | dict(known or {}), tie)
     # hold-outs lie on the tape too, but do not count: only what is their own is fitted to them
-    tape = jax.tree.map(jnp.asarray, Tape.from_recordings(even, unloaded))
     problem = Problem(
         parameters,
-        tape,
+        jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded)),
         jnp.asarray(noise),
         free=jnp.ones(len(parameters.names), bool),
         counts=jnp.arange(len(runs)) < len(recordings),
     )
-    middle = (parameters.lower + parameters.upper) / 2
+    roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
+    return Prepared(runs, roles, findings, untouched, dict(known or {}), tuple(tie), problem)
+
+
+class Solved(NamedTuple):
+    """The best fit that a search and its refinements found, and how it was found."""
+
+    polished: Polished
+    search: Search
+    seed: int
+    interrupted: bool
+    seconds: Mapping[str, float]
+
+
+def solve(
+    given: Prepared, search: str, seed: int, progress: ReportProgress | None = None
+) -> Solved:
+    """Search the bounds, refine the best candidates; again, from another seed, while the fit is poor."""
+    began = time.perf_counter()
+    report = progress or (lambda *args, **kwargs: None)
+    problem, searching = given.problem, Tape.from_recordings(given.training)
+    noise = np.asarray(problem.noise)
+
+    def look(seed: int) -> Found:
+        return global_search(problem.parameters, searching, noise, search, seed, progress=progress)
+
+    middle = (problem.parameters.lower + problem.parameters.upper) / 2
     with ThreadPoolExecutor(1) as beside:
         # a refinement that gives up at once: it is compiled on another core while the search runs
-        compiled = beside.submit(_refine, problem, _start(tape, middle), tolerance=1e3)
-        found = global_search(
-            parameters, Tape.from_recordings(training), noise, search, seed, progress=progress
-        )
+        compiled = beside.submit(_refine, problem, _start(problem.tape, middle), tolerance=1e3)
+        found = look(seed)
         searched = time.perf_counter()
         report("refining the best candidates", float(found.best[-1]))
         compiled.result()
-    ends = _refine_all(problem, [_start(tape, c) for c in _distinct(found)])
-    best, at_best, scale = polish(problem, ends[0])
-    refined = time.perf_counter()
+    ends = _refine_all(problem, found)
+    for attempt in range(1, SEARCHES):
+        if found.interrupted or _agreed(ends, searching):
+            break
+        before, found = found, look(seed + attempt)
+        found = found._replace(evaluations=before.evaluations + found.evaluations)
+        ends = sorted([*ends, *_refine_all(problem, found)], key=_fitness)
+    polished = polish(problem, ends[0])
+    seconds = {"search": searched - began, "refine": time.perf_counter() - searched}
+    return Solved(polished, _search_record(search, found, ends), seed, found.interrupted, seconds)
 
-    report("judging the uncertainty", best.fitness)
-    free = np.array([k not in best.at_bound for k in range(len(parameters.names))])
-    info = information(at_best.residuals, at_best.jacobian, tape.run, free, len(recordings))
-    best = _tidy(best, info, parameters)
-    motor = _plain(parameters(best.unknowns.coordinates))
-    directions = explain(info.unseen, parameters, training)
-    problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(scale))
+
+def judge(given: Prepared, solved: Solved) -> Identification:
+    """What a fit tells of every parameter and of every run."""
+    polished = solved.polished
+    problem, training = given.problem, given.training
+    parameters = problem.parameters
+    free = np.array([k not in polished.refined.at_bound for k in range(len(parameters.names))])
+    evaluation = polished.evaluation
+    info = information(
+        evaluation.residuals, evaluation.jacobian, problem.tape.run, free, len(training)
+    )
+    chosen = _tidy(problem, polished, info)
+    best = chosen.refined
+    problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
     def interval(k: int, spread: float, centre: float) -> tuple[float, float]:
         if not parameters.logarithmic[k] or spread < QUADRATIC:
@@ -119,26 +209,23 @@ def identify(
         return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], REACH)
 
     unknowns, ended = fit_own(problem, best.unknowns)
-    roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
-    fit = _fits(even, roles, tape, np.asarray(ended.seen), np.asarray(unknowns.local))
+    fit = _fits(
+        given.runs, given.roles, problem.tape, np.asarray(ended.seen), np.asarray(unknowns.local)
+    )
     return Identification(
-        motor=motor,
-        parameters=_estimates(parameters, best, info, untouched, dict(known or {}), interval),
-        unidentified_directions=directions,
+        motor=_plain(parameters(best.unknowns.coordinates)),
+        parameters=_estimates(parameters, best, info, given.untouched, given.known, interval),
+        unidentified_directions=explain(info.unseen, parameters, training),
         fit=fit,
         noise=_noise_of(fit),
         converged=best.converged,
-        seed=seed,
-        seconds={
-            "search": searched - began,
-            "refine": refined - searched,
-            "total": time.perf_counter() - began,
-        },
-        search=_search_record(search, found, ends, best),
-        findings=findings,
+        seed=solved.seed,
+        seconds=solved.seconds,
+        search=solved.search,
+        findings=given.findings,
         covariance=info.covariance,
         covariance_names=parameters.names,
-        messages=_messages(found, best, directions),
+        messages=_messages(solved, best, chosen is not polished),
     )
 
 
@@ -205,26 +292,54 @@ def _refine(problem: Problem, start: Unknowns, **options: float) -> Refined:
         return refine(problem, start, **options)
 
 
-def _refine_all(problem: Problem, starts: Sequence[Unknowns]) -> list[Refined]:
-    """Refine from several starts, one a core at a time; the best first."""
+def _refine_all(problem: Problem, found: Found) -> list[Refined]:
+    """Refine the best distinct candidates of a search, one a core at a time; the best first."""
+    starts = [_start(problem.tape, candidate) for candidate in _distinct(found)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        ends = pool.map(lambda start: _refine(problem, start), starts)
-        return sorted(ends, key=lambda end: end.fitness)
+        return sorted(pool.map(lambda start: _refine(problem, start), starts), key=_fitness)
 
 
-def _tidy(best: Refined, info: Information, parameters: Parameters) -> Refined:
-    """Along an unseen direction in which Kt may be anything, choose Kt = Kb, equals in SI."""
-    names = parameters.names
+def _fitness(end: Refined) -> float:
+    return end.fitness
+
+
+def _agreed(ends: Sequence[Refined], tape: Tape) -> bool:
+    """Whether several starts ended in the best optimum, and it is as good as the noise or was found often.
+
+    A misfit may be the model's, or an optimum of the search's own making: only another search can tell.
+    """
+    outputs = np.count_nonzero(np.asarray(tape.weight).any((0, 2)))
+    needed = 2 if ends[0].fitness < POOR * outputs else STARTS + 1
+    return _times_found(ends) >= needed
+
+
+def _times_found(ends: Sequence[Refined]) -> int:
+    fitness = np.array([end.fitness for end in ends])
+    return int(np.sum(fitness <= fitness[0] * (1 + SAME) + 1e-12))
+
+
+def _tidy(problem: Problem, polished: Polished, info: Information) -> Polished:
+    """Along an unseen direction in which Kt may be anything, choose Kt = Kb, equals in SI.
+
+    The direction is straight only nearby, so whatever else is free is refined again; a fit that is worse
+    then is no choice.
+    """
+    names, best = problem.parameters.names, polished.refined
     if "Kt" not in names or "Kb" not in names:
-        return best
+        return polished
     k, b = names.index("Kt"), names.index("Kb")
-    coordinates = np.array(best.unknowns.coordinates)
-    for direction in info.unseen:
-        if abs(direction[k]) > 0.1 and abs(direction[b]) < 1e-2:
-            coordinates += direction * (coordinates[b] - coordinates[k]) / direction[k]
-            break
-    local = np.array(best.unknowns.local)
-    return best._replace(unknowns=Unknowns(jnp.asarray(coordinates), jnp.asarray(local)))
+    along = [d for d in info.unseen if abs(d[k]) > 0.1 and abs(d[b]) < 1e-2]
+    if not along:
+        return polished
+    held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
+    tidied = polished
+    for _ in range(TIDYINGS):  # Kb moves a little as well
+        coordinates = np.array(tidied.refined.unknowns.coordinates)
+        coordinates += along[0] * (coordinates[b] - coordinates[k]) / along[0][k]
+        coordinates[k] = coordinates[b]
+        unknowns = tidied.refined.unknowns._replace(coordinates=jnp.asarray(coordinates))
+        tidied = polish(held, tidied.refined._replace(unknowns=unknowns))
+    return tidied if tidied.refined.fitness <= best.fitness * (1 + SAME) else polished
 
 
 def _plain(motor: Motor) -> Motor:
@@ -335,24 +450,23 @@ def _noise_of(fit: Mapping[str, RunFit]) -> dict[str, float | None]:
     }
 
 
-def _search_record(method: str, found: Found, ends: Sequence[Refined], best: Refined) -> Search:
-    fitness = np.array([end.fitness for end in ends])
+def _search_record(method: str, found: Found, ends: Sequence[Refined]) -> Search:
     return Search(
         method=method,
         evaluations=found.evaluations,
         best=found.best,
         median=found.median,
-        refined=fitness,
-        times_found=int(np.sum(fitness <= fitness[0] * (1 + SAME) + 1e-12)),
+        refined=np.array([end.fitness for end in ends]),
+        times_found=_times_found(ends),
     )
 
 
-def _messages(found: Found, best: Refined, directions: Sequence[Direction]) -> tuple[str, ...]:
+def _messages(solved: Solved, best: Refined, tied: bool) -> tuple[str, ...]:
     messages = []
-    if found.interrupted:
-        messages.append(f"the search was interrupted after {len(found.best)} generations")
+    if solved.interrupted:
+        messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
     if not best.converged:
         messages.append("the refinement did not converge: the gradient is not zero at its end")
-    if any("Kt" in d.parameters for d in directions):
+    if tied:
         messages.append("Kt was set equal to Kb, as they are in SI, and J and f go with it")
     return tuple(messages)
