@@ -88,10 +88,32 @@ class Motor(eqx.Module):
         """Names of the states that the effects add."""
         return tuple(sorted({name for effect in self.effects for name in effect.states}))
 
-    def rest(self, current: Scalars, speed: Scalars) -> State:
-        """State with this current and speed and all of the effects' states at zero."""
-        zero = jnp.zeros(jnp.broadcast_shapes(jnp.shape(current), jnp.shape(self.R)))
-        return State(zero + current, zero + speed, dict.fromkeys(self.states, zero))
+    @property
+    def affine(self) -> bool:
+        """Whether this is a linear system with inputs, effects and all."""
+        return all(effect.affine for effect in self.effects)
+
+    def rest(
+        self,
+        current: Scalars,
+        speed: Scalars,
+        load: Scalars | float = 0.0,
+        angle: Scalars | float = 0.0,
+    ) -> State:
+        """State with this current (A) and speed (rad/s), and the effects' states as a run begins with them.
+
+        `load`, N m, and `angle` of the rotor, rad, as the run begins.
+        """
+        shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (current, speed, load, angle, self.R)))
+        current, speed, load, angle = (jnp.zeros(shape) + x for x in (current, speed, load, angle))
+        extra = {}
+        for effect in self.effects:
+            extra |= effect.rest(speed, load, angle)
+        return State(current, speed, extra)
+
+    def at(self, state: State) -> Motor:
+        """The motor with its parameters as the effects make them at this state."""
+        return reduce(lambda motor, effect: effect.parameters(motor, state), self.effects, self)
 
     def derivative(
         self,
@@ -110,22 +132,22 @@ class Motor(eqx.Module):
         v, c, t = drive or Drive()
         state = state._replace(current=v * state.current + c * value)
         direction_i, direction_w = moving or (jnp.sign(state.current), jnp.sign(state.speed))
-        motor, voltage = self, value
+        motor, voltage, torque = self.at(state), value, load
         drop = _opposing(self.grip("current", state), direction_i)
-        torque = _opposing(self.grip("speed", state), direction_w)
         extra = {}
         for effect in self.effects:
-            motor = effect.parameters(motor, state)
             voltage = effect.terminal_voltage(voltage)
             drop = drop + effect.voltage_drop(state)
-            torque = torque + effect.torque(state)
+            torque = effect.load_at_rotor(torque)
+            extra |= effect.derivative(motor, state, load)
+        torque = torque + _opposing(self.grip("speed", state), direction_w)
         for effect in self.effects:
-            extra |= effect.derivative(motor, state)
+            torque = torque + effect.torque(state)
         # by the reciprocals: they leave the loop over the samples, and a division would break its fusion
         armature = voltage - motor.R * state.current - motor.Kb * state.speed - drop
         current_rate = v * armature * (1 / motor.L)
         driving = motor.Kt * state.current + t * value
-        speed_rate = (driving - motor.f * state.speed - load - torque) * (1 / motor.J)
+        speed_rate = (driving - motor.f * state.speed - torque) * (1 / motor.J)
         return State(current_rate, speed_rate, extra)
 
     def grip(self, holds: str, state: State) -> Grip | None:
@@ -135,11 +157,17 @@ class Motor(eqx.Module):
             return None
         return reduce(lambda a, b: Grip(a.backward + b.backward, a.forward + b.forward), grips)
 
-    def sensors(self, current: Scalars, speed: Scalars) -> tuple[Scalars, Scalars]:
-        """Current in A and speed in rad/s as the sensors report them."""
+    def sensors(self, state: State) -> tuple[Scalars, Scalars]:
+        """Current in A and speed in rad/s as the sensors report them, but for a delay."""
+        current, speed = state.current, state.speed
         for effect in self.effects:
-            current, speed = effect.sensors(current, speed)
+            current, speed = effect.sensors(state, current, speed)
         return current, speed
+
+    def speed_delay(self) -> Scalars | None:
+        """By how many seconds the reported speed is late; None for not at all."""
+        delays = [delay for effect in self.effects if (delay := effect.speed_delay()) is not None]
+        return reduce(jnp.add, delays) if delays else None
 
 
 def _opposing(grip: Grip | None, direction: Scalars) -> Scalars | float:

@@ -1,21 +1,62 @@
 """Physical effects beyond the linear motor, one class each; `EFFECTS` is the table of them by name."""
 
+from .angle_torque import CoggingTorque, TorqueRipple
 from .base import AbstractEffect, Grip, ParameterRange, State
 from .brush_voltage_drop import BrushVoltageDrop
-from .coulomb_friction import CoulombFriction
+from .constant_load import ConstantLoad
+from .coulomb_friction import AsymmetricFriction, CoulombFriction
+from .input_dead_zone import InputDeadZone
+from .quadratic_drag import QuadraticDrag
 from .resistance_heating import ResistanceHeating
+from .saturation import InductanceSaturation, TorqueConstantSaturation
+from .sensors import CurrentSensorOffset, SpeedSensorDelay, SpeedSensorLag
+from .shaft import GearBacklash, ShaftCompliance
+from .stribeck_friction import StribeckFriction
 
 EFFECTS: dict[str, type[AbstractEffect]] = {
-    effect.name: effect for effect in (CoulombFriction, BrushVoltageDrop, ResistanceHeating)
+    effect.name: effect
+    for effect in (
+        CoulombFriction,
+        StribeckFriction,
+        AsymmetricFriction,
+        QuadraticDrag,
+        CoggingTorque,
+        TorqueRipple,
+        ConstantLoad,
+        ShaftCompliance,
+        GearBacklash,
+        BrushVoltageDrop,
+        ResistanceHeating,
+        TorqueConstantSaturation,
+        InductanceSaturation,
+        InputDeadZone,
+        SpeedSensorLag,
+        SpeedSensorDelay,
+        CurrentSensorOffset,
+    )
 }
 
 __all__ = [
     "EFFECTS",
     "AbstractEffect",
+    "AsymmetricFriction",
     "BrushVoltageDrop",
+    "CoggingTorque",
+    "ConstantLoad",
     "CoulombFriction",
+    "CurrentSensorOffset",
+    "GearBacklash",
     "Grip",
+    "InductanceSaturation",
+    "InputDeadZone",
     "ParameterRange",
+    "QuadraticDrag",
     "ResistanceHeating",
+    "ShaftCompliance",
+    "SpeedSensorDelay",
+    "SpeedSensorLag",
     "State",
+    "StribeckFriction",
+    "TorqueConstantSaturation",
+    "TorqueRipple",
 ]

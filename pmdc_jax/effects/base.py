@@ -6,9 +6,11 @@ each of which does nothing unless the effect overrides it:
 - `terminal_voltage`: the voltage that reaches the winding, V
 - `parameters`: the motor's own parameters at a state, R(temperature), Kt(current), ...
 - `voltage_drop` and `torque`: smooth terms of the electrical and the mechanical equation
+- `load_at_rotor`: what of the load torque acts on the rotor itself
 - `grip`: a dry, set-valued term that can hold a state at exactly zero (stiction, brush contact)
-- `states` and `derivative`: states of its own
-- `sensors`: how current and speed are seen
+- `states`, `rest` and `derivative`: states of its own, how they begin and how they move
+- `linear`: the linear effect that it is, or nearly is, whose states then join the exact step
+- `sensors` and `speed_delay`: how current and speed are seen
 
 New effects are one class here and one row in the table `EFFECTS` of this package.
 """
@@ -46,7 +48,8 @@ class Grip(NamedTuple):
 class ParameterRange(NamedTuple):
     """Unit of an effect's parameter, and between which values a search may look for it.
 
-    `scale` is "log" for a strictly positive parameter, "linear" for one of either sign.
+    `scale` is "log" for a strictly positive parameter, "linear" for one of either sign. A plain number has
+    the unit "".
     """
 
     unit: str
@@ -59,11 +62,18 @@ class AbstractEffect(eqx.Module):
     """A physical effect that the plain linear motor lacks. See the module for what may be overridden."""
 
     name: ClassVar[str]
+    # in plain English, and as one line of mathematics in the symbols of the motor, for reports
+    label: ClassVar[str]
+    formula: ClassVar[str]
     equation: ClassVar[Literal["electrical", "mechanical", "input", "sensor"]]
     ranges: ClassVar[dict[str, ParameterRange]]
     states: ClassVar[tuple[str, ...]] = ()
     # which state a dry element holds at zero
     holds: ClassVar[Literal["speed", "current"] | None] = None
+    # with it the motor is still a linear system with inputs, whose step is exact
+    affine: ClassVar[bool] = False
+    # the longest step in s that follows the effect well
+    longest_step: ClassVar[float] = 1e-3
 
     def terminal_voltage(self, voltage: Scalars) -> Scalars:
         """Voltage at the winding, V."""
@@ -84,15 +94,33 @@ class AbstractEffect(eqx.Module):
         del state
         return 0.0
 
+    def load_at_rotor(self, load: Scalars) -> Scalars:
+        """The load torque as it acts on the rotor, N m."""
+        return load
+
     def grip(self, state: State) -> Grip:
         """Limits of the dry element; needs `holds`."""
         raise NotImplementedError(f"{self.name} has no dry element")
 
-    def derivative(self, motor: Motor, state: State) -> dict[str, Scalars]:
-        """Rates of the effect's own states, per second."""
-        del motor, state
+    def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
+        """The effect's own states where a run begins with this speed (rad/s), load (N m) and angle (rad)."""
+        del load, angle
+        return dict.fromkeys(self.states, 0.0 * speed)
+
+    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
+        """Rates of the effect's own states, per second; `motor` with its parameters at this state."""
+        del motor, state, load
         return {}
 
-    def sensors(self, current: Scalars, speed: Scalars) -> tuple[Scalars, Scalars]:
+    def linear(self) -> AbstractEffect | None:
+        """An effect with the same states and only linear terms, near enough to step stiff ones by."""
+        return None
+
+    def sensors(self, state: State, current: Scalars, speed: Scalars) -> tuple[Scalars, Scalars]:
         """Current in A and speed in rad/s as the sensors report them."""
+        del state
         return current, speed
+
+    def speed_delay(self) -> Scalars | None:
+        """By how many seconds the reported speed is late; None for not at all."""
+        return None

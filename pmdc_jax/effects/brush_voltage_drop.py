@@ -17,6 +17,8 @@ class BrushVoltageDrop(AbstractEffect):
     """
 
     name: ClassVar = "brush_voltage_drop"
+    label: ClassVar = "Brush voltage drop"
+    formula: ClassVar = "v_b = V_b sign(i)"
     equation: ClassVar = "electrical"
     holds: ClassVar = "current"
     ranges: ClassVar = {"voltage_V": ParameterRange("V", 1e-5, 10.0)}

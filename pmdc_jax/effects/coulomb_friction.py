@@ -1,4 +1,4 @@
-"""Dry friction of constant size, in both directions the same."""
+"""Dry friction of constant size."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ class CoulombFriction(AbstractEffect):
     """
 
     name: ClassVar = "coulomb_friction"
+    label: ClassVar = "Coulomb friction"
+    formula: ClassVar = "T_f = T_c sign(w)"
     equation: ClassVar = "mechanical"
     holds: ClassVar = "speed"
     ranges: ClassVar = {"torque_Nm": ParameterRange("N m", 1e-7, 1e4)}
@@ -26,3 +28,34 @@ class CoulombFriction(AbstractEffect):
     def grip(self, state: State) -> Grip:
         del state
         return Grip(self.torque_Nm, self.torque_Nm)
+
+
+class AsymmetricFriction(AbstractEffect):
+    """Coulomb friction that differs with direction: T_f = forward_Nm for w > 0, -backward_Nm for w < 0.
+
+    At rest it takes whatever lies between the two. While the motor turns this is the same torque as
+    `coulomb_friction` of half the sum and a `constant_load` of half the difference.
+
+    **Fields**: `forward_Nm`, `backward_Nm`, friction torque in N m in either direction, both >= 0.
+    **Excitation needed**: motion in both directions at several speeds.
+    **Source**: Armstrong-Helouvry, Dupont, Canudas de Wit, "A survey of models, analysis tools and
+    compensation methods for the control of machines with friction", Automatica 30 (1994),
+    doi:10.1016/0005-1098(94)90209-7.
+    """
+
+    name: ClassVar = "asymmetric_friction"
+    label: ClassVar = "Friction that differs with direction"
+    formula: ClassVar = "T_f = T_+ for w > 0, -T_- for w < 0"
+    equation: ClassVar = "mechanical"
+    holds: ClassVar = "speed"
+    ranges: ClassVar = {
+        "forward_Nm": ParameterRange("N m", 1e-7, 1e4),
+        "backward_Nm": ParameterRange("N m", 1e-7, 1e4),
+    }
+
+    forward_Nm: Scalars
+    backward_Nm: Scalars
+
+    def grip(self, state: State) -> Grip:
+        del state
+        return Grip(self.backward_Nm, self.forward_Nm)

@@ -25,6 +25,8 @@ class ResistanceHeating(AbstractEffect):
     """
 
     name: ClassVar = "resistance_heating"
+    label: ClassVar = "Heating of the winding"
+    formula: ClassVar = "R (1 + rise), tau drise/dt = a R i^2 - rise"
     equation: ClassVar = "electrical"
     states: ClassVar = ("resistance_rise",)
     ranges: ClassVar = {
@@ -39,7 +41,8 @@ class ResistanceHeating(AbstractEffect):
         hot = motor.R * (1 + state.extra["resistance_rise"])
         return eqx.tree_at(lambda m: m.R, motor, hot)
 
-    def derivative(self, motor: Motor, state: State) -> dict[str, Scalars]:
+    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
+        del load
         rise = state.extra["resistance_rise"]
         loss = motor.R * state.current**2
         return {"resistance_rise": (self.rise_per_W * loss - rise) * (1 / self.time_constant_s)}

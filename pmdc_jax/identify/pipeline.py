@@ -271,7 +271,7 @@ def _untouched(recordings: Sequence[Recording]) -> dict[str, float]:
 
 
 def _start(tape: Tape, coordinates: jax.Array | np.ndarray) -> Unknowns:
-    local = np.concatenate([np.asarray(tape.initial), np.zeros((tape.runs, 1))], axis=1)
+    local = np.column_stack([tape.initial, np.zeros(tape.runs), tape.angle])
     return Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
 
 

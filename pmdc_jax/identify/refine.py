@@ -21,7 +21,7 @@ class Unknowns(NamedTuple):
     """What a refinement moves: search coordinates, and what each run does not tell."""
 
     coordinates: Float[Array, " parameters"]
-    local: Float[Array, "runs 3"]  # initial current A, initial speed rad/s, load offset N m
+    local: Float[Array, "runs 4"]  # initial current A and speed rad/s, load offset N m, initial angle rad
 
 
 class Refined(NamedTuple):
@@ -50,14 +50,19 @@ class Problem(eqx.Module):
         tape = self.tape
         first = jnp.argmax(jnp.asarray(tape.run)[None, :] == jnp.arange(tape.runs)[:, None], axis=1)
         voltage = jnp.asarray(tape.drive.voltage)[jnp.asarray(tape.grid)[first]] > 0
-        own = jnp.stack([voltage, jnp.ones_like(voltage), jnp.asarray(tape.load_unknown)], 1)
+        known = jnp.asarray(tape.angle_known)
+        # where nobody knows an angle, that of the first run is the zero from which phases count
+        zero = ~jnp.any(known) & (jnp.arange(tape.runs) == 0)
+        angle = ~known & ~zero & any("angle" in e.states for e in self.parameters.effects)
+        load = jnp.asarray(tape.load_unknown)
+        own = jnp.stack([voltage, jnp.ones_like(voltage), load, angle], 1)
         return jnp.concatenate([self.free[None, :] & self.counts[:, None], own], 1)
 
 
 class Evaluation(NamedTuple):
     """A free run, its residuals over the noise, and their derivatives.
 
-    Columns: the coordinates, then the run's own initial current, initial speed and load offset.
+    Columns: the coordinates, then the run's own initial current, initial speed, load offset and initial angle.
     """
 
     seen: Float[Array, "blocks 2 samples"]
@@ -70,7 +75,7 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     """Simulate every run of the problem and compare."""
     tape, local = problem.tape, unknowns.local
     seen, jacobian = sensitivities(
-        problem.parameters, unknowns.coordinates, tape, local[:, :2], local[:, 2]
+        problem.parameters, unknowns.coordinates, tape, local[:, :2], local[:, 2], local[:, 3]
     )
     scale = tape.weight / problem.noise[:, None]
     jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]

@@ -1,4 +1,4 @@
-"""Functions phi_k of 2 x 2 matrices, with which a linear system is stepped exactly."""
+"""Functions phi_k of small matrices, with which a linear system is stepped exactly."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Matrix = Float[Array, "2 2 *batch"]
+Matrix = Float[Array, "n n *batch"]
 
 # Taylor order and halvings: exact to rounding for |A h| up to 0.25 * 2**HALVINGS
 ORDER = 10
@@ -16,8 +16,8 @@ HALVINGS = 20
 
 
 def product(a: Matrix, b: Matrix) -> Matrix:
-    """Matrix product over the two leading axes; written out, since XLA on CPU is slow on batches of tiny dots."""
-    return jnp.stack([a[i, 0] * b[0] + a[i, 1] * b[1] for i in range(2)])
+    """Matrix product over the two leading axes; a sum, since XLA on CPU is slow on batches of tiny dots."""
+    return (a[:, :, None] * b[None]).sum(1)
 
 
 def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
@@ -30,7 +30,7 @@ def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
     **Source**: Hochbruck, Ostermann, "Exponential integrators", Acta Numerica 19 (2010), section 2;
     Skaflestad, Wright, Applied Numerical Mathematics 59 (2009), equation (2.5), doi:10.1016/j.apnum.2008.03.021.
     """
-    one = jnp.zeros_like(z).at[0, 0].set(1.0).at[1, 1].set(1.0)
+    one = jnp.zeros_like(z) + jnp.eye(len(z)).reshape(len(z), len(z), *[1] * (z.ndim - 2))
     small = z / 2**HALVINGS
 
     def series(k: int) -> Matrix:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..motor import Motor
-from .solver import HeldInput, Walk, along_grids, held_step, pick_grid, walk
+from .solver import HeldInput, Walk, along_grids, held_step, pick_grid, steps_in_sample, walk
 from .tape import Tape
 
 # Samples of linear motors whose arithmetic XLA fuses into one kernel, measured: small populations gain from fewer
@@ -52,7 +52,7 @@ def squared_errors(
 @eqx.filter_jit
 def _squared_errors(motors: Motor, tape: Tape):
     """One share: its blocks one after another, the whole population in the state."""
-    grids = along_grids(motors, tape)
+    grids, steps = along_grids(motors, tape), steps_in_sample(motors, tape)
     unroll = UNROLL_SMALL if motors.R.shape[0] <= SMALL else UNROLL_LARGE
     if motors.effects:
         unroll = 1
@@ -63,13 +63,15 @@ def _squared_errors(motors: Motor, tape: Tape):
         def sample(carry, samples):
             state, errors = carry
             value, load, measured, weight = samples
-            seen = motors.sensors(state.current, state.speed)
+            seen = motors.sensors(state)
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
-            return (held_step(motors, along, drive, state, value, load), errors), None
+            after = held_step(motors, along, drive, state, value, load, steps)
+            return (after, errors), None
 
-        initial = motors.rest(*tape.initial[tape.run[block]])
+        run = tape.run[block]
+        initial = motors.rest(*tape.initial[run], tape.load[block, 0], tape.angle[run])
         begins = tape.begins[block]
         state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
         samples = (

@@ -21,15 +21,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..effects.base import State
-from ..motor import Motor
-from .solver import HeldInput, Propagator, Walk, along_grids, held_step, pick_grid, walk
+from ..motor import Drive, Motor
+from .solver import (
+    HeldInput,
+    Propagator,
+    Walk,
+    along_grids,
+    held_step,
+    pick_grid,
+    steps_in_sample,
+    walk,
+)
 from .tape import BLOCK, Tape
 
 # The last pass corrects to first order what is left, so the joint error is about the square of this.
 JOINED = 1e-4
 
-# Columns of the sensitivities for a run's own unknowns: initial current, initial speed, load offset.
-LOCAL = 3
+# Columns of the sensitivities for a run's own unknowns: initial current, initial speed, load offset, initial angle.
+LOCAL = 4
 
 Starts = Float[Array, "blocks states"]
 
@@ -37,10 +46,19 @@ Starts = Float[Array, "blocks states"]
 class Pass(NamedTuple):
     """All blocks once, from given starts. Derivatives are by the columns: parameters, load offset, start."""
 
-    seen: Float[Array, "samples 2 blocks"]  # current A, speed rad/s
-    d_seen: Float[Array, "samples columns 2 blocks"]
+    seen: Float[Array, "samples outputs blocks"]
+    d_seen: Float[Array, "samples columns outputs blocks"]
     end: Starts
     d_end: Float[Array, "columns blocks states"]
+
+
+class Own(NamedTuple):
+    """What belongs to each run: how it starts, and a constant load in N m on top of the recorded one."""
+
+    current: Float[Array, " runs"]
+    speed: Float[Array, " runs"]
+    load_offset: Float[Array, " runs"]
+    angle: Float[Array, " runs"]
 
 
 @eqx.filter_jit
@@ -49,17 +67,22 @@ def free_run(
     tape: Tape,
     initial: Float[Array, "runs 2"],
     load_offset: Float[Array, " runs"],
+    angle: Float[Array, " runs"] | None = None,
 ) -> Float[Array, "blocks 2 samples"]:
     """Current (A) and speed (rad/s) as the sensors report them, simulated freely from each run's `initial`.
 
-    `load_offset` is a constant load in N m on top of each run's recorded one.
+    `load_offset` is a constant load in N m on top of each run's recorded one; `angle`, of the rotor in rad as
+    the run starts, matters only to effects that depend on it, and is the recorded one (else 0) unless given.
     """
+    own = _own(tape, initial, load_offset, angle)
     prepared = (motor, along_grids(motor, tape))
-    starts, last = _join(prepared, tape, initial, load_offset)
-    shift = _stitch(last, tape, starts, _begins(motor, initial, tape)) - starts
-    states = shift.shape[1]
+    begins = _begins(motor, own, tape)
+    states = begins.shape[1]
+    still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
+    starts, last = _join(prepared, still, states, tape, own, begins)
+    shift = _stitch(last, tape, starts, begins) - starts
     seen = last.seen + jnp.einsum("sncb,bn->scb", last.d_seen[:, -states:], shift)
-    return jnp.moveaxis(seen, -1, 0).transpose(0, 2, 1)
+    return _reported(motor, tape, seen.transpose(2, 1, 0))
 
 
 @eqx.filter_jit
@@ -69,74 +92,127 @@ def sensitivities(
     tape: Tape,
     initial: Float[Array, "runs 2"],
     load_offset: Float[Array, " runs"],
+    angle: Float[Array, " runs"] | None = None,
 ) -> tuple[Float[Array, "blocks 2 samples"], Float[Array, "blocks 2 samples columns"]]:
-    """Free run, and its derivatives by `parameters` and then by the run's own initial current, initial speed
-    and load offset.
+    """Free run, and its derivatives by `parameters` and then by the run's own initial current, initial speed,
+    load offset and initial angle.
 
-    `assemble` makes a motor of the parameters.
+    `assemble` makes a motor of the parameters; the rest is as in `free_run`.
     """
+    own = _own(tape, initial, load_offset, angle)
+    count = len(parameters)
+    every = count + LOCAL
 
     def prepare(parameters):
         motor = assemble(parameters)
         return motor, along_grids(motor, tape)
 
-    count = len(parameters)
     prepared, d_prepared = jax.vmap(
         lambda direction: jax.jvp(prepare, (parameters,), (direction,)), out_axes=(None, 0)
     )(jnp.eye(count))
     motor = prepared[0]
-    begins = _begins(motor, initial, tape)
+    d_motor = jax.tree.map(lambda leaf: _pad_columns(leaf, every), d_prepared[0])
+    ones = jnp.eye(LOCAL, every, count)[:, :, None]
+    d_own = Own(*(jnp.broadcast_to(one, (every, tape.runs)) for one in ones))
+    begins, d_begins = _along_columns(
+        lambda motor, own: _begins(motor, own, tape), (motor, own), (d_motor, d_own)
+    )
     states = begins.shape[1]
     columns = count + 1 + states
     d_prepared = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_prepared)
 
-    # the derivatives by the parameters must be those at the joined starts
-    guess, last = _join(prepared, tape, initial, load_offset)
-    starts = _stitch(last, tape, guess, begins)
-    passed = _pass(prepared, d_prepared, columns, tape, starts, load_offset)
-    joined, d_starts = _stitch_tangents(passed, tape, starts, begins, count)
+    if motor.effects:
+        starts, passed = _join(prepared, d_prepared, columns, tape, own, begins)
+    else:
+        # the derivatives by the parameters must be those at the joined starts
+        still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
+        guess, last = _join(prepared, still, states, tape, own, begins)
+        starts = _stitch(last, tape, guess, begins)
+        passed = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
+    joined, d_starts = _stitch_tangents(passed, tape, starts, begins, d_begins, count)
 
     by_start = passed.d_seen[:, -states:]
     seen = passed.seen + jnp.einsum("sncb,bn->scb", by_start, joined - starts)
     through = jnp.einsum("sncb,bnp->scbp", by_start, d_starts)
-    own = jnp.moveaxis(passed.d_seen[:, : count + 1], 1, -1)
-    direct = jnp.concatenate(
-        [own[..., :count], jnp.zeros((*own.shape[:-1], 2)), own[..., count:]], -1
+    direct = _among_columns(jnp.moveaxis(passed.d_seen[:, : count + 1], 1, -1), count)
+    d_seen = (direct + through).transpose(2, 1, 0, 3)
+    if motor.speed_delay() is None:
+        return seen.transpose(2, 1, 0), d_seen
+    seen, d_seen = _along_columns(
+        lambda motor, seen: _reported(motor, tape, seen),
+        (motor, seen.transpose(2, 1, 0)),
+        (d_motor, jnp.moveaxis(d_seen, -1, 0)),
     )
-    return seen.transpose(2, 1, 0), (direct + through).transpose(2, 1, 0, 3)
+    return seen, jnp.moveaxis(d_seen, 0, -1)
 
 
-def _join(prepared, tape: Tape, initial, load_offset) -> tuple[Starts, Pass]:
-    """Starts at which every block begins where the one before it ended, and the last pass."""
+def _along_columns(function: Callable, primals: tuple, tangents: tuple):
+    """A function's value, and its derivative along every column of the tangents."""
+    return jax.vmap(lambda *tangent: jax.jvp(function, primals, tangent), out_axes=(None, 0))(
+        *tangents
+    )
+
+
+def _among_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "... columns"]:
+    """Derivatives by parameters and load offset, spread out among all columns."""
+    zero = jnp.zeros((*own.shape[:-1], 2))
+    return jnp.concatenate([own[..., :count], zero, own[..., count:], zero[..., :1]], -1)
+
+
+def _own(tape: Tape, initial, load_offset, angle) -> Own:
+    initial = jnp.asarray(initial)
+    angle = jnp.asarray(tape.angle if angle is None else angle)
+    return Own(initial[:, 0], initial[:, 1], jnp.asarray(load_offset), angle)
+
+
+def _begins(motor: Motor, own: Own, tape: Tape) -> Starts:
+    """How the run of each block begins."""
+    first = jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs))
+    load = jnp.asarray(tape.load)[first, 0] + own.load_offset
+    return _pack(motor.rest(own.current, own.speed, load, own.angle)).T[tape.run]
+
+
+def _guess(motor: Motor, own: Own, tape: Tape, begins: Starts) -> Starts:
+    """Starts of the blocks by what was measured there: most of the way, and rarely all of it."""
+    known = (tape.weight[:, :, 0] > 0).T
+    current, speed = jnp.where(known, tape.measured[:, :, 0].T, begins[:, :2].T)
+    length = jnp.asarray(tape.sample_time)[tape.grid]
+    turned = jnp.cumsum((tape.measured[:, 1] * tape.weight[:, 1]).sum(-1) * length)
+    before = jnp.append(0.0, turned)
+    first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
+    angle = own.angle[tape.run] + before[:-1] - before[first]
+    load = jnp.asarray(tape.load)[:, 0] + own.load_offset[tape.run]
+    guess = _pack(motor.rest(current, speed, load, angle)).T
+    return jnp.where(jnp.asarray(tape.begins)[:, None], begins, guess)
+
+
+def _join(
+    prepared, d_prepared, columns: int, tape: Tape, own: Own, begins: Starts
+) -> tuple[Starts, Pass]:
+    """Starts at which every block begins nearly where the one before it ended, and the pass from them."""
     motor = prepared[0]
-    begins = _begins(motor, initial, tape)
-    states = begins.shape[1]
-    still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
-
-    # where it was measured, a block begins close to what was measured at its first sample
-    known = tape.weight[:, :, 0] > 0
-    guess = begins.at[:, :2].set(jnp.where(known, tape.measured[:, :, 0], begins[:, :2]))
-    guess = jnp.where(jnp.asarray(tape.begins)[:, None], begins, guess)
-    # a linear motor is joined exactly by the correction of its one pass; any other block is exact once the
-    # one before it is, so this ends however hard the motor
-    passes = len(guess) + 1 if motor.effects else 1
+    guess = _guess(motor, own, tape, begins)
+    # a linear motor is joined exactly by the correction of its one pass, and its derivatives by the next; any
+    # other block is exact once the one before it is, so this ends however hard the motor
+    passes = len(guess) + 1 if not motor.affine else 1 + (columns > begins.shape[1])
 
     def unjoined(carry):
-        _, _, gap, passed = carry
+        *_, gap, passed = carry
         return (gap > JOINED) & (passed < passes)
 
     def again(carry):
-        starts, _, _, passed = carry
-        run = _pass(prepared, still, states, tape, starts, load_offset)
+        _, starts, _, _, passed = carry
+        run = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
         joined = _stitch(run, tape, starts, begins)
         size = jnp.max(jnp.abs(joined), axis=0) + 1e-6
         # what the last pass started from is kept: its derivatives belong to it
-        return joined, (starts, run), jnp.max(jnp.abs(joined - starts) / size), passed + 1
+        return starts, joined, run, jnp.max(jnp.abs(joined - starts) / size), passed + 1
 
-    shapes = jax.eval_shape(again, (guess, None, 0.0, 0))[1]
+    shapes = jax.eval_shape(again, (guess, guess, None, 0.0, 0))[2]
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    carry = (guess, nothing, jnp.asarray(jnp.inf), jnp.asarray(0))
-    return jax.lax.while_loop(unjoined, again, carry)[1]
+    carry = (guess, guess, nothing, jnp.asarray(jnp.inf), jnp.asarray(0))
+    starts, _, run, *_ = jax.lax.while_loop(unjoined, again, carry)
+    return starts, run
 
 
 def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_offset) -> Pass:
@@ -146,7 +222,7 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
     along, drive = pick_grid(grids, tape, tape.grid)
     along = _blocks_last(along, 0)
     d_along = _blocks_last(jax.tree.map(lambda leaf: leaf[:, tape.grid], d_grids), 1)
-    states = starts.shape[1]
+    states, steps = starts.shape[1], steps_in_sample(motor, tape)
     offset = load_offset[tape.run]
     d_load = jnp.zeros(columns)
     if columns > states:
@@ -158,8 +234,8 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
         state, d_state = carry.state
 
         def look_and_step(motor, along, state, load):
-            seen = jnp.stack(motor.sensors(state.current, state.speed))
-            return held_step(motor, along, drive, state, value[k], load), seen
+            after = held_step(motor, along, drive, state, value[k], load, steps)
+            return after, _outputs(motor, drive, state, after, value[k], load)
 
         (state, seen), (d_state, d_seen) = jax.vmap(
             lambda *tangents: jax.jvp(look_and_step, (motor, along, state, load[k]), tangents),
@@ -174,7 +250,8 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
         .set(jnp.eye(states)[:, :, None])
     )
     d_state = jax.vmap(lambda column: _unpack(motor, column))(identity)
-    seen = (jnp.zeros((2, len(starts))), jnp.zeros((columns, 2, len(starts))))
+    outputs = 2 if motor.speed_delay() is None else 4
+    seen = (jnp.zeros((outputs, len(starts))), jnp.zeros((columns, outputs, len(starts))))
     saveat = diffrax.SaveAt(
         subs=[
             diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: y.seen),
@@ -201,28 +278,60 @@ def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts) -> Starts:
     return jax.lax.scan(follow, jnp.zeros_like(starts[0]), blocks)[1]
 
 
-def _stitch_tangents(passed: Pass, tape: Tape, starts: Starts, begins: Starts, count: int):
-    """The same, and the derivatives of the starts by parameters, initial current, initial speed, offset."""
+def _stitch_tangents(
+    passed: Pass, tape: Tape, starts: Starts, begins: Starts, d_begins, count: int
+):
+    """The same, and the derivatives of the starts by all columns."""
     states = starts.shape[1]
     by_column = jnp.moveaxis(passed.d_end, 0, -1)
-    by_start, by_own = by_column[..., -states:], by_column[..., : count + 1]
-    zero = jnp.zeros((*by_own.shape[:-1], 2))
-    by_own = jnp.concatenate([by_own[..., :count], zero, by_own[..., count:]], -1)
-    at_begin = jnp.zeros((states, count + LOCAL)).at[0, count].set(1.0).at[1, count + 1].set(1.0)
+    by_start = by_column[..., -states:]
+    by_own = _among_columns(by_column[..., : count + 1], count)
 
     def follow(carry, block):
-        begin, first, passed_end, jacobian, start, own = block
-        new, d_new = jax.tree.map(lambda a, b: jnp.where(first, a, b), (begin, at_begin), carry)
+        first, begin, passed_end, jacobian, start, own = block
+        new, d_new = jax.tree.map(lambda a, b: jnp.where(first, a, b), begin, carry)
         return (passed_end + jacobian @ (new - start), jacobian @ d_new + own), (new, d_new)
 
-    blocks = (begins, jnp.asarray(tape.begins), passed.end, by_start, starts, by_own)
-    return jax.lax.scan(follow, (jnp.zeros_like(starts[0]), jnp.zeros_like(at_begin)), blocks)[1]
+    at_begin = (begins, jnp.moveaxis(d_begins, 0, -1))
+    blocks = (jnp.asarray(tape.begins), at_begin, passed.end, by_start, starts, by_own)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), at_begin)
+    return jax.lax.scan(follow, nothing, blocks)[1]
 
 
-def _begins(motor: Motor, initial: Float[Array, "runs 2"], tape: Tape) -> Starts:
-    """How the run of each block begins."""
-    of_block = jnp.asarray(initial)[tape.run]
-    return _pack(motor.rest(of_block[:, 0], of_block[:, 1])).T
+def _outputs(motor: Motor, drive: Drive, before: State, after: State, value, load):
+    """Reported current and speed, and for a delay the slope of the latter at both ends of the sample."""
+    current, speed = motor.sensors(before)
+    if motor.speed_delay() is None:
+        return jnp.stack([current, speed])
+
+    def slope(state):
+        rate = motor.derivative(state, value, load, drive)
+        return jax.jvp(lambda x: motor.sensors(x)[1], (state,), (rate,))[1]
+
+    return jnp.stack([current, speed, slope(before), slope(after)])
+
+
+def _reported(motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]):
+    """Current and speed, the latter as late as the motor's sensor reports it.
+
+    Between samples by the cubic of Hermite: speeds and slopes at both ends of the sample, within which nothing
+    jumps, so that values and the derivative by the delay are good to the fourth and third order of the sample time.
+    """
+    delay = motor.speed_delay()
+    if delay is None:
+        return seen
+    speed, slope, slope_after = (seen[:, k].reshape(-1) for k in (1, 2, 3))
+    step = jnp.repeat(jnp.asarray(tape.sample_time)[tape.grid], BLOCK)
+    first = jnp.repeat(jnp.searchsorted(jnp.asarray(tape.run), tape.run) * BLOCK, BLOCK)
+    here = jnp.arange(len(speed))
+    position = jnp.clip(here - delay / step, first, here)
+    # the sample that reaches up to here from the left, but for the first of a run
+    left = jnp.clip(jnp.ceil(position).astype(int) - 1, first, jnp.maximum(here - 1, first))
+    x = position - left
+    rise = jnp.where(here > first, speed[jnp.minimum(left + 1, here)] - speed[left], 0.0)
+    start, end = slope[left] * step, slope_after[left] * step
+    late = speed[left] + x * (start + x * (3 * rise - 2 * start - end + x * (start + end - 2 * rise)))
+    return jnp.stack([seen[:, 0], late.reshape(seen[:, 0].shape)], 1)
 
 
 def _blocks_last(along: Propagator, axis: int) -> Propagator:

@@ -8,6 +8,7 @@ from operator import add
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,109 +22,139 @@ if TYPE_CHECKING:
     from .tape import Tape
 
 Held = Float[Array, "*batch"]
-Pair = tuple[Scalars, Scalars]  # of current and speed
+Vector = tuple[Scalars, ...]  # current, speed, and the states of linear effects
+
+# Steps into which a sample is divided at most
+FINEST = 32
 
 
 class Stages(NamedTuple):
-    """Weights of ETDRK4 for whatever is not the linear motor."""
+    """What the exponential midpoint rule needs for whatever is not the linear motor."""
 
     half: Matrix  # exp(A h / 2)
-    push: Matrix  # h / 2 phi_1(A h / 2)
-    turn: Matrix  # (exp(A h / 2) - 1) push
-    first: Matrix  # h (phi_1 - 3 phi_2 + 4 phi_3)
-    middle: Matrix  # h (2 phi_2 - 4 phi_3)
-    last: Matrix  # h (4 phi_3 - phi_2)
+    half_push: Matrix  # h / 2 phi_1(A h / 2)
+    push: Matrix  # h phi_1(A h)
+    linear: Matrix  # A
     step: Float[Array, "*batch"]  # s
 
 
 class Propagator(NamedTuple):
     """Everything about a motor and a step length that does not change from step to step.
 
-    x(h) = whole x + inputs u is exact for the linear motor; only effects need `stages`.
+    x(h) = whole x + inputs u is exact for the linear motor; with effects there are `stages` in place of
+    `inputs`, and the step is one of the equal parts of a sample.
     """
 
     whole: Matrix  # exp(A h)
-    inputs: Matrix  # h phi_1(A h) B
+    inputs: Matrix | None  # h phi_1(A h) B
     stages: Stages | None = None
 
 
 def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator:
-    """Exact step of the linear part over `step` seconds, and the stage weights for what the effects add.
-
-    **Source**: ETDRK4, Cox, Matthews, Journal of Computational Physics 176 (2002), equations (26)-(29),
-    doi:10.1006/jcph.2002.6995.
-    """
-    A, B = motor.state_space(drive)
+    """Exact step of the linear part over `step` seconds, and what else the effects need."""
+    A, B = _linear_part(motor, drive)
+    (half0, half1), (phi0, phi1) = phi_functions(A * step, 1)
     if not motor.effects:
-        _, (phi0, phi1) = phi_functions(A * step, 1)
         return Propagator(phi0, step * product(phi1, B))
-    (half0, half1, *_), (phi0, phi1, phi2, phi3) = phi_functions(A * step, 3)
-    inputs = step * product(phi1, B)
-    push = step / 2 * half1
-    stages = Stages(
-        half=half0,
-        push=push,
-        turn=product(half0, push) - push,
-        first=step * (phi1 - 3 * phi2 + 4 * phi3),
-        middle=step * (2 * phi2 - 4 * phi3),
-        last=step * (4 * phi3 - phi2),
-        step=step * jnp.ones_like(motor.R),
-    )
-    return Propagator(phi0, inputs, stages)
+    stages = Stages(half0, step / 2 * half1, step * phi1, A, step * jnp.ones_like(motor.R))
+    return Propagator(phi0, None, stages)
+
+
+def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "2 2 *batch"]]:
+    """A and B of the linear motor, A with the states of its linear effects."""
+    A, B = motor.state_space(drive)
+    linear = tuple(e for effect in motor.effects if (e := effect.linear()) is not None)
+    if not linear:
+        return A, B
+    core = eqx.tree_at(lambda m: m.effects, motor, linear)
+    zero, one = jnp.zeros_like(motor.R), jnp.ones_like(motor.R)
+    count = 2 + len(core.states)
+    columns = []
+    for k in range(count):
+        state = _state(core, tuple(one if j == k else zero for j in range(count)), {})
+        columns.append(jnp.stack(_vector(core, core.derivative(state, zero, zero, drive))))
+    return jnp.stack(columns, 1), B
+
+
+def steps_in_sample(motor: Motor, tape: Tape) -> int:
+    """Into how many equal steps a sample is divided, so that none is longer than the effects allow."""
+    if motor.affine:
+        return 1
+    longest = min(effect.longest_step for effect in motor.effects if not effect.affine)
+    return min(max(round(tape.longest / longest), 1), FINEST)
 
 
 def held_step(
+    motor: Motor,
+    along: Propagator,
+    drive: Drive,
+    state: State,
+    value: Held,
+    load: Held,
+    steps: int = 1,
+) -> State:
+    """The state one held sample later, in `steps` equal steps, for one of which `along` is made.
+
+    Motors whose effects leave them linear: exact. Otherwise by the exponential midpoint rule, the linear part
+    exact and the rest by two stages, in which dry elements act in the direction the step began with; a
+    step in which a held state crosses zero is then mended by `_cross`, so that friction sticks at exactly
+    zero without any smoothing.
+
+    **Source**: Hochbruck, Ostermann, "Exponential integrators", Acta Numerica 19 (2010), equation (2.41).
+    """
+    if along.stages is None:
+        x = (state.current, state.speed)
+        return State(*_add(_times(along.whole, x), _times(along.inputs, (value, load))), state.extra)
+    if steps == 1:
+        return _step(motor, along, drive, state, value, load)
+    return jax.lax.fori_loop(
+        0, steps, lambda _, now: _step(motor, along, drive, now, value, load), state
+    )
+
+
+def _step(
     motor: Motor, along: Propagator, drive: Drive, state: State, value: Held, load: Held
 ) -> State:
-    """The state one held sample later.
-
-    Linear motors: exact. With effects: ETDRK4, the linear part exact and the rest by four stages, in which
-    dry elements act in the direction the sample began with; a sample in which a held state crosses zero is
-    then mended by `_cross`, so that friction sticks at exactly zero without any smoothing.
-    """
-    x = (state.current, state.speed)
-    moved = _times(along.whole, x)
-    if along.stages is None:
-        return State(*_add(moved, _times(along.inputs, (value, load))), state.extra)
-    half, push, turn, first, middle, last, h = along.stages
+    half, half_push, push, linear, h = along.stages
     moving = (jnp.sign(state.current), jnp.sign(state.speed))
-    A, _ = motor.state_space(drive)
+    x, slow = _vector(motor, state), _slow(motor, state)
 
-    def rates(x, extra):
-        rate = motor.derivative(State(x[0], x[1], extra), value, load, drive, moving)
-        return _add((rate.current, rate.speed), _times(-A, x)), rate.extra
+    def rates(x, slow):
+        """What the linear part leaves over, and the rates of the states that are not in it."""
+        rate = motor.derivative(_state(motor, x, slow), value, load, drive, moving)
+        return _add(_vector(motor, rate), _times(-linear, x)), _slow(motor, rate)
 
-    halfway = _times(half, x)
-    n0, e0 = rates(x, state.extra)
-    n1, e1 = rates(_add(halfway, _times(push, n0)), _shifted(state.extra, h / 2, e0))
-    n2, e2 = rates(_add(halfway, _times(push, n1)), _shifted(state.extra, h / 2, e1))
-    end = _add(moved, _times(2 * push, n2), _times(turn, n0))
-    n3, e3 = rates(end, _shifted(state.extra, h, e2))
-    moved = _add(moved, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
-    extra = {
-        name: state.extra[name] + h / 6 * (e0[name] + 2 * (e1[name] + e2[name]) + e3[name])
-        for name in state.extra
-    }
-    whole_push = first + 2 * middle + last
-    moved = _cross(1, motor.grip("speed", state), x, moved, whole_push[:, 1] * (1 / motor.J))
-    v = drive.voltage
-    moved = _cross(0, motor.grip("current", state), x, moved, whole_push[:, 0] * (v / motor.L))
-    return State(*moved, extra)
+    rest, slow_rate = rates(x, slow)
+    if not motor.affine:
+        middle = _add(_times(half, x), _times(half_push, rest))
+        rest, slow_rate = rates(middle, _shifted(slow, h / 2, slow_rate))
+    moved = _add(_times(along.whole, x), _times(push, rest))
+    now, still = motor.at(state), state._replace(current=0.0 * x[0], speed=0.0 * x[1])
+    for row, holds, unit in ((1, "speed", 1 / now.J), (0, "current", drive.voltage / now.L)):
+        grips = motor.grip(holds, state), motor.grip(holds, still)
+        moved = _cross(row, grips, x, moved, push[:, row] * unit)
+    return _state(motor, moved, _shifted(slow, h, slow_rate))
 
 
 def _cross(
-    row: int, grip: Grip | None, before: Pair, after: Pair, push: Float[Array, "2 *batch"]
-) -> Pair:
+    row: int,
+    grips: tuple[Grip | None, Grip | None],
+    before: Vector,
+    after: Vector,
+    push: Float[Array, "n *batch"],
+) -> Vector:
     """Mend a step in which the state that a dry element holds comes to zero.
 
     For a share of the step the state moved on as it did before; for the rest of it the element takes
     whatever, within its limits, ends the step at zero: if it can, the state sticks, at exactly zero.
-    `push[:, ...]` is what a unit of driving torque (or voltage) over the whole step adds to the state.
+    `grips` are those at the start of the step and at zero; `push` is what a unit of driving torque (or
+    voltage) over the whole step adds to the state.
 
     **Source**: time-stepping with set-valued forces, Moreau (1988), doi:10.1007/978-3-7091-2624-0_1, with the
     response of the exact linear step in place of h / J.
     """
-    if grip is None:
+    grip, hold = grips
+    if grip is None or hold is None:
         return after
     direction = jnp.sign(before[row])
     crosses = direction * after[row] <= 0
@@ -134,12 +165,12 @@ def _cross(
     # what already acts against the motion; then the same force, chosen anew, over what is left of the step
     acting = jnp.where(direction > 0, grip.forward, jnp.where(direction < 0, -grip.backward, 0.0))
     needed = acting + after[row] / left
-    taken = jnp.clip(needed, -grip.backward, grip.forward)
+    taken = jnp.clip(needed, -hold.backward, hold.forward)
     change = jnp.where(crosses, (acting - taken) * jnp.maximum(1.0 - share, 1e-12), 0.0)
     sticks = crosses & (taken == needed)
-    mended = [after[k] + push[k] * change for k in range(2)]
+    mended = [x + push[k] * change for k, x in enumerate(after)]
     mended[row] = jnp.where(sticks, 0.0, mended[row])
-    return mended[0], mended[1]
+    return tuple(mended)
 
 
 class Walk(NamedTuple):
@@ -162,7 +193,7 @@ class HeldInput(diffrax.AbstractSolver):
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
     def order(self, terms):
-        return 4
+        return 2
 
     def init(self, terms, t0, t1, y0, args):
         return None
@@ -194,10 +225,11 @@ def walk(solver: HeldInput, start: Walk, steps: int, saveat: diffrax.SaveAt) -> 
 
 
 def along_grids(motor: Motor, tape: Tape) -> Propagator:
-    """The propagator on every grid of the tape, stacked in front."""
+    """The propagator of one step on every grid of the tape, stacked in front."""
+    steps = steps_in_sample(motor, tape)
     grids = [
         propagator(
-            motor, tape.sample_time[g], Drive(*(jnp.asarray(share)[g] for share in tape.drive))
+            motor, tape.sample_time[g] / steps, Drive(*(jnp.asarray(share)[g] for share in tape.drive))
         )
         for g in range(tape.sample_time.shape[0])
     ]
@@ -211,15 +243,35 @@ def pick_grid(
     return jax.tree.map(lambda leaf: leaf[grid], (grids, tape.drive))
 
 
-def _times(matrix: Matrix, x: Pair) -> Pair:
-    first, second = (matrix[i, 0] * x[0] + matrix[i, 1] * x[1] for i in range(2))
-    return first, second
+def _times(matrix: Matrix, x: Vector) -> Vector:
+    return tuple(
+        reduce(add, (matrix[i, j] * x_j for j, x_j in enumerate(x))) for i in range(len(matrix))
+    )
 
 
-def _add(*vectors: Pair) -> Pair:
-    first, second = (reduce(add, entries) for entries in zip(*vectors, strict=True))
-    return first, second
+def _add(*vectors: Vector) -> Vector:
+    return tuple(reduce(add, entries) for entries in zip(*vectors, strict=True))
 
 
-def _shifted(extra: dict, weight: Held, rates: dict) -> dict:
-    return {name: extra[name] + weight * rates[name] for name in extra}
+def _linear_states(motor: Motor) -> list[str]:
+    """States that effects add to the linear part."""
+    linear = {name for e in motor.effects if e.linear() is not None for name in e.states}
+    return sorted(linear)
+
+
+def _vector(motor: Motor, state: State) -> Vector:
+    return (state.current, state.speed, *(state.extra[name] for name in _linear_states(motor)))
+
+
+def _slow(motor: Motor, state: State) -> dict[str, Scalars]:
+    """The states that are not in the linear part."""
+    linear = _linear_states(motor)
+    return {name: x for name, x in state.extra.items() if name not in linear}
+
+
+def _state(motor: Motor, x: Vector, slow: dict[str, Scalars]) -> State:
+    return State(x[0], x[1], slow | dict(zip(_linear_states(motor), x[2:], strict=True)))
+
+
+def _shifted(slow: dict, weight: Held, rates: dict) -> dict:
+    return {name: slow[name] + weight * rates[name] for name in slow}

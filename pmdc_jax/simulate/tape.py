@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -40,6 +41,10 @@ class Tape(eqx.Module):
     drive: Drive  # each Float[Samples, " grids"]
     initial: Float[Samples, "runs 2"]  # first guess of current A and speed rad/s
     load_unknown: Bool[Samples, " runs"]
+    angle: Float[Samples, " runs"]  # rad at the start, zero where unknown
+    angle_known: Bool[Samples, " runs"]
+    # longest sample time, rounded up to few values: it decides how a sample is divided
+    longest: float = eqx.field(static=True)
 
     @classmethod
     def from_recordings(cls, recordings: Sequence[Recording], unloaded: bool = False) -> Tape:
@@ -80,6 +85,9 @@ class Tape(eqx.Module):
             drive=Drive(*(np.where(kinds == kind, 1.0, 0.0) for kind in Drive._fields)),
             initial=np.array([run.initial for run in runs]),
             load_unknown=np.array([r.load is None and not unloaded for r in recordings]),
+            angle=np.array([_first(r.angle) for r in recordings]),
+            angle_known=np.array([r.angle is not None for r in recordings]),
+            longest=2.0 ** math.ceil(math.log2(max(s for s, _ in grids) / 1e-3) - 1e-6) * 1e-3,
         )
 
     @property
@@ -125,8 +133,8 @@ class _Run:
         return np.pad(samples, (0, spare), mode="edge" if hold else "constant").reshape(-1, BLOCK)
 
 
-def _first(samples: np.ndarray) -> float:
-    known = samples[~np.isnan(samples)]
+def _first(samples: np.ndarray | None) -> float:
+    known = samples[~np.isnan(samples)] if samples is not None else ()
     return float(known[0]) if len(known) else 0.0
 
 

@@ -1,0 +1,98 @@
+"""Torque that changes with the angle of the rotor."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .base import AbstractEffect, ParameterRange, Scalars, State
+
+if TYPE_CHECKING:
+    from ..motor import Motor
+
+
+PHASE = ParameterRange("rad", -4.0, 4.0, "linear")
+PERIODS = ParameterRange("", 0.5, 200.0)
+
+
+class CoggingTorque(AbstractEffect):
+    """Cogging: T = a sin(n angle + phase), the pull of the magnets on the teeth, whatever the current.
+
+    The angle is that of the record where one was recorded, and otherwise counts from the start of the first
+    run, an unknown of every other.
+
+    **Fields**: `amplitude_Nm`, a in N m, > 0, usually 1 to 10 % of the rated torque; `phase_rad` in rad;
+    `periods`, n for one revolution, commonly the least common multiple of poles and slots.
+    **Excitation needed**: slow motion over several periods, sampled ten times a period or more.
+    **Source**: Hanselman, "Brushless Permanent Magnet Motor Design", 2nd edition, chapter 9.
+    """
+
+    name: ClassVar = "cogging_torque"
+    label: ClassVar = "Cogging torque"
+    formula: ClassVar = "T = a sin(n angle + phase)"
+    equation: ClassVar = "mechanical"
+    states: ClassVar = ("angle",)
+    longest_step: ClassVar = 5e-4
+    ranges: ClassVar = {
+        "amplitude_Nm": ParameterRange("N m", 1e-7, 1e3),
+        "phase_rad": PHASE,
+        "periods": PERIODS,
+    }
+
+    amplitude_Nm: Scalars
+    phase_rad: Scalars
+    periods: Scalars
+
+    def torque(self, state: State) -> Scalars:
+        return self.amplitude_Nm * jnp.sin(self.periods * state.extra["angle"] + self.phase_rad)
+
+    def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
+        del speed, load
+        return {"angle": angle}
+
+    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
+        del motor, load
+        return {"angle": state.speed}
+
+
+class TorqueRipple(AbstractEffect):
+    """Torque ripple: Kt (1 + a sin(n angle + phase)) in place of Kt, of commutation and winding.
+
+    In the torque alone: the back-EMF ripples alike, but the brushes short what of it changes within a segment.
+    The angle is as in `cogging_torque`.
+
+    **Fields**: `amplitude`, a, a plain number > 0, usually 0.01 to 0.1; `phase_rad` in rad; `periods`, n for one
+    revolution, commonly the number of commutator segments, or twice it.
+    **Excitation needed**: slow motion over several periods with a current that is not small.
+    **Source**: Hanselman, "Brushless Permanent Magnet Motor Design", 2nd edition, chapter 9.
+    """
+
+    name: ClassVar = "torque_ripple"
+    label: ClassVar = "Torque ripple"
+    formula: ClassVar = "T_m = Kt i (1 + a sin(n angle + phase))"
+    equation: ClassVar = "mechanical"
+    states: ClassVar = ("angle",)
+    longest_step: ClassVar = 5e-4
+    ranges: ClassVar = {
+        "amplitude": ParameterRange("", 1e-5, 1.0),
+        "phase_rad": PHASE,
+        "periods": PERIODS,
+    }
+
+    amplitude: Scalars
+    phase_rad: Scalars
+    periods: Scalars
+
+    def parameters(self, motor: Motor, state: State) -> Motor:
+        wave = jnp.sin(self.periods * state.extra["angle"] + self.phase_rad)
+        return eqx.tree_at(lambda m: m.Kt, motor, motor.Kt * (1 + self.amplitude * wave))
+
+    def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
+        del speed, load
+        return {"angle": angle}
+
+    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
+        del motor, load
+        return {"angle": state.speed}

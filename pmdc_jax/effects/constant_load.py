@@ -1,0 +1,32 @@
+"""A load torque that never changes."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from .base import AbstractEffect, ParameterRange, Scalars, State
+
+
+class ConstantLoad(AbstractEffect):
+    """Constant load: a torque T_0 that opposes positive motion, whichever way the motor turns: a weight, a
+    spring, the zero error of a torque sensor.
+
+    A run whose load is unknown already has such a torque of its own, beside which this one cannot be seen.
+
+    **Fields**: `torque_Nm`, T_0 in N m, of either sign.
+    **Excitation needed**: motion in both directions, or several speeds.
+    **Source**: Hughes, Drury, "Electric Motors and Drives", 5th edition, section 11.4 (hoists).
+    """
+
+    name: ClassVar = "constant_load"
+    label: ClassVar = "Constant load"
+    formula: ClassVar = "T = T_0"
+    equation: ClassVar = "mechanical"
+    affine: ClassVar = True
+    ranges: ClassVar = {"torque_Nm": ParameterRange("N m", -1e4, 1e4, "linear")}
+
+    torque_Nm: Scalars
+
+    def torque(self, state: State) -> Scalars:
+        del state
+        return self.torque_Nm

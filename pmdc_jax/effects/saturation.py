@@ -1,0 +1,60 @@
+"""What high current does to the magnetic circuit."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+
+from .base import AbstractEffect, ParameterRange, Scalars, State
+
+if TYPE_CHECKING:
+    from ..motor import Motor
+
+
+class TorqueConstantSaturation(AbstractEffect):
+    """Saturated torque: Kt / (1 + c i^2) in place of Kt.
+
+    In the torque alone. Armature reaction weakens the flux under load, and with it the back-EMF too; but that
+    change, R i + Kb(i) w, cannot be told from a resistance that grows with speed, so Kb keeps its value at no load.
+
+    **Fields**: `per_A2`, c in 1/A^2, > 0: at a current of 1 / sqrt(c) the torque per ampere is halved.
+    **Excitation needed**: high and low torque at known load, or accelerations with high and with low current.
+    **Source**: Fitzgerald, Kingsley, Umans, "Electric Machinery", 6th edition, section 7.3 (armature reaction).
+    """
+
+    name: ClassVar = "torque_constant_saturation"
+    label: ClassVar = "Saturation of the torque constant"
+    formula: ClassVar = "T_m = Kt i / (1 + c i^2)"
+    equation: ClassVar = "mechanical"
+    ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 10.0)}
+
+    per_A2: Scalars
+
+    def parameters(self, motor: Motor, state: State) -> Motor:
+        return eqx.tree_at(
+            lambda m: m.Kt, motor, motor.Kt * (1 / (1 + self.per_A2 * state.current**2))
+        )
+
+
+class InductanceSaturation(AbstractEffect):
+    """Saturated inductance: L / (1 + c i^2) in place of L, the differential inductance d flux / di.
+
+    **Fields**: `per_A2`, c in 1/A^2, > 0: at a current of 1 / sqrt(c) the inductance is halved.
+    **Excitation needed**: voltage steps from zero and from high current, sampled faster than L / R.
+    **Source**: Krishnan, "Permanent Magnet Synchronous and Brushless DC Motor Drives" (2010), section 1.3.
+    """
+
+    name: ClassVar = "inductance_saturation"
+    label: ClassVar = "Saturation of the inductance"
+    formula: ClassVar = "L di/dt = (1 + c i^2) (v - R i - Kb w)"
+    equation: ClassVar = "electrical"
+    longest_step: ClassVar = 2.5e-4
+    ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 10.0)}
+
+    per_A2: Scalars
+
+    def parameters(self, motor: Motor, state: State) -> Motor:
+        return eqx.tree_at(
+            lambda m: m.L, motor, motor.L * (1 / (1 + self.per_A2 * state.current**2))
+        )

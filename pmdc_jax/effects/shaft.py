@@ -1,0 +1,133 @@
+"""A load that hangs on the rotor by an elastic shaft, with or without play."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .base import AbstractEffect, ParameterRange, Scalars, State
+
+if TYPE_CHECKING:
+    from ..motor import Motor
+
+
+# Damping of the teeth in contact over their stiffness, s
+CONTACT = 1e-3
+
+
+class _Shaft(AbstractEffect):
+    """Two inertias, (1 - s) J at the motor and s J at the load, with a shaft between them."""
+
+    load_share: eqx.AbstractVar[Scalars]
+
+    def shaft_torque(self, state: State) -> Scalars:
+        """What the shaft takes from the rotor, N m."""
+        raise NotImplementedError
+
+    def parameters(self, motor: Motor, state: State) -> Motor:
+        del state
+        return eqx.tree_at(lambda m: m.J, motor, motor.J * (1 - self.load_share))
+
+    def torque(self, state: State) -> Scalars:
+        return self.shaft_torque(state)
+
+    def load_at_rotor(self, load: Scalars) -> Scalars:
+        return 0.0 * load
+
+    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
+        inertia = motor.J * self.load_share / (1 - self.load_share)
+        return {
+            "load_speed": (self.shaft_torque(state) - load) * (1 / inertia),
+            "twist": state.speed - state.extra["load_speed"],
+        }
+
+
+class ShaftCompliance(_Shaft):
+    """Compliant shaft: the load torque acts on an inertia s J behind a spring and damper.
+
+    (1 - s) J dw/dt = Kt i - f w - T_s,  s J dw_L/dt = T_s - T_load,
+    d twist/dt = w - w_L,  T_s = stiffness twist + damping (w - w_L).
+
+    A run begins with both ends at one speed and the shaft twisted by the load.
+
+    **Fields**: `stiffness_Nm_rad` in N m/rad, > 0; `damping_Nms_rad` in N m s/rad, > 0; `load_share`, s, the share
+    of the inertia behind the shaft, between 0 and 1.
+    **Excitation needed**: steps fast enough to ring the shaft, sampled ten times a period.
+    **Source**: Zhang, Furusho, "Speed control of two-inertia system by PI/PID control", IEEE Transactions on
+    Industrial Electronics 47 (2000), doi:10.1109/41.847907.
+    """
+
+    name: ClassVar = "shaft_compliance"
+    label: ClassVar = "Compliant shaft"
+    formula: ClassVar = "T_s = k twist + d (w - w_L), s J dw_L/dt = T_s - T_load"
+    equation: ClassVar = "mechanical"
+    states: ClassVar = ("load_speed", "twist")
+    affine: ClassVar = True
+    ranges: ClassVar = {
+        "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-3, 1e6),
+        "damping_Nms_rad": ParameterRange("N m s/rad", 1e-7, 1e3),
+        "load_share": ParameterRange("", 1e-2, 0.99),
+    }
+
+    stiffness_Nm_rad: Scalars
+    damping_Nms_rad: Scalars
+    load_share: Scalars
+
+    def shaft_torque(self, state: State) -> Scalars:
+        slip = state.speed - state.extra["load_speed"]
+        return self.stiffness_Nm_rad * state.extra["twist"] + self.damping_Nms_rad * slip
+
+    def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
+        del angle
+        return {"load_speed": speed, "twist": load * (1 / self.stiffness_Nm_rad)}
+
+    def linear(self) -> AbstractEffect:
+        return self
+
+
+class GearBacklash(_Shaft):
+    """Backlash: a compliant shaft, or gear, that carries torque only once its play is taken up.
+
+    As `shaft_compliance`, with T_s = stiffness (bite + 1 ms d bite/dt), where bite = twist - clip(twist, -gap/2,
+    gap/2) is how far the teeth are pressed together. Without gap it is a compliant shaft. A run begins with the
+    teeth in contact on the side that the load presses them to, or in the middle without load.
+
+    **Fields**: `gap_rad`, the whole play in rad, > 0, usually 0.001 to 0.1; `stiffness_Nm_rad` of the teeth in
+    contact in N m/rad, > 0; `load_share`, s, the share of the inertia behind the gear, between 0 and 1.
+    **Excitation needed**: torque through zero again and again, at two amplitudes.
+    **Source**: Nordin, Gutman, "Controlling mechanical systems with backlash: a survey", Automatica 38
+    (2002), doi:10.1016/S0005-1098(02)00047-X, section 2.
+    """
+
+    name: ClassVar = "gear_backlash"
+    label: ClassVar = "Gear backlash"
+    formula: ClassVar = "T_s = k (bite + t_c dbite/dt), bite = twist - clip(twist, -gap/2, gap/2)"
+    equation: ClassVar = "mechanical"
+    states: ClassVar = ("load_speed", "twist")
+    longest_step: ClassVar = 2.5e-4
+    ranges: ClassVar = {
+        "gap_rad": ParameterRange("rad", 1e-6, 1.0),
+        "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-3, 1e6),
+        "load_share": ParameterRange("", 1e-2, 0.99),
+    }
+
+    gap_rad: Scalars
+    stiffness_Nm_rad: Scalars
+    load_share: Scalars
+
+    def shaft_torque(self, state: State) -> Scalars:
+        twist, slip = state.extra["twist"], state.speed - state.extra["load_speed"]
+        outside = jnp.abs(twist) > self.gap_rad / 2
+        bite = jnp.where(outside, twist - jnp.sign(twist) * self.gap_rad / 2, 0.0)
+        return self.stiffness_Nm_rad * (bite + jnp.where(outside, CONTACT * slip, 0.0))
+
+    def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
+        del angle
+        twist = load * (1 / self.stiffness_Nm_rad) + jnp.sign(load) * self.gap_rad / 2
+        return {"load_speed": speed, "twist": twist}
+
+    def linear(self) -> AbstractEffect:
+        k = self.stiffness_Nm_rad
+        return ShaftCompliance(k, CONTACT * k, self.load_share)
