@@ -1,0 +1,226 @@
+"""What may be missing: for every effect of the library the columns that its evidence is a regression on.
+
+An effect is linear in its amplitudes; what else shapes it (a Stribeck speed, a number of periods) is tried on a
+grid that the recordings set. Effects that are no small change (a lag, a shaft) are tried at finite sizes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..effects import EFFECTS
+
+Values = dict[str, float]
+
+
+class Scales(NamedTuple):
+    """Sizes that are typical of the recordings."""
+
+    current: float  # A
+    speed: float  # rad/s
+    voltage: float  # V
+    torque: float  # N m
+    inertia: float  # kg m^2
+    sample_time: float  # s
+    duration: float  # s
+
+
+class Candidate(NamedTuple):
+    """One shape of one effect.
+
+    `columns` are settings of the effect, each with one amplitude small; the response to each over `units` is
+    one column of the regression. `build` makes the effect's parameters of the coefficients found and of the
+    Coulomb friction that is in the model already, or None where they have a sign that physics forbids. With
+    `own_phase`, every run has coefficients of its own.
+    """
+
+    effect: str
+    columns: tuple[Values, ...]
+    units: tuple[float, ...]
+    build: Callable[[np.ndarray, float], Values | None]
+    amplitude: str | None = None  # the field that the last column's coefficient is, where it is one
+    own_phase: bool = False
+    whole: bool = False  # the response is that of a simulation with the whole setting
+
+    @property
+    def order(self) -> int:
+        """How many coefficients it has (in one run, with `own_phase`)."""
+        return len(self.columns)
+
+
+# An amplitude that is small, as a share of the scale: the response to it is as good as a derivative.
+SMALL = 1e-4
+# ... and one that is nothing at all, where an amplitude must be positive.
+NOTHING = 1e-12
+
+
+def candidates(scales: Scales) -> list[Candidate]:
+    """All shapes of all effects of the library that are to be tried."""
+    return [c for name in EFFECTS for c in TABLE[name](name, scales)]
+
+
+def _amplitude(field: str, size: Callable[[Scales], float], signed: bool = False, **shapes):
+    """An effect of one amplitude; `shapes` are functions of the scales that give the grid of another field."""
+
+    def rows(name: str, scales: Scales) -> list[Candidate]:
+        small = SMALL * size(scales)
+        grids = [{}]
+        for shape, grid in shapes.items():
+            grids = [{**values, shape: x} for values in grids for x in grid(scales)]
+
+        def candidate(values: Values) -> Candidate:
+            def build(c: np.ndarray, dry: float) -> Values | None:
+                return {field: float(c[0]), **values} if signed or c[0] > 0 else None
+
+            return Candidate(name, ({field: small, **values},), (small,), build, field)
+
+        return [candidate(values) for values in grids]
+
+    return rows
+
+
+def _sensor(field: str, grid: Callable[[Scales], Sequence[float]]):
+    """An effect of a sensor tried at finite sizes, scaled up or down by the coefficient."""
+
+    def rows(name: str, scales: Scales) -> list[Candidate]:
+        def candidate(size: float) -> Candidate:
+            def build(c: np.ndarray, dry: float) -> Values | None:
+                return {field: size * float(np.clip(c[0], 0.2, 5.0))} if c[0] > 0 else None
+
+            return Candidate(name, ({field: size},), (1.0,), build, field)
+
+        return [candidate(size) for size in grid(scales)]
+
+    return rows
+
+
+def _stribeck(name: str, scales: Scales) -> list[Candidate]:
+    small = SMALL * scales.torque
+
+    def candidate(speed: float) -> Candidate:
+        def build(c: np.ndarray, dry: float) -> Values | None:
+            if c[1] <= 0 or c[0] + c[1] + dry <= 0:
+                return None
+            coulomb = max(float(c[0]) + dry, 1e-3 * float(c[1]))
+            return {"coulomb_Nm": coulomb, "static_Nm": coulomb + float(c[1]), "speed_rad_s": speed}
+
+        flat = {"coulomb_Nm": small, "static_Nm": small, "speed_rad_s": speed}
+        peak = {"coulomb_Nm": NOTHING, "static_Nm": small, "speed_rad_s": speed}
+        return Candidate(name, (flat, peak), (small, small), build, "static_Nm")
+
+    return [candidate(share * scales.speed) for share in (0.01, 0.025, 0.06, 0.15)]
+
+
+def _asymmetric(name: str, scales: Scales) -> list[Candidate]:
+    small = SMALL * scales.torque
+
+    def build(c: np.ndarray, dry: float) -> Values | None:
+        if min(c) + dry <= 0:
+            return None
+        return {"forward_Nm": float(c[0]) + dry, "backward_Nm": float(c[1]) + dry}
+
+    columns = (
+        {"forward_Nm": small, "backward_Nm": NOTHING},
+        {"forward_Nm": NOTHING, "backward_Nm": small},
+    )
+    return [Candidate(name, columns, (small, small), build, "backward_Nm")]
+
+
+def _periodic(field: str, size: Callable[[Scales], float]):
+    """Sine and cosine of the angle, in every run of its own phase."""
+
+    def rows(name: str, scales: Scales) -> list[Candidate]:
+        small = SMALL * size(scales)
+
+        def candidate(periods: int) -> Candidate:
+            def build(c: np.ndarray, dry: float) -> Values | None:
+                phase = float(np.arctan2(c[1], c[0]))
+                return {field: float(np.hypot(c[0], c[1])), "phase_rad": phase, "periods": periods}
+
+            columns = tuple(
+                {field: small, "phase_rad": phase, "periods": float(periods)}
+                for phase in (0.0, np.pi / 2)
+            )
+            return Candidate(name, columns, (small, small), build, field, own_phase=True)
+
+        return [candidate(periods) for periods in PERIODS]
+
+    return rows
+
+
+PERIODS = (*range(1, 17), 18, 20, 21, 22, 24, 26, 28, 30, 32, 36, 40, 42, 48)
+
+# How often a compliant shaft rings in Hz, and how wide a play is in rad
+RINGING = (6.0, 12.0, 25.0, 50.0, 100.0)
+PLAY = (0.003, 0.01, 0.03, 0.1)
+SHARE = 0.5
+
+
+def _stiffness(hertz: float, share: float, scales: Scales) -> float:
+    """Stiffness at which two inertias ring at `hertz`."""
+    return (2 * np.pi * hertz) ** 2 * scales.inertia * share * (1 - share)
+
+
+def _compliance(name: str, scales: Scales) -> list[Candidate]:
+    def candidate(hertz: float) -> Candidate:
+        stiffness = _stiffness(hertz, SHARE, scales)
+        damping = 2 * 0.05 * stiffness / (2 * np.pi * hertz)
+        values = {
+            "stiffness_Nm_rad": stiffness,
+            "damping_Nms_rad": damping,
+            "load_share": SHARE,
+        }
+        return Candidate(
+            name, (values,), (1.0,), lambda c, dry: values if c[0] > 0 else None, whole=True
+        )
+
+    return [candidate(hertz) for hertz in RINGING]
+
+
+def _backlash(name: str, scales: Scales) -> list[Candidate]:
+    def candidate(gap: float) -> Candidate:
+        values = {
+            "gap_rad": gap,
+            "stiffness_Nm_rad": _stiffness(80.0, SHARE, scales),
+            "load_share": SHARE,
+        }
+        return Candidate(
+            name, (values,), (1.0,), lambda c, dry: values if c[0] > 0 else None, whole=True
+        )
+
+    return [candidate(gap) for gap in PLAY]
+
+
+def _times(scales: Scales) -> list[float]:
+    """Time constants of a sensor, from a fraction of a sample on."""
+    return [x for x in (5e-4, 1.5e-3, 4e-3, 1e-2, 3e-2) if 0.2 < x / scales.sample_time < 200]
+
+
+def _thermal(scales: Scales) -> list[float]:
+    return [scales.duration * x for x in (0.03, 0.1, 0.3, 1.0)]
+
+
+TABLE: Mapping[str, Callable[[str, Scales], list[Candidate]]] = {
+    "coulomb_friction": _amplitude("torque_Nm", lambda s: s.torque),
+    "stribeck_friction": _stribeck,
+    "asymmetric_friction": _asymmetric,
+    "quadratic_drag": _amplitude("drag_Nms2_rad2", lambda s: s.torque / s.speed**2),
+    "cogging_torque": _periodic("amplitude_Nm", lambda s: s.torque),
+    "torque_ripple": _periodic("amplitude", lambda s: 1.0),
+    "constant_load": _amplitude("torque_Nm", lambda s: s.torque, signed=True),
+    "shaft_compliance": _compliance,
+    "gear_backlash": _backlash,
+    "brush_voltage_drop": _amplitude("voltage_V", lambda s: s.voltage),
+    "resistance_heating": _amplitude(
+        "rise_per_W", lambda s: 1 / (s.voltage * s.current), time_constant_s=_thermal
+    ),
+    "torque_constant_saturation": _amplitude("per_A2", lambda s: 1 / s.current**2),
+    "inductance_saturation": _amplitude("per_A2", lambda s: 1 / s.current**2),
+    "input_dead_zone": _amplitude("width_V", lambda s: s.voltage),
+    "speed_sensor_lag": _sensor("time_constant_s", _times),
+    "speed_sensor_delay": _sensor("delay_s", _times),
+    "current_sensor_offset": _amplitude("offset_A", lambda s: s.current, signed=True),
+}

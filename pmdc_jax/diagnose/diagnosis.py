@@ -1,0 +1,96 @@
+"""What a diagnosis returns: plain records, read by the command line and the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from attrs import frozen
+
+from ..identify.identification import Estimate, Identification, Role
+
+Verdict = Literal["none_detected", "named", "ambiguous", "not_in_library"]
+
+
+@frozen
+class EffectFound:
+    """An effect that the data ask for: its parameters, and how sure it is that it is there."""
+
+    name: str
+    equation: str
+    parameters: Mapping[str, Estimate]
+    p_value: float  # of the data if the effect were not there
+    also_possible: tuple[str, ...] = ()  # sets such as "coulomb_friction + constant_load"
+
+
+@frozen
+class Region:
+    """A stretch of one variable in which one equation of the motor without effects is off."""
+
+    equation: str  # "mechanical" or "electrical"
+    variable: str  # "speed", "current", "voltage", "time"
+    region: tuple[float, float]  # rad/s, A, V, or share of a run
+    z: float  # the misfit there over its standard error, of the largest size in the region
+
+
+@frozen
+class LearnedCurve:
+    """A term of one equation as the data draw it, whatever it may be: (knots,) arrays, SI."""
+
+    equation: str
+    variable: str
+    unit: str  # of `value`: "N m" opposing motion, or "V" at the terminals
+    x: np.ndarray
+    value: np.ndarray
+    stderr: np.ndarray
+    p_value: float
+
+
+@frozen
+class Gap:
+    """Root mean squares of the noise-scaled residual over both outputs; a perfect model has 1."""
+
+    before: float
+    after: float
+    floor: float
+
+
+@frozen
+class NextExperiment:
+    """A run that would tell the rivals apart, and how likely it is to."""
+
+    why: str
+    description: str
+    power: float
+    time: np.ndarray
+    voltage: np.ndarray
+
+
+@frozen
+class Detectable:
+    """The smallest amplitude of an effect that these runs would have shown, nine times of ten."""
+
+    effect: str
+    parameter: str
+    amplitude: float
+    unit: str
+
+
+@frozen
+class Diagnosis:
+    """Which effects the motor without effects lacked, where that shows, and the completed motor."""
+
+    verdict: Verdict
+    effects: tuple[EffectFound, ...]
+    where: tuple[Region, ...]
+    gap: Mapping[Role, Gap]
+    gap_of_run: Mapping[str, Gap]
+    closed_fraction: float | None  # of the gap, on hold-outs where there are any
+    next_experiment: NextExperiment | None
+    curves: tuple[LearnedCurve, ...]  # what is left, where something outside the library is
+    detectable: tuple[Detectable, ...]
+    base: Identification  # without effects
+    final: Identification  # with the effects that were found
+    p_nothing: float  # of the data if nothing were missing
+    seconds: Mapping[str, float]

@@ -1,0 +1,104 @@
+"""Evidence for what is missing: one regression of whitened residuals on everything that might be.
+
+Whatever is asked of the evidence afterwards (a single effect, a pair, a curve) is algebra on one small matrix of
+inner products for every run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Block(NamedTuple):
+    """Columns that stand or fall together; with `own`, every run has its own coefficients."""
+
+    columns: tuple[int, ...]
+    own: bool = False
+
+
+class Regression(NamedTuple):
+    """A fit by some blocks on top of the motor's own parameters."""
+
+    squares: float  # sum of the squared white residuals that are left
+    moved: Float[np.ndarray, " parameters"]  # by how much the motor's parameters move
+    coefficients: list[Float[np.ndarray, "*runs columns"]]  # of every block
+    errors: list[Float[np.ndarray, "*runs columns"]]  # their standard errors
+
+
+class Evidence(NamedTuple):
+    """Inner products of the white rows of every run: motor parameters first, then columns, residual last.
+
+    What belongs to a run alone (its initial state, its load) is projected out.
+    """
+
+    products: Float[np.ndarray, "runs columns columns"]
+    parameters: int  # how many columns are the motor's
+    rows: int
+
+    def regress(self, blocks: Sequence[Block] = ()) -> Regression:
+        """Least squares of the residual on the motor's parameters and some blocks."""
+        shared = [*range(self.parameters), *(c for b in blocks if not b.own for c in b.columns)]
+        own = [c for b in blocks if b.own for c in b.columns]
+        kept = [*shared, -1]
+        total, solved = np.zeros((len(kept), len(kept))), []
+        for product in self.products:
+            across = product[np.ix_(own, kept)]
+            inverse = _inverse(product[np.ix_(own, own)])
+            total += product[np.ix_(kept, kept)] - across.T @ inverse @ across
+            solved.append((inverse, across))
+        inverse = _inverse(total[:-1, :-1])
+        coefficients = inverse @ total[:-1, -1]
+        squares = float(total[-1, -1] - total[:-1, -1] @ coefficients)
+        errors = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+        of_own = [i @ (a[:, -1] - a[:, :-1] @ coefficients) for i, a in solved]
+        own_errors = [np.sqrt(np.maximum(np.diag(i), 0.0)) for i, _ in solved]
+        place_shared, place_own = self.parameters, 0
+        found, spread = [], []
+        for block in blocks:
+            n = len(block.columns)
+            if block.own:
+                part = slice(place_own, place_own + n)
+                found.append(np.array([c[part] for c in of_own]))
+                spread.append(np.array([e[part] for e in own_errors]))
+                place_own += n
+            else:
+                part = slice(place_shared, place_shared + n)
+                found.append(coefficients[part])
+                spread.append(errors[part])
+                place_shared += n
+        return Regression(squares, coefficients[: self.parameters], found, spread)
+
+    def freedom(self, block: Block) -> int:
+        """How many coefficients a block has."""
+        return len(block.columns) * (len(self.products) if block.own else 1)
+
+
+def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Inverse on what the rows can see of it."""
+    if not len(matrix):
+        return matrix
+    lengths = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    lengths = np.where(lengths > 0, lengths, 1.0)
+    values, vectors = np.linalg.eigh(matrix / lengths[:, None] / lengths)
+    visible = values > 1e-9
+    inverse = np.where(visible, 1 / np.where(visible, values, 1.0), 0.0)
+    return (vectors * inverse) @ vectors.T / lengths[:, None] / lengths
+
+
+def products(
+    shared: Sequence[Float[np.ndarray, "rows shared"]],
+    local: Sequence[Float[np.ndarray, "rows local"]],
+    columns: Sequence[Float[np.ndarray, "rows columns"]],
+    residual: Sequence[Float[np.ndarray, " rows"]],
+) -> Evidence:
+    """Gather the evidence from white rows, one array a run of each."""
+    gathered = []
+    for J, own, X, r in zip(shared, local, columns, residual, strict=True):
+        everything = np.concatenate([J, X, r[:, None]], 1)
+        everything = everything - own @ (_inverse(own.T @ own) @ (own.T @ everything))
+        gathered.append(everything.T @ everything)
+    return Evidence(np.array(gathered), shared[0].shape[1], sum(len(r) for r in residual))

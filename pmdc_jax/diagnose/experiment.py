@@ -1,0 +1,93 @@
+"""The run that would tell rivals apart: of a few waveforms the one in which they differ most."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+from scipy import stats
+
+from ..motor import Motor
+from ..recording import Recording
+from ..simulate import simulate
+from .diagnosis import NextExperiment
+from .naming import Naming
+
+# Length of the run in s, and its sample time
+DURATION, STEP = 6.0, 1e-3
+# Simulation and reality share only so much of a difference once every parameter has been fitted anew
+SHARED = 0.3
+# Chance of a false answer at which the power is stated
+LEVEL = 0.05
+
+Waveform = Callable[[np.ndarray], np.ndarray]  # time in s to voltage over its limit
+
+
+def _steps(seed: int, least: float, most: float) -> Waveform:
+    """Levels drawn anew after drawn times."""
+
+    def levels(time: np.ndarray) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        edges = np.cumsum(rng.uniform(least, most, int(time[-1] / least) + 1))
+        return rng.uniform(-1, 1, len(edges) + 1)[np.searchsorted(edges, time)]
+
+    return levels
+
+
+WAVEFORMS: dict[str, Waveform] = {
+    "creep slowly through zero in both directions": lambda t: (
+        0.15 * np.abs((2 * t / 1.5) % 4 - 2) - 0.15
+    ),
+    "climb in steps to full speed forward, then backward": lambda t: (
+        np.round(4 * np.abs((t * 4 / DURATION) % 4 - 2)) / 4 - 1
+    ),
+    "jump between levels every few hundredths of a second": _steps(1, 0.01, 0.06),
+    "jump between levels every half second": _steps(2, 0.3, 0.7),
+    "reverse at full voltage, then coast": lambda t: (
+        np.sign(np.sin(4 * np.pi * t)) * ((t % 1.5) < 1)
+    ),
+    "rest, then small steps": lambda t: 0.08 * _steps(3, 0.2, 0.4)(t) * (t > 2),
+}
+
+
+def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExperiment | None:
+    """The waveform within the recorded voltage in which the chosen motor and its nearest rival differ most."""
+    limit = max(
+        (float(np.max(np.abs(r.voltage))) for r in recordings if r.voltage is not None), default=0
+    )
+    if not limit or not naming.rivals:
+        return None
+    rival = naming.rivals[0]
+    motors = [jax.tree.map(np.asarray, m.motor) for m in (naming.chosen, rival)]
+    noise = np.asarray(naming.chosen.polished.noise)
+    time = STEP * np.arange(int(DURATION / STEP))
+    ranked = sorted(
+        (
+            (_difference(motors, time, limit * waveform(time), noise), name)
+            for name, waveform in WAVEFORMS.items()
+        ),
+        reverse=True,
+    )
+    difference, name = ranked[0]
+    power = float(stats.norm.cdf(SHARED * difference - stats.norm.isf(LEVEL)))
+    sets = (" + ".join(sorted(m.effects)) for m in (naming.chosen, rival))
+    return NextExperiment(
+        why=f"{' and '.join(sets)} explain these runs equally well",
+        description=f"{name}, {DURATION:g} s within {limit:.3g} V, no load",
+        power=power,
+        time=time,
+        voltage=limit * WAVEFORMS[name](time),
+    )
+
+
+def _difference(motors: list[Motor], time, voltage, noise) -> float:
+    """Root of the summed squares of what two motors answer differently, over the noise."""
+    start = np.zeros_like(time)
+    run = Recording("next", time, voltage, current=start, speed=start, load=start)
+    one, other = (simulate(motor, run) for motor in motors)
+    parts = [
+        (getattr(one, c) - getattr(other, c)) / s
+        for c, s in zip(("current", "speed"), noise, strict=True)
+    ]
+    return float(np.sqrt(np.sum(np.square(parts))))

@@ -1,0 +1,289 @@
+"""Which effects are missing: forward from the motor without effects, each step refitted in full simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import special, stats
+
+from ..effects import EFFECTS
+from ..identify.refine import Refined, Unknowns, polish
+from .candidates import Candidate, Values
+from .evidence import Block, Evidence
+from .noise import whitener
+from .screen import Library, Model, Screen, left_over, rows_of, screen
+
+# Chance that anything at all is called missing from a motor that lacks nothing
+ALARM = 0.01
+# At most so many effects are named, and so many candidates for one are refitted in full simulation
+MOST, SHORTLIST = 3, 3
+# ... those whose evidence to first order is at least this share of the best one's
+COMPARABLE = 0.6
+# An effect that contains another one replaces it
+CONTAINS = {
+    "stribeck_friction": {"coulomb_friction"},
+    "asymmetric_friction": {"coulomb_friction", "constant_load"},
+    "gear_backlash": {"shaft_compliance"},
+}
+# Rivals whose criterion is nearer than this are not told apart
+MARGIN = 8.0
+
+
+class Signal(NamedTuple):
+    """A block of the evidence on its own: how much better the fit is with it."""
+
+    gain: float
+    log_p: float  # natural logarithm of the chance of such a gain by noise
+    candidate: Candidate | None
+    block: Block
+
+
+def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
+    """Of every candidate that physics allows, and of every curve; the most significant first."""
+    base = found.evidence.regress().squares
+
+    def signal(candidate: Candidate | None, block: Block) -> Signal | None:
+        fit = found.evidence.regress([block])
+        if candidate is not None and not found.possible(candidate, fit.coefficients[0]):
+            return None
+        gain = max(base - fit.squares, 0.0)
+        return Signal(gain, _log_chance(gain, found.evidence, block), candidate, block)
+
+    def ranked(pairs) -> list[Signal]:
+        every = [s for pair in pairs if (s := signal(*pair)) is not None]
+        return sorted(every, key=lambda s: s.log_p)
+
+    of_candidates = ranked(zip(found.candidates, found.of_candidate, strict=True))
+    return of_candidates, ranked((None, block) for block in found.of_curve)
+
+
+def _log_chance(gain: float, evidence: Evidence, block: Block) -> float:
+    return log_chance(gain, evidence.freedom(block))
+
+
+def log_chance(gain: float, freedom: int) -> float:
+    """Logarithm of the chance that noise alone gains as much; far out by the leading term of the tail."""
+    if gain < 500:
+        return float(stats.chi2.logsf(gain, freedom))
+    half = freedom / 2
+    return float(-gain / 2 + (half - 1) * np.log(gain / 2) - special.gammaln(half))
+
+
+def chance_of_nothing(found: Screen) -> float:
+    """Chance of evidence as strong as the strongest if nothing were missing: Bonferroni over all blocks."""
+    of_candidates, of_curves = signals(found)
+    count = len(found.candidates) + len(found.curves)
+    smallest = min(s.log_p for s in (*of_candidates, *of_curves))
+    return float(min(1.0, np.exp(smallest + np.log(count))))
+
+
+class Fitted(NamedTuple):
+    """A model among others fitted to the same runs, and how well it does by a common filter of the noise."""
+
+    model: Model
+    squares: float
+    criterion: float  # squares and the price of every parameter; less is better
+
+
+class Naming(NamedTuple):
+    """The set chosen, its rivals, and what is left that no candidate explains."""
+
+    chosen: Model
+    rivals: list[Model]
+    first: Screen  # evidence against the motor without effects
+    last: Screen  # and against the chosen one
+    nothing: float  # chance of the evidence if nothing were missing
+    left: float  # chance of what is left if nothing more were missing
+    explained: float  # how much of the squares the chosen set takes away
+    unexplained: float  # and how much the clearest curve would still take
+    without: dict[str, float]  # by effect of the chosen: chance of the data without it
+
+
+class Namer:
+    """Refits sets of effects, each once."""
+
+    def __init__(self, base: Model, report):
+        self.base, self.report = base, report
+        self.library = Library(base)
+        self.models: dict[frozenset[str], Model] = {frozenset(): base}
+
+    def name(self) -> Naming:
+        """Add effects while the evidence asks for them; then see which could be spared or replaced."""
+        current, first = self.base, screen(self.base, self.library)
+        found, nothing = first, chance_of_nothing(first)
+        left = nothing
+        while left < ALARM and len(current.effects) < MOST:
+            tried = [self.refit(current, s, found) for s in self._shortlist(current, found)]
+            tried = [m for m in tried if m is not None]
+            if not tried:
+                break
+            best = self.compare([current, *tried])[0]
+            if best.model is current:
+                break
+            current = self._spared(best.model)
+            found = screen(current, self.library)
+            left = chance_of_nothing(found)
+        ranked = self.compare(list(self.models.values()))
+        price = {frozenset(f.model.effects): f for f in ranked}
+        mine = price[frozenset(current.effects)]
+        rivals = [
+            f.model
+            for f in ranked
+            if f.criterion < mine.criterion + MARGIN and self._is_rival(f.model, current)
+        ]
+        alone = price[frozenset()].squares
+        unexplained = max(s.gain for found_of in signals(found) for s in found_of)
+        return Naming(
+            current,
+            rivals,
+            first,
+            found,
+            nothing,
+            left,
+            alone - mine.squares,
+            unexplained,
+            self._without(current),
+        )
+
+    def _is_rival(self, model: Model, chosen: Model) -> bool:
+        """Not the same, not a part of it, not the same with something on top."""
+        a, b = set(model.effects), set(chosen.effects)
+        return bool(a) and not (a <= b or b <= a or _same_class(a, b) or _contains(a, b))
+
+    def _shortlist(self, current: Model, found: Screen) -> list[Signal]:
+        """The most significant shape of each of the best few effects that are not there yet."""
+        best: dict[str, Signal] = {}
+        for s in signals(found)[0]:
+            assert s.candidate is not None
+            if s.candidate.effect not in current.effects:
+                best.setdefault(s.candidate.effect, s)
+        ranked = [
+            s for s in best.values() if s.log_p + np.log(len(found.candidates)) < np.log(ALARM)
+        ]
+        return [s for s in ranked if s.log_p < COMPARABLE * ranked[0].log_p][:SHORTLIST]
+
+    def refit(self, current: Model, signal: Signal, found: Screen) -> Model | None:
+        """The current model with one more effect, in full simulation."""
+        assert signal.candidate is not None
+        name = signal.candidate.effect
+        kept = [e for e in current.effects if e not in CONTAINS.get(name, ())]
+        key = frozenset([*kept, name])
+        if key in self.models:
+            return self.models[key]
+        self.report(f"trying {' + '.join(sorted(key))}", current.polished.refined.fitness)
+        fit = found.evidence.regress([signal.block])
+        runs = len(self.base.given.roles)
+        values, angles = _values(signal.candidate, fit.coefficients[0], current.dry, runs)
+        model = self._fit(current, (*kept, name), {name: values}, fit.moved, angles)
+        self.models[key] = model
+        return model
+
+    def _fit(
+        self,
+        current: Model,
+        effects: tuple[str, ...],
+        values: dict[str, Values],
+        moved: np.ndarray,
+        angles: np.ndarray | None,
+    ) -> Model:
+        given = self.base.given.with_effects([EFFECTS[e] for e in effects])
+        parameters = given.problem.parameters
+        before = dict(
+            zip(
+                current.given.problem.parameters.names,
+                np.asarray(current.polished.refined.unknowns.coordinates) + moved,
+                strict=True,
+            )
+        )
+        coordinates = []
+        for name, log in zip(parameters.names, parameters.logarithmic, strict=True):
+            if name in before:
+                coordinates.append(before[name])
+            else:
+                effect, field = name.split(".")
+                value = values[effect][field]
+                coordinates.append(np.log(max(value, 1e-300)) if log else value)
+        inside = np.clip(coordinates, parameters.lower, parameters.upper)
+        local = np.array(current.polished.refined.unknowns.local)
+        if angles is not None:
+            local[:, 3] += angles
+        start = Unknowns(jnp.asarray(inside), jnp.asarray(local))
+        return Model(effects, given, polish(given.problem, Refined(start, np.inf, (), False)))
+
+    def _spared(self, model: Model) -> Model:
+        """The model without effects that it can do without."""
+        for effect in model.effects[:-1]:
+            rest = tuple(e for e in model.effects if e != effect)
+            smaller = self.models.get(frozenset(rest)) or self._drop(model, rest)
+            if self.compare([model, smaller])[0].model is smaller:
+                return self._spared(smaller)
+        return model
+
+    def _drop(self, model: Model, rest: tuple[str, ...]) -> Model:
+        nothing = np.zeros(len(model.given.problem.parameters.names))
+        smaller = self._fit(model, rest, {}, nothing, None)
+        self.models[frozenset(rest)] = smaller
+        return smaller
+
+    def compare(self, models: Sequence[Model]) -> list[Fitted]:
+        """By the squares of what each leaves, made white by the filter of the one that leaves least."""
+        least = min(models, key=lambda m: m.polished.refined.fitness)
+        white = whitener([residual for _, residual in rows_of(least)])
+        fitted = []
+        for model in models:
+            squares, rows = left_over(model, white)
+            price = len(model.given.problem.parameters.names) * np.log(rows)
+            fitted.append(Fitted(model, squares, squares + price))
+        return sorted(fitted, key=lambda f: f.criterion)
+
+    def _without(self, chosen: Model) -> dict[str, float]:
+        chances = {}
+        for effect in chosen.effects:
+            rest = tuple(e for e in chosen.effects if e != effect)
+            smaller = self.models.get(frozenset(rest)) or self._drop(chosen, rest)
+            both = {f.model.effects: f.squares for f in self.compare([chosen, smaller])}
+            gain = both[smaller.effects] - both[chosen.effects]
+            chances[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
+        return chances
+
+
+def _values(candidate: Candidate, coefficients: np.ndarray, dry: float, runs: int):
+    """An effect's parameters by the coefficients of its columns, and how far each run starts turned."""
+    angles = np.zeros(runs)
+    if not candidate.own_phase:
+        return candidate.build(coefficients, dry), angles
+    sizes = np.hypot(*coefficients.T)
+    phases = np.arctan2(coefficients[:, 1], coefficients[:, 0])
+    values = candidate.build(coefficients[0], dry)
+    assert values is not None
+    amplitude = next(iter(values))
+    values = {**values, amplitude: float(np.median(sizes))}
+    angles[: len(phases)] = (phases - phases[0]) / values["periods"]
+    return values, angles
+
+
+def _same_class(a: set[str], b: set[str]) -> bool:
+    """While the motor turns, asymmetric friction and Coulomb friction with a constant load are one torque."""
+    return _spelt_out(a) == _spelt_out(b)
+
+
+def _spelt_out(effects: set[str]) -> set[str]:
+    if "asymmetric_friction" in effects:
+        return (effects - {"asymmetric_friction"}) | {"coulomb_friction", "constant_load"}
+    return effects
+
+
+def _contains(a: set[str], b: set[str]) -> bool:
+    """Whether one set is the other but for an effect that another one contains."""
+    return any(_simplified(x) <= y or _simplified(x) == _simplified(y) for x, y in ((a, b), (b, a)))
+
+
+def _simplified(effects: set[str]) -> set[str]:
+    return {
+        simple
+        for e in effects
+        for simple in (CONTAINS[e] - {"constant_load"} if e in CONTAINS else {e})
+    }

@@ -1,0 +1,123 @@
+"""The noise of the recordings: an autoregression of the residuals, and what is left when it is taken out.
+
+Residuals of a free run are coloured even where the sensors are white: a torque that fluctuates is filtered by the
+motor. Tests for white noise would take that for an effect. So residuals, and whatever is regressed on them, are
+passed through the filter that makes the noise white, and every run is weighed by what its own noise then is.
+
+**Source**: Ljung, "System Identification", 2nd edition, section 7.4 (prediction errors); Lütkepohl, "New
+Introduction to Multiple Time Series Analysis" (2005), sections 3.2 and 4.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+# Orders that are tried; the Bayesian criterion chooses.
+ORDERS = (1, 2, 4, 8, 12, 20, 30)
+
+Rows = Float[np.ndarray, "samples outputs *columns"]
+
+
+class Series(NamedTuple):
+    """Signals of one run in the order of time, of the outputs that it has."""
+
+    values: Rows
+    known: Bool[np.ndarray, " samples"]  # where all outputs were measured
+    kind: tuple[float, tuple[int, ...]]  # sample time and outputs: runs of a kind share a filter
+
+
+class Whitener(NamedTuple):
+    """A filter for every kind of run, and for every run the matrix that gives it unit variance."""
+
+    filters: dict[tuple, Float[np.ndarray, "order outputs outputs"]]
+    scales: list[Float[np.ndarray, "outputs outputs"]]
+
+    def __call__(self, run: int, series: Series) -> Float[np.ndarray, "rows *columns"]:
+        """The rows of a run, white if the series is its noise, those of all outputs one after another."""
+        rest = _filtered(series, self.filters[series.kind])
+        rows = np.einsum("oi,si...->so...", self.scales[run], rest)
+        return rows.reshape(-1, *rows.shape[2:])
+
+
+def whitener(residuals: Sequence[Series]) -> Whitener:
+    """Fit the filters to the residuals of every run.
+
+    **Arguments**: `residuals`, one `Series` a run, `values` (samples, outputs).
+    """
+    filters = {}
+    for kind in dict.fromkeys(series.kind for series in residuals):
+        filters[kind] = _autoregression([s for s in residuals if s.kind == kind])
+    scales = []
+    for series in residuals:
+        rest = _filtered(series, filters[series.kind])
+        covariance = rest.T @ rest / max(len(rest), 1)
+        floor = 1e-12 * np.trace(covariance) + 1e-300
+        values, vectors = np.linalg.eigh(covariance)
+        scales.append((vectors / np.sqrt(np.maximum(values, floor))) @ vectors.T)
+    return Whitener(filters, scales)
+
+
+def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order outputs outputs"]:
+    """Coefficients A_k of r(t) = sum_k A_k r(t - k) + white noise, of the order that the criterion likes best.
+
+    Runs are weighed by their own variance: noise may differ between them.
+    """
+    outputs, longest = residuals[0].values.shape[1], max(ORDERS)
+    lagged = [_lagged(series, longest) for series in residuals]
+    units = np.sqrt(np.mean(np.square(np.concatenate(lagged)), axis=0))[:outputs] + 1e-300
+    size, rows = outputs * (longest + 1), sum(len(x) for x in lagged)
+    gram = np.zeros((size, size))
+    for x in lagged:
+        scaled = x / np.tile(units, longest + 1)
+        gram += scaled.T @ scaled / (np.mean(np.square(scaled)) + 1e-300)
+    best, chosen = np.inf, np.zeros((0, outputs, outputs))
+    for order in ORDERS:
+        if rows < 20 * order * outputs:
+            break
+        now, past = slice(0, outputs), slice(outputs, outputs * (order + 1))
+        ridge = 1e-9 * np.trace(gram[past, past]) * np.eye(order * outputs) / (order * outputs)
+        coefficients = np.linalg.solve(gram[past, past] + ridge, gram[past, now])
+        left = gram[now, now] - gram[now, past] @ coefficients
+        criterion = rows * np.linalg.slogdet(left / rows)[1] + order * outputs**2 * np.log(rows)
+        if criterion < best:
+            best = criterion
+            chosen = coefficients.reshape(order, outputs, outputs).transpose(0, 2, 1)
+    return chosen * units[:, None] / units
+
+
+def _lagged(series: Series, order: int) -> Float[np.ndarray, "rows lags"]:
+    values = series.values
+    whole = np.concatenate([values[order - k : len(values) - k] for k in range(order + 1)], axis=1)
+    return whole[_usable(series.known, order)]
+
+
+# Samples that are filtered by one product of matrices.
+CHUNK = 128
+
+
+def _filtered(series: Series, filters: Float[np.ndarray, "order outputs outputs"]) -> Rows:
+    values, order, outputs = series.values, len(filters), series.values.shape[1]
+    flat = np.ascontiguousarray(values).reshape(len(values) * outputs, -1)
+    band = np.zeros((CHUNK, outputs, CHUNK + order, outputs))
+    here = np.arange(CHUNK)
+    band[here, :, here + order] = np.eye(outputs)
+    for k, A in enumerate(filters, start=1):
+        band[here, :, here + order - k] = -A
+    band = band.reshape(CHUNK * outputs, -1)
+    rest = np.empty(((len(values) - order) * outputs, flat.shape[1]))
+    for first in range(0, len(rest), len(band)):
+        window = flat[first : first + band.shape[1]]
+        part = rest[first : first + len(band)]
+        part[:] = band[: len(part), : len(window)] @ window
+    rest = rest.reshape(len(values) - order, *values.shape[1:])
+    return rest[_usable(series.known, order)]
+
+
+def _usable(known: Bool[np.ndarray, " samples"], order: int) -> Bool[np.ndarray, " rows"]:
+    """Samples that were measured, as were all that the filter looks back on."""
+    lost = np.cumsum(np.append(0, ~known))
+    return lost[order + 1 :] == lost[: len(known) - order]

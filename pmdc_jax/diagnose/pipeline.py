@@ -1,0 +1,250 @@
+"""From recordings to a `Diagnosis`: identify, gather evidence, name, refit, say what is left."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import attrs
+import numpy as np
+from scipy import stats
+
+from ..effects import EFFECTS
+from ..identify.identification import Identification, Role
+from ..identify.pipeline import judge, prepare, solve
+from ..precision import double_precision
+from ..recording import Recording
+from .diagnosis import (
+    Detectable,
+    Diagnosis,
+    EffectFound,
+    Gap,
+    LearnedCurve,
+    Region,
+    Verdict,
+)
+from .experiment import next_experiment
+from .naming import ALARM, Namer, Naming, log_chance
+from .screen import Model, Screen
+
+if TYPE_CHECKING:
+    from ..report.terminal import ReportProgress
+
+# A hat of a curve whose misfit is so many standard errors is part of a region
+CLEAR = 4.0
+# What a complete model may leave of the gap when a library's formula is not quite nature's
+LEFT = 0.1
+
+
+@double_precision
+def diagnose(
+    recordings: Sequence[Recording],
+    holdout: Sequence[Recording] = (),
+    *,
+    tie: Sequence[tuple[str, str]] = (),
+    known: Mapping[str, float] | None = None,
+    unloaded: bool = False,
+    search: str = "cma_es",
+    seed: int = 0,
+    progress: ReportProgress | None = None,
+) -> Diagnosis:
+    """Find where a motor's recordings and its simulation disagree, name the missing effects and add them.
+
+    The arguments are those of `pmdc_jax.identify`.
+
+    **Returns**: the verdict, the effects with their parameters, where the misfit shows, how much of the gap
+    they close, and the motor before and after.
+
+    **Raises**: `InputError` on data or arguments that cannot give an answer.
+    """
+    began = time.perf_counter()
+    report = progress or (lambda *args, **kwargs: None)
+    report("checking the recordings")
+    given = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
+    solved = solve(given, search, seed, progress)
+    identified = time.perf_counter()
+    report("gathering evidence", solved.polished.refined.fitness)
+    naming = Namer(Model((), given, solved.polished), report).name()
+    named = time.perf_counter()
+    report("judging the uncertainty", naming.chosen.polished.refined.fitness)
+    base = judge(given, solved)
+    chosen = solved._replace(polished=naming.chosen.polished)
+    final = judge(naming.chosen.given, chosen) if naming.chosen.effects else base
+    gaps = _gaps(base, final)
+    verdict = _verdict(naming)
+    seconds = {
+        "identify": identified - began,
+        "name": named - identified,
+        "total": time.perf_counter() - began,
+    }
+    final = attrs.evolve(final, seconds=seconds)
+    total = _total(gaps, base)
+    return Diagnosis(
+        verdict=verdict,
+        effects=_effects(naming, final),
+        where=_regions(naming.first),
+        gap=total,
+        gap_of_run=gaps,
+        closed_fraction=_closed(total),
+        next_experiment=next_experiment(naming, given.training) if verdict == "ambiguous" else None,
+        curves=_learned(naming.last) if verdict == "not_in_library" else (),
+        detectable=_detectable(naming.last),
+        base=base,
+        final=final,
+        p_nothing=naming.nothing,
+        seconds=seconds,
+    )
+
+
+def _verdict(naming: Naming) -> Verdict:
+    if naming.nothing >= ALARM:
+        return "none_detected"
+    if naming.left < ALARM and not _nearly_closed(naming):
+        return "not_in_library"
+    if not naming.chosen.effects:
+        return "not_in_library"
+    return "ambiguous" if naming.rivals else "named"
+
+
+def _nearly_closed(naming: Naming) -> bool:
+    """Whether what is left is no more than another formula for the same effect might leave."""
+    return bool(naming.chosen.effects) and naming.unexplained < LEFT * naming.explained
+
+
+def _effects(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:
+    rivals = tuple(" + ".join(sorted(m.effects)) for m in naming.rivals)
+    return tuple(
+        EffectFound(
+            name,
+            EFFECTS[name].equation,
+            {f: final.parameters[f"{name}.{f}"] for f in EFFECTS[name].ranges},
+            naming.without[name],
+            rivals,
+        )
+        for name in naming.chosen.effects
+    )
+
+
+def _regions(found: Screen) -> tuple[Region, ...]:
+    """Where the curves over every variable are far from zero, the clearest first."""
+    base = found.evidence.regress().squares
+    regions = []
+    for curve, block in zip(found.curves, found.of_curve, strict=True):
+        fit = found.evidence.regress([block])
+        if (
+            log_chance(base - fit.squares, found.evidence.freedom(block)) > np.log(1e-4)
+            or curve.own
+        ):
+            continue
+        z = fit.coefficients[0] / np.where(fit.errors[0] > 0, fit.errors[0], np.inf)
+        regions += _stretches(curve.equation, curve.variable, curve.knots, z)
+    return tuple(sorted(regions, key=lambda r: -abs(r.z))[:12])
+
+
+def _stretches(equation: str, variable: str, knots: np.ndarray, z: np.ndarray) -> list[Region]:
+    clear = np.abs(z) > CLEAR
+    regions, first = [], None
+    for k in range(len(knots) + 1):
+        inside = k < len(knots) and clear[k] and (first is None or z[k] * z[first] > 0)
+        if first is not None and not inside:
+            part = z[first:k]
+            peak = float(part[np.argmax(np.abs(part))])
+            ends = float(knots[max(first - 1, 0)]), float(knots[min(k, len(knots) - 1)])
+            regions.append(Region(equation, variable, ends, peak))
+            first = k if k < len(knots) and clear[k] else None
+        elif inside and first is None:
+            first = k
+    return regions
+
+
+def _learned(found: Screen) -> tuple[LearnedCurve, ...]:
+    """The curves that are left, drawn by the data, the most significant first."""
+    base = found.evidence.regress().squares
+    learned = []
+    for curve, block in zip(found.curves, found.of_curve, strict=True):
+        fit = found.evidence.regress([block])
+        chance = log_chance(base - fit.squares, found.evidence.freedom(block))
+        value, error = (
+            np.mean(x, axis=0) if curve.own else x for x in (fit.coefficients[0], fit.errors[0])
+        )
+        unit = "N m" if curve.equation == "mechanical" else "V"
+        learned.append(
+            LearnedCurve(
+                curve.equation,
+                curve.variable,
+                unit,
+                curve.knots,
+                value,
+                error,
+                float(np.exp(chance)),
+            )
+        )
+    return tuple(sorted(learned, key=lambda c: c.p_value)[:3])
+
+
+def _detectable(found: Screen) -> tuple[Detectable, ...]:
+    """For every effect the smallest amplitude that would have been seen nine times of ten."""
+    count = len(found.candidates) + len(found.curves)
+    needed = stats.norm.isf(ALARM / count / 2) + stats.norm.isf(0.1)
+    smallest: dict[str, Detectable] = {}
+    for candidate, block in zip(found.candidates, found.of_candidate, strict=True):
+        field = candidate.amplitude
+        if field is None:
+            continue
+        error = float(np.min(found.evidence.regress([block]).errors[0][..., -1]))
+        # a column is the response to a unit of the amplitude, or to the whole of a finite one
+        size = candidate.columns[-1][field] if candidate.units[-1] == 1.0 else 1.0
+        amplitude = float(needed * error * size)
+        if error > 0 and (
+            candidate.effect not in smallest or amplitude < smallest[candidate.effect].amplitude
+        ):
+            unit = EFFECTS[candidate.effect].ranges[field].unit
+            smallest[candidate.effect] = Detectable(candidate.effect, field, amplitude, unit)
+    return tuple(smallest.values())
+
+
+def _gaps(base: Identification, final: Identification) -> dict[str, Gap]:
+    """Of every run the misfit before and after, over the noise as the final model's training runs show it."""
+    noise = {c: _rms_of_all(final, c) for c in ("current", "speed")}
+
+    def misfit(found: Identification, run: str) -> float:
+        ratios = [
+            getattr(found.fit[run], f"{c}_rmse") / noise[c]
+            for c in noise
+            if getattr(found.fit[run], f"{c}_rmse") is not None and noise[c]
+        ]
+        return float(np.sqrt(np.mean(np.square(ratios)))) if ratios else 1.0
+
+    gaps = {}
+    for run in base.fit:
+        before, after = misfit(base, run), misfit(final, run)
+        gaps[run] = Gap(before, after, min(1.0, after))
+    return gaps
+
+
+def _rms_of_all(found: Identification, channel: str) -> float:
+    errors = [
+        (getattr(f, f"{channel}_rmse"), len(f.time))
+        for f in found.fit.values()
+        if f.role == "train" and getattr(f, f"{channel}_rmse") is not None
+    ]
+    samples = sum(n for _, n in errors)
+    return float(np.sqrt(sum(e * e * n for e, n in errors) / samples)) if samples else 0.0
+
+
+def _total(gaps: Mapping[str, Gap], base: Identification) -> dict[Role, Gap]:
+    total: dict[Role, Gap] = {}
+    for role in ("train", "holdout"):
+        mine = [(gaps[name], len(f.time)) for name, f in base.fit.items() if f.role == role]
+        if mine:
+            weights = np.array([n for _, n in mine], float)
+            squares = np.array([[g.before, g.after, g.floor] for g, _ in mine]) ** 2
+            total[role] = Gap(*(float(x) for x in np.sqrt(weights @ squares / weights.sum())))
+    return total
+
+
+def _closed(total: Mapping[Role, Gap]) -> float | None:
+    gap = total.get("holdout") or total["train"]
+    open_before = gap.before**2 - gap.floor**2
+    return (gap.before**2 - gap.after**2) / open_before if open_before > 1e-9 else None

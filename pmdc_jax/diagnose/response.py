@@ -1,0 +1,161 @@
+"""What an effect would change in the recorded outputs, to first order, along a free run of the motor.
+
+An effect changes where one sample leads to the next: it *kicks* the motor a little at every sample. The linear
+motor carries the kicks on, and the sum is the response: one column of a regression, whose coefficient is the
+amplitude of the effect. No measured signal is ever differentiated.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..effects import State
+from ..motor import Drive, Motor
+from ..simulate import Tape
+from ..simulate.solver import Propagator, along_grids, held_step, pick_grid, steps_in_sample
+
+Signal = Float[Array, "samples blocks"]
+Outputs = Float[Array, "samples 2 blocks"]
+
+
+class Path(NamedTuple):
+    """A free run, sample by sample: current (A) and speed (rad/s), and where dry friction holds the rotor."""
+
+    current: Signal
+    speed: Signal
+    angle: Signal  # rad, from the recorded speed where there is one
+    held: Bool[Array, "samples blocks"]
+
+
+@eqx.filter_jit
+def path_of(seen: Float[Array, "blocks 2 samples"], tape: Tape, dry: bool | Array) -> Path:
+    """The path of a free run as seen; `dry` says that the motor has friction that holds."""
+    current, speed = seen[:, 0].T, seen[:, 1].T
+    drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid], tape.drive)
+    current = drive.voltage * current + drive.current * jnp.asarray(tape.value).T
+    turning = jnp.where(tape.weight[:, 1] > 0, tape.measured[:, 1], seen[:, 1])
+    step = jnp.asarray(tape.sample_time)[tape.grid][:, None]
+    # the mean speed over a sample turns the rotor; every run counts from its own start
+    ahead = jnp.append(turning.reshape(-1)[1:], 0.0).reshape(turning.shape)
+    turned = jnp.cumsum(((turning + ahead) / 2 * step).reshape(-1))
+    before = jnp.append(0.0, turned[:-1]).reshape(turning.shape)
+    first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
+    angle = before - before[first, :1]
+    return Path(current, speed, angle.T, (speed == 0) & dry)
+
+
+@eqx.filter_jit
+def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
+    """By how much `motor` goes elsewhere than `bare` in the sample after each of the path: current and speed."""
+    after = _one_sample(motor, tape, path)
+    without = _one_sample(bare, tape, path)
+    return jnp.stack([after.current - without.current, after.speed - without.speed], 1)
+
+
+@eqx.filter_jit
+def sensed(motor: Motor, tape: Tape, path: Path) -> Outputs:
+    """By how much the sensors of `motor` report something else than the path."""
+    current, speed = motor.sensors(_states(motor, tape, path))
+    if (delay := motor.speed_delay()) is not None:
+        speed = _delayed(speed, delay, tape)
+    return jnp.stack([current - path.current, speed - path.speed], 1)
+
+
+@eqx.filter_jit
+def pushes(motor: Motor, tape: Tape) -> tuple[Outputs, Outputs]:
+    """What a volt, and a newton metre that opposes motion, over one sample do to current and speed."""
+    along, _ = _of_blocks(motor, tape)
+    ones = jnp.ones((tape.value.shape[1], 1, 1))
+    assert along.inputs is not None, "an effect would need a step of its own"
+    voltage = jnp.asarray(tape.drive.voltage)[tape.grid]
+    return ones * along.inputs[:, 0, 0] * voltage, ones * along.inputs[:, 1, 0]
+
+
+@eqx.filter_jit
+def respond(
+    motor: Motor,
+    tape: Tape,
+    path: Path,
+    kicks: Float[Array, "samples 2 blocks columns"],
+) -> Float[Array, "samples 2 blocks columns"]:
+    """What the kicks of every column grow into, in current and speed, along the linear `motor`.
+
+    Blocks run side by side from zero; what reaches the end of each then starts the next.
+    """
+    along, _ = _of_blocks(motor, tape)
+    whole = along.whole[:, :, 0]
+
+    def step(x, sample):
+        kick, held = sample
+        after = jnp.einsum("ijb,jbc->ibc", whole, x) + kick
+        # a rotor that sticks forgets
+        return after.at[1].multiply(1.0 - held[:, None]), x
+
+    stuck = path.held.astype(kicks.dtype)
+    zero = jnp.zeros(kicks.shape[1:])
+    end, driven = jax.lax.scan(step, zero, (kicks, stuck))
+    basis = jnp.broadcast_to(jnp.eye(2)[:, None, :], (2, kicks.shape[2], 2))
+    through, free = jax.lax.scan(step, basis, (jnp.zeros((*kicks.shape[:3], 2)), stuck))
+
+    def follow(start, block):
+        begins, passed, own = block
+        start = jnp.where(begins, 0.0, start)
+        return passed @ start + own, start
+
+    blocks = (jnp.asarray(tape.begins), through.transpose(1, 0, 2), end.transpose(1, 0, 2))
+    starts = jax.lax.scan(follow, jnp.zeros((2, kicks.shape[3])), blocks)[1]
+    return driven + jnp.einsum("sibj,bjc->sibc", free, starts)
+
+
+def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Drive]:
+    """The propagator and the drive of every block, over (samples, blocks)."""
+    along, drive = pick_grid(along_grids(motor, tape), tape, tape.grid)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[..., None, :], along), drive
+
+
+def _one_sample(motor: Motor, tape: Tape, path: Path) -> State:
+    along, drive = _of_blocks(motor, tape)
+    value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T
+    state = _states(motor, tape, path)
+    return held_step(motor, along, drive, state, value, load, steps_in_sample(motor, tape))
+
+
+def _states(motor: Motor, tape: Tape, path: Path) -> State:
+    """The motor's states on the path; those that its effects add follow from current and speed there."""
+    load = jnp.asarray(tape.load).T
+    start = motor.rest(path.current, path.speed, load, path.angle)
+    if not set(motor.states) - {"angle"}:
+        return start
+    along, drive = _of_blocks(motor, tape)
+    steps, value = steps_in_sample(motor, tape), jnp.asarray(tape.value).T
+    begins = jnp.zeros(load.shape, bool).at[0].set(tape.begins)
+
+    def advance(extra, sample):
+        begins, rest, current, speed, value, load, block = sample
+        extra = jax.tree.map(lambda new, old: jnp.where(begins, new, old), rest, extra)
+        here = jax.tree.map(lambda leaf: leaf[..., 0, block], along)
+        driven = jax.tree.map(lambda share: share[block], drive)
+        state = State(current, speed, extra)
+        return held_step(motor, here, driven, state, value, load, steps).extra, extra
+
+    block = jnp.broadcast_to(jnp.arange(load.shape[1]), load.shape)
+    samples = (begins, start.extra, path.current, path.speed, value, load, block)
+    in_time = jax.tree.map(lambda x: x.T.reshape(-1), samples)
+    nothing = jax.tree.map(lambda x: 0.0 * x[0], in_time[1])
+    extra = jax.lax.scan(advance, nothing, in_time)[1]
+    return start._replace(extra=jax.tree.map(lambda x: x.reshape(load.shape[::-1]).T, extra))
+
+
+def _delayed(speed: Signal, delay, tape: Tape) -> Signal:
+    """The speed as it was, by straight lines between samples."""
+    flat = speed.T.reshape(-1)
+    length, step = speed.shape[0], jnp.asarray(tape.sample_time)[tape.grid]
+    first = jnp.searchsorted(jnp.asarray(tape.run), tape.run) * length
+    here = jnp.arange(len(flat))
+    back = jnp.maximum(here - delay / jnp.repeat(step, length), jnp.repeat(first, length))
+    return jnp.interp(back, here, flat).reshape(speed.shape[::-1]).T
