@@ -19,7 +19,9 @@ before anything was tuned. Sample k of every suite is the same whatever else is 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -131,7 +133,7 @@ def drawn_noise(rng: Generator, kind: str) -> Noise:
     return Noise(current, speed, torque_Nm=torque, torque_correlation_s=memory)
 
 
-def noise_levels(plant: Plant, excitation: Excitation, noise: Noise) -> tuple[float, float]:
+def noise_levels(plant: Plant, noise: Noise) -> tuple[float, float]:
     """Standard deviation of current and speed noise, torque noise as the linear motor passes it."""
     shaken = np.zeros((1, 2))
     if noise.torque_Nm:
@@ -149,8 +151,9 @@ def noise_levels(plant: Plant, excitation: Excitation, noise: Noise) -> tuple[fl
 
 def _ideal(plant: Plant, excitations: Excitations) -> list[Outputs]:
     """Noise-free current and speed of every run but the hold-out, in fewer fine steps."""
-    runs = (e for name, e in excitations.items() if name != HOLDOUT)
-    return [simulate(plant, *e, least=5)[:, :2] for e in runs]
+    runs = [e for name, e in excitations.items() if name != HOLDOUT]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(lambda e: simulate(plant, *e, least=5)[:, :2], runs))
 
 
 @dataclass(frozen=True)
@@ -222,6 +225,16 @@ def drawn_plant(rng: Generator) -> Plant:
     return Plant(*(getattr(motor, name) for name in vb.SIX))
 
 
+def _typical(bench: Bench) -> Noise:
+    """The noise of all runs together, as root mean squares."""
+
+    def mean(name: str) -> float:
+        return math.sqrt(np.mean([getattr(n, name) ** 2 for n in bench.noises.values()]))
+
+    some = next(iter(bench.noises.values()))
+    return replace(some, current_A=mean("current_A"), speed_rad_s=mean("speed_rad_s"))
+
+
 def _spread(outputs: list[Outputs]) -> tuple[float, float]:
     current, speed = np.concatenate(outputs).std(0)
     return float(current), float(speed)
@@ -248,8 +261,7 @@ def build(suite: str, index: int, plan: Plan, rng: Generator) -> Case:
     """Draw the motor, set the amplitudes, run and measure."""
     plant, excitations = drawn_plant(rng), plan.drive(rng)
     bench = _bench(plan, rng, plant, excitations)
-    first = next(iter(excitations))
-    levels = noise_levels(plant, excitations[first], bench.noises[first])
+    levels = noise_levels(plant, _typical(bench))
     drawn: list[Parameters] = []
     complete, response = plant, None
     if plan.hidden:

@@ -114,7 +114,7 @@ def _compliance_draw(rng: Generator, plant: Plant) -> Parameters:
 
 def _backlash_draw(rng: Generator, plant: Plant) -> Parameters:
     """Teeth so stiff that it is the play that shows, not their spring."""
-    contact = _coupling_draw(rng, plant, (250.0, 400.0), (0.3, 0.8))
+    contact = _coupling_draw(rng, plant, (500.0, 900.0), (0.3, 0.8))
     return contact | {"gap_rad": log_uniform(rng, 0.01, 0.1)}
 
 
@@ -168,7 +168,9 @@ _ROWS = (
     Hidden(
         "", "shaft_compliance", _compliance_draw, _coupled, (), ("stiffness",), limits=(1e-2, 10.0)
     ),
-    Hidden("", "gear_backlash", _backlash_draw, _backlash_fields, ("gap_rad",)),
+    Hidden(
+        "", "gear_backlash", _backlash_draw, _backlash_fields, ("gap_rad",), limits=(0.05, 10.0)
+    ),
     Hidden(
         "",
         "brush_voltage_drop",

@@ -26,13 +26,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-compiled = njit(
-    cache=True,
-    error_model="numpy",
-    boundscheck=False,
-    fastmath={"contract", "arcp", "nsz"},
-    inline="never",
-)  # a division checked for zero is a slow one
+# without the GIL, so that runs can be simulated side by side; a checked division is a slow one
+compiled = njit(cache=True, nogil=True, error_model="numpy")
 Samples = NDArray[np.float64]
 
 
@@ -106,7 +101,7 @@ class Plant(NamedTuple):
 PACKED = np.dtype([(name, np.float64) for name in Plant._fields])
 
 # the states
-I, W, ANGLE, W_LOAD, TWIST, HEAT, SLOW_HEAT, BRISTLE, READ, SAG = range(10)
+CURRENT, SPEED, ANGLE, LOAD_SPEED, TWIST, HEAT, SLOW_HEAT, BRISTLE, READ, SAG = range(10)
 STATES = 10
 
 
@@ -161,7 +156,7 @@ def _ripple(angle, p):
 @compiled
 def _coupling(x, p):
     """Torque through a spring with play; teeth push and do not pull."""
-    slip = x[W] - x[W_LOAD]
+    slip = x[SPEED] - x[LOAD_SPEED]
     if p.gap_rad == 0.0:
         return p.stiffness * x[TWIST] + p.damping * slip
     beyond = abs(x[TWIST]) - 0.5 * p.gap_rad
@@ -185,7 +180,7 @@ def _load_torque(x, t, load, p):
 @compiled
 def _drive(x, t, load, disturbance, p):
     """All torque on the rotor but dry friction (N m)."""
-    i, w, angle = x[I], x[W], x[ANGLE]
+    i, w, angle = x[CURRENT], x[SPEED], x[ANGLE]
     torque = p.Kt * _saturated(p.kt_saturation, p.kt_curve, i) * _ripple(angle, p) * i
     torque -= p.f * w + disturbance
     if p.drag != 0.0:
@@ -206,7 +201,7 @@ def _drive(x, t, load, disturbance, p):
 @compiled
 def _electric(x, v, p):
     """Voltage left for the winding's own drops: supply less back-EMF (V)."""
-    emf = p.Kb * x[W]
+    emf = p.Kb * x[SPEED]
     if p.ripple_in_emf != 0.0:
         emf *= _ripple(x[ANGLE], p)
     return v - x[SAG] * v / p.bus_V - emf
@@ -215,15 +210,15 @@ def _electric(x, v, p):
 @compiled
 def _slope(x, t, v, load, disturbance, mode_i, mode_w, p, dx):
     """Time derivative of the state; a mode is the direction of a dry element, 0 held at zero."""
-    i, w = x[I], x[W]
+    i, w = x[CURRENT], x[SPEED]
     R = p.R * (1.0 + x[HEAT] + x[SLOW_HEAT])
-    dx[I] = 0.0
+    dx[CURRENT] = 0.0
     if mode_i != 0:
         brush = p.brush_V * (mode_i if p.brush_onset_A == 0.0 else math.tanh(i / p.brush_onset_A))
         L = p.L * _saturated(p.l_saturation, p.l_curve, i)
-        dx[I] = (_electric(x, v, p) - R * i - brush) / L
+        dx[CURRENT] = (_electric(x, v, p) - R * i - brush) / L
     dx[BRISTLE] = 0.0
-    dx[W] = 0.0
+    dx[SPEED] = 0.0
     if mode_w != 0:
         torque = _drive(x, t, load, disturbance, p)
         if p.presliding_rad != 0.0:
@@ -232,14 +227,14 @@ def _slope(x, t, v, load, disturbance, mode_i, mode_w, p, dx):
             torque -= level * x[BRISTLE] / p.presliding_rad + p.bristle_damping * dx[BRISTLE]
         elif _sticks(p):
             torque -= mode_w * _dry_level(w, mode_w, t, p)
-        dx[W] = torque / (p.J * (1.0 - p.load_share))
+        dx[SPEED] = torque / (p.J * (1.0 - p.load_share))
     dx[ANGLE] = w
-    dx[W_LOAD] = 0.0
+    dx[LOAD_SPEED] = 0.0
     dx[TWIST] = 0.0
     if p.stiffness != 0.0:
         push = _coupling(x, p) - _load_torque(x, t, load, p)
-        dx[W_LOAD] = push / (p.J * p.load_share)
-        dx[TWIST] = w - x[W_LOAD]
+        dx[LOAD_SPEED] = push / (p.J * p.load_share)
+        dx[TWIST] = w - x[LOAD_SPEED]
     heat = R * i * i
     dx[HEAT] = (p.heat_per_W * heat - x[HEAT]) / p.heat_s
     dx[SLOW_HEAT] = (p.slow_heat_per_W * heat - x[SLOW_HEAT]) / p.slow_heat_s
@@ -268,7 +263,7 @@ def _rk4(x, t, h, v, load, disturbance, mode_i, mode_w, p, work, out):
     for n in range(STATES):
         out[n] = x[n] + h / 6.0 * (a[n] + 2.0 * (b[n] + c[n]) + d[n])
     if p.lag_s == 0.0:
-        out[READ] = out[W]
+        out[READ] = out[SPEED]
 
 
 @compiled
@@ -276,7 +271,7 @@ def _brush_leaves(x, v, mode, p):
     """Has the current come through zero, or has the voltage overcome the brushes?"""
     if p.brush_V == 0.0 or p.brush_onset_A != 0.0:
         return False
-    return abs(_electric(x, v, p)) > p.brush_V if mode == 0 else x[I] * mode < 0.0
+    return abs(_electric(x, v, p)) > p.brush_V if mode == 0 else x[CURRENT] * mode < 0.0
 
 
 @compiled
@@ -285,7 +280,7 @@ def _rotor_leaves(x, t, load, disturbance, mode, p):
     if not _sticks(p):
         return False
     if mode != 0:
-        return x[W] * mode < 0.0
+        return x[SPEED] * mode < 0.0
     drive = _drive(x, t, load, disturbance, p)
     return abs(drive) > _dry_level(0.0, drive, t, p)
 
@@ -294,11 +289,11 @@ def _rotor_leaves(x, t, load, disturbance, mode, p):
 def _settle(x, t, v, load, disturbance, mode_i, mode_w, p):
     """Modes just after an event; what came through zero is put there."""
     if _brush_leaves(x, v, mode_i, p):
-        x[I] = 0.0
+        x[CURRENT] = 0.0
         push = _electric(x, v, p)
         mode_i = 0 if abs(push) <= p.brush_V else (1 if push > 0.0 else -1)
     if _rotor_leaves(x, t, load, disturbance, mode_w, p):
-        x[W] = 0.0
+        x[SPEED] = 0.0
         drive = _drive(x, t, load, disturbance, p)
         held = abs(drive) <= _dry_level(0.0, drive, t, p)
         mode_w = 0 if held else (1 if drive > 0.0 else -1)
@@ -359,14 +354,14 @@ def _run(time, voltage, load, disturbance, substeps, start, p):
     history = np.empty((samples - 1) * substeps + 1)
     x, work = start.copy(), np.empty((6, STATES))
     history[0] = x[READ]
-    mode_i = 1 if x[I] > 0.0 else (-1 if x[I] < 0.0 else 0)
-    mode_w = 1 if x[W] > 0.0 else (-1 if x[W] < 0.0 else 0)
+    mode_i = 1 if x[CURRENT] > 0.0 else (-1 if x[CURRENT] < 0.0 else 0)
+    mode_w = 1 if x[SPEED] > 0.0 else (-1 if x[SPEED] < 0.0 else 0)
     if p.brush_V == 0.0 or p.brush_onset_A != 0.0:
         mode_i = 1
     if not _sticks(p):
         mode_w = 1
     for k in range(samples):
-        read[k, 0], read[k, 1], read[k, 2] = x[I] + p.offset_A, x[READ], x[ANGLE]
+        read[k, 0], read[k, 1], read[k, 2] = x[CURRENT] + p.offset_A, x[READ], x[ANGLE]
         if k == samples - 1:
             break
         h = (time[k + 1] - time[k]) / substeps
@@ -409,8 +404,11 @@ def ornstein_uhlenbeck(white, decay, sd):
 
 
 def substeps(plant: Plant, interval: float, least: int = 20) -> int:
-    """Fine steps a sample: at least `least`, more for pulses, bristles and stiff windings."""
-    stiff = 20.0 * plant.R / plant.L
+    """Fine steps a sample: at least `least`, more for what is fast, and whole ones a pulse."""
+    stiff = 8.0 * plant.R / plant.L
+    if plant.stiffness:
+        reduced = plant.J * plant.load_share * (1.0 - plant.load_share)
+        stiff = max(stiff, 2.0 * math.sqrt(plant.stiffness / reduced))
     if plant.presliding_rad:
         stiff = max(stiff, 1.3 * plant.bus_V / plant.Kb / plant.presliding_rad)
     if plant.brush_onset_A:
@@ -442,7 +440,14 @@ def simulate(
         disturbance = np.zeros((1, 1))
         disturbance = np.broadcast_to(disturbance, (time.size, steps))
     start = np.zeros(STATES)
-    start[[I, W, ANGLE, W_LOAD, TWIST, READ]] = current, speed, angle, speed, twist, speed
+    start[[CURRENT, SPEED, ANGLE, LOAD_SPEED, TWIST, READ]] = (
+        current,
+        speed,
+        angle,
+        speed,
+        twist,
+        speed,
+    )
     packed = np.array([plant], dtype=PACKED)[0]
     columns = (np.ascontiguousarray(c, float) for c in (time, voltage, load))
     return _run(*columns, np.ascontiguousarray(disturbance), disturbance.shape[1], start, packed)
