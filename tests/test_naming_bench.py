@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from benchmarks import virtual_bench as vb
+from benchmarks.naming import sparse, stepwise
 from benchmarks.naming.cases import SUITES, SWEEP_PERCENT, VISIBLE, case, dump
 from benchmarks.naming.excitations import HOLDOUT, jittered
 from benchmarks.naming.hidden import FORMULAS, LIBRARY, STRANGERS
@@ -338,3 +339,65 @@ def test_intervals_and_gap():
     answer["gap"] = {"holdout": {"before": 3.0, "after": 1.0, "floor": 1.0}}
     assert gap_closed(json.loads(json.dumps(answer))) == 1.0
     assert gap_closed(said("named", "a")) is None
+
+
+# ----------------------------------------------------------------------------- baselines
+
+
+def recorded(plant, seed=0):
+    """Two short runs with white noise, columns by name."""
+    rng = np.random.default_rng(seed)
+    runs = {"steps": vb.staircase(duration=1.0), "loaded": vb.loaded(rng, duration=1.0)}
+    made = {}
+    for name, e in runs.items():
+        read = simulate(plant, *e)[:, :2] + rng.standard_normal((e.time.size, 2)) * [0.1, 0.5]
+        made[name] = {
+            "time_s": e.time,
+            "voltage_V": e.voltage,
+            "current_A": read[:, 0],
+            "speed_rad_s": read[:, 1],
+            "load_torque_Nm": e.load,
+        }
+    return made
+
+
+def test_stepwise_refits_motor_and_effect_in_simulation():
+    truth = PAPER._replace(
+        friction_forward_Nm=0.05, friction_backward_Nm=0.05, R=0.2, Kb=0.055, Kt=0.055, J=6e-4
+    )
+    bench = stepwise.Bench(recorded(truth))
+    np.testing.assert_allclose(bench.noise, [0.1, 0.5], rtol=0.3)
+    bare = stepwise.baseline(bench)
+    started = stepwise.replace(bare, effects={"coulomb_friction": {"torque_Nm": 0.01}})
+    found = stepwise.fit(bench, started)
+    assert found.bic < bare.bic - 100
+    key = ("coulomb_friction", "torque_Nm")
+    assert abs(found.effects[key[0]][key[1]] - 0.05) < 4 * 0.05 * found.stderr[key]
+    for name in ("R", "Kb", "Kt", "J"):
+        assert abs(found.base[name] / getattr(truth, name) - 1) < 4 * found.stderr["", name]
+    assert np.mean(found.residual**2) < 1.3
+
+
+def test_the_integrated_equations_hold():
+    """Weak-form terms of the true equations explain the change of current and speed."""
+    excitation = vb.loaded(np.random.default_rng(0), duration=1.0, dt=1e-4)
+    p = PAPER._replace(friction_forward_Nm=0.1, friction_backward_Nm=0.1, brush_V=0.5)
+    read = simulate(p, *excitation)
+    columns = dict(
+        zip(("time_s", "voltage_V", "load_torque_Nm"), excitation, strict=True),
+        current_A=read[:, 0],
+        speed_rad_s=read[:, 1],
+    )
+    e, m = sparse.terms(columns)
+
+    def left(difference, signal):
+        """The largest error where the element never sticks within the window."""
+        held = np.convolve(signal == 0, np.ones(sparse.WINDOW + 1), "valid") > 0
+        assert held.sum() < 200
+        return np.abs(difference[~held]).max()
+
+    volts = e["v"] - p.R * e["i"] - p.Kb * e["w"] - 0.5 * e["brush_voltage_drop"]
+    assert left(p.L * e["change"] - volts, read[:, 0]) < 3e-3 * np.abs(e["v"]).max()
+    torque = p.Kt * m["i"] - p.f * m["w"] - m["load"] - 0.1 * m["coulomb_friction"]
+    change = p.J * m["change"]
+    assert left(change - torque, read[:, 1]) < 3e-3 * np.abs(change).max()

@@ -7,6 +7,9 @@ from typing import Any
 
 from benchmarks.virtual_bench import Columns
 
+from .sparse import sparse
+from .stepwise import stepwise
+
 Answer = dict[str, Any]
 Runs = Mapping[str, Columns]
 
@@ -30,4 +33,8 @@ def _recordings(runs: Runs):
     ]
 
 
-METHODS: Mapping[str, Callable[[Runs, Runs], Answer]] = {"pmdc": ours}
+METHODS: Mapping[str, Callable[[Runs, Runs], Answer]] = {
+    "pmdc": ours,
+    "stepwise": stepwise,
+    "sparse": sparse,
+}
