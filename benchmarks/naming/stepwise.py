@@ -194,7 +194,7 @@ def _stepped(bench: Bench, model: Model, by: NDArray[np.float64]) -> Model:
     return replace(model, residual=bench.residual(model))
 
 
-def fit(bench: Bench, model: Model, steps: int = 12) -> Model:
+def fit(bench: Bench, model: Model, steps: int = 8) -> Model:
     """Levenberg-Marquardt; the model with its residual, BIC and standard errors."""
     model = replace(model, residual=bench.residual(model))
     damping, cost = 1e-3, float(model.residual @ model.residual)
