@@ -430,12 +430,14 @@ def simulate(
     current: float = 0.0,
     disturbance: NDArray[np.float64] | None = None,
     least: int = 20,
+    steps: int | None = None,
 ) -> NDArray[np.float64]:
     """What ideal sensors read: current (A), speed (rad/s), true angle (rad) per sample, (N, 3).
 
-    `disturbance` is a torque (N m) for every fine step, shape (N, substeps).
+    `disturbance` is a torque (N m) for every fine step, shape (N, substeps). `steps` are the fine
+    steps of a sample where accuracy matters less than time.
     """
-    steps = substeps(plant, float(np.median(np.diff(time))), least)
+    steps = steps or substeps(plant, float(np.median(np.diff(time))), least)
     if disturbance is None:
         disturbance = np.zeros((1, 1))
         disturbance = np.broadcast_to(disturbance, (time.size, steps))
