@@ -70,9 +70,9 @@ class AbstractEffect(eqx.Module):
     states: ClassVar[tuple[str, ...]] = ()
     # which state a dry element holds at zero
     holds: ClassVar[Literal["speed", "current"] | None] = None
-    # with it the motor is still a linear system with inputs, whose step is exact
+    # with it the motor is still a linear system with inputs, as long as no dry element changes direction
     affine: ClassVar[bool] = False
-    # the longest step in s that follows the effect well
+    # the longest step in s that follows the effect well, or finds the changes of direction
     longest_step: ClassVar[float] = 1e-3
 
     def terminal_voltage(self, voltage: Scalars) -> Scalars:

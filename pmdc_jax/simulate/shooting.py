@@ -194,7 +194,8 @@ def _join(
     guess = _guess(motor, own, tape, begins)
     # a linear motor is joined exactly by the correction of its one pass, and its derivatives by the next; any
     # other block is exact once the one before it is, so this ends however hard the motor
-    passes = len(guess) + 1 if not motor.affine else 1 + (columns > begins.shape[1])
+    exact = motor.affine and not motor.sticks
+    passes = 1 + (columns > begins.shape[1]) if exact else len(guess) + 1
 
     def unjoined(carry):
         *_, gap, passed = carry
@@ -203,8 +204,9 @@ def _join(
     def again(carry):
         _, starts, _, _, passed = carry
         run = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
-        joined = _stitch(run, tape, starts, begins)
-        size = jnp.max(jnp.abs(joined), axis=0) + 1e-6
+        # Newton far from the end of the road overshoots: no state moves by more than the largest it has been
+        size = jnp.max(jnp.abs(jnp.concatenate([starts, run.end])), axis=0) + 1e-6
+        joined = _stitch(run, tape, starts, begins, jnp.inf if exact else size)
         # what the last pass started from is kept: its derivatives belong to it
         return starts, joined, run, jnp.max(jnp.abs(joined - starts) / size), passed + 1
 
@@ -265,14 +267,14 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
     return Pass(seen, d_seen, _pack(end).T, jax.vmap(_pack)(d_end).swapaxes(1, 2))
 
 
-def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts) -> Starts:
-    """Newton's correction: each block starts where the corrected one before it ends."""
+def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts, most=jnp.inf) -> Starts:
+    """Newton's correction, by `most` at most: each block starts where the corrected one before it ends."""
     by_start = jnp.moveaxis(passed.d_end[-starts.shape[1] :], 0, -1)
 
     def follow(end, block):
         begin, first, passed_end, jacobian, start = block
         new = jnp.where(first, begin, end)
-        return passed_end + jacobian @ (new - start), new
+        return passed_end + jnp.clip(jacobian @ (new - start), -most, most), new
 
     blocks = (begins, jnp.asarray(tape.begins), passed.end, by_start, starts)
     return jax.lax.scan(follow, jnp.zeros_like(starts[0]), blocks)[1]
