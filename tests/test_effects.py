@@ -370,7 +370,8 @@ def _one_mode(case, t, end, x, v, load, inside, got):
     event.terminal, event.direction = True, 1 if sticks else -1
     solved = solve_ivp(rates, (t, end), x, events=event, dense_output=True, max_step=2e-3, **PRECISE)
     now = (inside >= t - 1e-12) & (inside < solved.t[-1] + 1e-12)
-    got[:, now] = solved.sol(np.maximum(inside[now], t))
+    if now.any():
+        got[:, now] = solved.sol(np.maximum(inside[now], t))
     x = solved.y[:, -1]
     if solved.status == 1 and not sticks:
         x[1] = 0.0

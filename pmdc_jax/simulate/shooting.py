@@ -37,6 +37,9 @@ from .tape import BLOCK, Tape
 # The last pass corrects to first order what is left, so the joint error is about the square of this.
 JOINED = 1e-4
 
+# By how much a change of a block's start may seem to grow along the block, relative to the size of the states.
+GROWTH = 1.0
+
 # Columns of the sensitivities for a run's own unknowns: initial current, initial speed, load offset, initial angle.
 LOCAL = 4
 
@@ -204,9 +207,8 @@ def _join(
     def again(carry):
         _, starts, _, _, passed = carry
         run = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
-        # Newton far from the end of the road overshoots: no state moves by more than the largest it has been
         size = jnp.max(jnp.abs(jnp.concatenate([starts, run.end])), axis=0) + 1e-6
-        joined = _stitch(run, tape, starts, begins, jnp.inf if exact else size)
+        joined = _stitch(run, tape, starts, begins, None if exact else size)
         # what the last pass started from is kept: its derivatives belong to it
         return starts, joined, run, jnp.max(jnp.abs(joined - starts) / size), passed + 1
 
@@ -267,14 +269,22 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
     return Pass(seen, d_seen, _pack(end).T, jax.vmap(_pack)(d_end).swapaxes(1, 2))
 
 
-def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts, most=jnp.inf) -> Starts:
-    """Newton's correction, by `most` at most: each block starts where the corrected one before it ends."""
+def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts, size=None) -> Starts:
+    """Newton's correction: each block starts where the corrected one before it ends.
+
+    With the `size` of the states a change of a block's start is not taken to grow much along the block: a motor
+    forgets how it began, and where it seems otherwise, Newton's straight line overshoots.
+    """
     by_start = jnp.moveaxis(passed.d_end[-starts.shape[1] :], 0, -1)
 
     def follow(end, block):
         begin, first, passed_end, jacobian, start = block
         new = jnp.where(first, begin, end)
-        return passed_end + jnp.clip(jacobian @ (new - start), -most, most), new
+        change = jacobian @ (new - start)
+        if size is not None:
+            most = GROWTH * size * jnp.max(jnp.abs(new - start) / size)
+            change = jnp.clip(change, -most, most)
+        return passed_end + change, new
 
     blocks = (begins, jnp.asarray(tape.begins), passed.end, by_start, starts)
     return jax.lax.scan(follow, jnp.zeros_like(starts[0]), blocks)[1]
