@@ -46,7 +46,9 @@ class Case(NamedTuple):
     # within a sample, which costs the current a share of what it changes by in one
     tolerance: float = 1e-4
     dissipates: bool = True  # takes energy whatever the motor does
-    shows: float = 0.02  # by how much at least the outputs change, root mean square over the largest
+    shows: float = (
+        0.02  # by how much at least the outputs change, root mean square over the largest
+    )
 
 
 def electrical(i, w, v, L=None, R=None):
@@ -88,7 +90,7 @@ def rippled(x, v, load, values):
 
 
 def two_inertias(x, v, load, values, torque):
-    i, w, load_speed, twist = x
+    i, w, load_speed, _ = x
     share = values["load_share"]
     return [
         electrical(i, w, v),
@@ -368,7 +370,9 @@ def _one_mode(case, t, end, x, v, load, inside, got):
 
     start, event = t, slips if sticks else stops
     event.terminal, event.direction = True, 1 if sticks else -1
-    solved = solve_ivp(rates, (t, end), x, events=event, dense_output=True, max_step=2e-3, **PRECISE)
+    solved = solve_ivp(
+        rates, (t, end), x, events=event, dense_output=True, max_step=2e-3, **PRECISE
+    )
     now = (inside >= t - 1e-12) & (inside < solved.t[-1] + 1e-12)
     if now.any():
         got[:, now] = solved.sol(np.maximum(inside[now], t))

@@ -39,19 +39,25 @@ class Stages(NamedTuple):
     last: Matrix  # h (4 phi_3 - phi_2)
 
 
+class Weights(NamedTuple):
+    """By what the rest of a motor with effects acts over one step."""
+
+    push: Matrix  # h phi_1(A h)
+    linear: Matrix  # A
+    step: Float[Array, "*batch"]  # s
+    stages: Stages | None = None  # where the rest changes within a step
+
+
 class Propagator(NamedTuple):
     """Everything about a motor and a step length that does not change from step to step.
 
     x(h) = whole x + inputs u is exact for the linear motor. With effects the step is one of the equal parts of
-    a sample, and whatever is not `linear` acts by `push`, or by `stages` where it changes within a step.
+    a sample, and the inputs are part of the rest, for which there are `weights`.
     """
 
     whole: Matrix  # exp(A h)
-    inputs: Matrix | None  # h phi_1(A h) B
-    push: Matrix | None = None  # h phi_1(A h)
-    linear: Matrix | None = None  # A
-    step: Float[Array, "*batch"] | None = None  # s
-    stages: Stages | None = None
+    inputs: Float[Array, "n 2 *batch"]  # h phi_1(A h) B
+    weights: Weights | None = None
 
 
 def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator:
@@ -63,9 +69,10 @@ def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator
     A, B = _linear_part(motor, drive)
     if motor.affine:
         _, (phi0, phi1) = phi_functions(A * step, 1)
+        inputs = step * product(phi1, B)
         if not motor.effects:
-            return Propagator(phi0, step * product(phi1, B))
-        return Propagator(phi0, None, step * phi1, A, step * jnp.ones_like(motor.R))
+            return Propagator(phi0, inputs)
+        return Propagator(phi0, inputs, Weights(step * phi1, A, step * jnp.ones_like(motor.R)))
     (half0, half1, *_), (phi0, phi1, phi2, phi3) = phi_functions(A * step, 3)
     push = step / 2 * half1
     stages = Stages(
@@ -76,11 +83,12 @@ def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator
         middle=step * (2 * phi2 - 4 * phi3),
         last=step * (4 * phi3 - phi2),
     )
-    return Propagator(phi0, None, step * phi1, A, step * jnp.ones_like(motor.R), stages)
+    weights = Weights(step * phi1, A, step * jnp.ones_like(motor.R), stages)
+    return Propagator(phi0, step * product(phi1, B), weights)
 
 
-def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "2 2 *batch"]]:
-    """A and B of the linear motor, A with the states of its linear effects."""
+def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 *batch"]]:
+    """A and B of the linear motor, with the states of its linear effects."""
     A, B = motor.state_space(drive)
     linear = tuple(e for effect in motor.effects if (e := effect.linear()) is not None)
     if not linear:
@@ -92,7 +100,8 @@ def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "2 2 
     for k in range(count):
         state = _state(core, tuple(one if j == k else zero for j in range(count)), {})
         columns.append(jnp.stack(_vector(core, core.derivative(state, zero, zero, drive))))
-    return jnp.stack(columns, 1), B
+    A = jnp.stack(columns, 1)
+    return A, jnp.concatenate([B, jnp.zeros_like(A[2:, :2])])
 
 
 def steps_in_sample(motor: Motor, tape: Tape) -> int:
@@ -119,34 +128,42 @@ def held_step(
     held state crosses zero is then mended by `_cross`, so that friction sticks at exactly zero without any
     smoothing.
     """
-    if along.push is None:
-        x = (state.current, state.speed)
-        return State(*_add(_times(along.whole, x), _times(along.inputs, (value, load))), state.extra)
+    whole, inputs, weights = along
+    if weights is None:
+        x = _times(whole, (state.current, state.speed))
+        current, speed = _add(x, _times(inputs, (value, load)))
+        return State(current, speed, state.extra)
     if steps == 1:
-        return _step(motor, along, drive, state, value, load)
+        return _step(motor, whole, weights, drive, state, value, load)
     return jax.lax.fori_loop(
-        0, steps, lambda _, now: _step(motor, along, drive, now, value, load), state
+        0, steps, lambda _, now: _step(motor, whole, weights, drive, now, value, load), state
     )
 
 
 def _step(
-    motor: Motor, along: Propagator, drive: Drive, state: State, value: Held, load: Held
+    motor: Motor,
+    whole: Matrix,
+    weights: Weights,
+    drive: Drive,
+    state: State,
+    value: Held,
+    load: Held,
 ) -> State:
-    h = along.step
+    all_push, linear, h, stages = weights
     moving = (jnp.sign(state.current), jnp.sign(state.speed))
     x, slow = _vector(motor, state), _slow(motor, state)
-    moved = _times(along.whole, x)
+    moved = _times(whole, x)
 
     def rates(x, slow):
         """What the linear part leaves over, and the rates of the states that are not in it."""
         rate = motor.derivative(_state(motor, x, slow), value, load, drive, moving)
-        return _add(_vector(motor, rate), _times(-along.linear, x)), _slow(motor, rate)
+        return _add(_vector(motor, rate), _times(-linear, x)), _slow(motor, rate)
 
     n0, s0 = rates(x, slow)
-    if along.stages is None:
-        moved, slow = _add(moved, _times(along.push, n0)), _shifted(slow, h, s0)
+    if stages is None:
+        moved, slow = _add(moved, _times(all_push, n0)), _shifted(slow, h, s0)
     else:
-        half, push, turn, first, middle, last = along.stages
+        half, push, turn, first, middle, last = stages
         halfway = _times(half, x)
         n1, s1 = rates(_add(halfway, _times(push, n0)), _shifted(slow, h / 2, s0))
         n2, s2 = rates(_add(halfway, _times(push, n1)), _shifted(slow, h / 2, s1))
@@ -158,7 +175,7 @@ def _step(
         now, still = motor.at(state), state._replace(current=0.0 * x[0], speed=0.0 * x[1])
         for row, holds, unit in ((1, "speed", 1 / now.J), (0, "current", drive.voltage / now.L)):
             grips = motor.grip(holds, state), motor.grip(holds, still)
-            moved = _cross(row, grips, x, moved, along.push[:, row] * unit)
+            moved = _cross(row, grips, x, moved, all_push[:, row] * unit)
     return _state(motor, moved, slow)
 
 
@@ -255,7 +272,9 @@ def along_grids(motor: Motor, tape: Tape) -> Propagator:
     steps = steps_in_sample(motor, tape)
     grids = [
         propagator(
-            motor, tape.sample_time[g] / steps, Drive(*(jnp.asarray(share)[g] for share in tape.drive))
+            motor,
+            tape.sample_time[g] / steps,
+            Drive(*(jnp.asarray(share)[g] for share in tape.drive)),
         )
         for g in range(tape.sample_time.shape[0])
     ]
