@@ -19,7 +19,7 @@ from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recording import Recording
-from pmdc_jax.simulate import Tape, free_run, sensitivities
+from pmdc_jax.simulate import Tape, free_run, sensitivities, squared_errors
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 STARTS = ((5.0, 60.0), (-3.0, -8.0), (0.0, 0.0))  # current A, speed rad/s of each run
@@ -473,6 +473,17 @@ def test_sensitivities_are_central_differences(x64, name):
             continue
         error = np.linalg.norm(jacobian[..., column] - expected) / np.linalg.norm(expected)
         assert error < 1e-4, (column, parameters.names[column : column + 1], error)
+
+
+@every_effect
+def test_the_search_sees_what_the_free_run_sees(x64, name):
+    """Sums of squared errors of a population are those of its members; the search rounds delays to samples."""
+    motor = with_effect(name, CASES[name].values | ({"delay_s": 3e-3} if "delay" in name else {}))
+    tape = Tape.from_recordings(RUNS)
+    seen = free_run(motor, tape, tape.initial, jnp.zeros(3))
+    expected = (((seen - tape.measured) ** 2) * tape.weight).sum((0, 2))
+    found = squared_errors(jax.tree.map(lambda x: np.full(2, x), motor), tape)
+    np.testing.assert_allclose(np.array(found)[:, 1], expected, rtol=1e-6)
 
 
 @every_effect

@@ -117,8 +117,8 @@ def held_step(
     along: Propagator,
     drive: Drive,
     state: State,
-    value: Held,
-    load: Held,
+    value: Scalars,
+    load: Scalars,
     steps: int = 1,
 ) -> State:
     """The state one held sample later, in `steps` equal steps, for one of which `along` is made.
@@ -146,8 +146,8 @@ def _step(
     weights: Weights,
     drive: Drive,
     state: State,
-    value: Held,
-    load: Held,
+    value: Scalars,
+    load: Scalars,
 ) -> State:
     all_push, linear, h, stages = weights
     moving = (jnp.sign(state.current), jnp.sign(state.speed))
