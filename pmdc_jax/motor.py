@@ -90,8 +90,13 @@ class Motor(eqx.Module):
 
     @property
     def affine(self) -> bool:
-        """Whether this is a linear system with inputs, effects and all."""
+        """Whether this is a linear system with inputs, as long as no dry element changes direction."""
         return all(effect.affine for effect in self.effects)
+
+    @property
+    def sticks(self) -> bool:
+        """Whether there are dry elements."""
+        return any(effect.holds for effect in self.effects)
 
     def rest(
         self,

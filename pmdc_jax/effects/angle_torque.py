@@ -34,7 +34,6 @@ class CoggingTorque(AbstractEffect):
     formula: ClassVar = "T = a sin(n angle + phase)"
     equation: ClassVar = "mechanical"
     states: ClassVar = ("angle",)
-    longest_step: ClassVar = 5e-4
     ranges: ClassVar = {
         "amplitude_Nm": ParameterRange("N m", 1e-7, 1e3),
         "phase_rad": PHASE,
@@ -51,6 +50,9 @@ class CoggingTorque(AbstractEffect):
     def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del speed, load
         return {"angle": angle}
+
+    def recurrence(self) -> dict[str, Scalars]:
+        return {"angle": 2 * jnp.pi * (1 / self.periods)}
 
     def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
         del motor, load
@@ -74,7 +76,6 @@ class TorqueRipple(AbstractEffect):
     formula: ClassVar = "T_m = Kt i (1 + a sin(n angle + phase))"
     equation: ClassVar = "mechanical"
     states: ClassVar = ("angle",)
-    longest_step: ClassVar = 5e-4
     ranges: ClassVar = {
         "amplitude": ParameterRange("", 1e-5, 1.0),
         "phase_rad": PHASE,
@@ -92,6 +93,9 @@ class TorqueRipple(AbstractEffect):
     def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del speed, load
         return {"angle": angle}
+
+    def recurrence(self) -> dict[str, Scalars]:
+        return {"angle": 2 * jnp.pi * (1 / self.periods)}
 
     def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
         del motor, load

@@ -9,6 +9,7 @@ each of which does nothing unless the effect overrides it:
 - `load_at_rotor`: what of the load torque acts on the rotor itself
 - `grip`: a dry, set-valued term that can hold a state at exactly zero (stiction, brush contact)
 - `states`, `rest` and `derivative`: states of its own, how they begin and how they move
+- `recurrence`: after how much of a state everything is as before
 - `linear`: the linear effect that it is, or nearly is, whose states then join the exact step
 - `sensors` and `speed_delay`: how current and speed are seen
 
@@ -70,9 +71,9 @@ class AbstractEffect(eqx.Module):
     states: ClassVar[tuple[str, ...]] = ()
     # which state a dry element holds at zero
     holds: ClassVar[Literal["speed", "current"] | None] = None
-    # with it the motor is still a linear system with inputs, whose step is exact
+    # with it the motor is still a linear system with inputs, as long as no dry element changes direction
     affine: ClassVar[bool] = False
-    # the longest step in s that follows the effect well
+    # the longest step in s that follows the effect well, or finds the changes of direction
     longest_step: ClassVar[float] = 1e-3
 
     def terminal_voltage(self, voltage: Scalars) -> Scalars:
@@ -110,6 +111,10 @@ class AbstractEffect(eqx.Module):
     def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
         """Rates of the effect's own states, per second; `motor` with its parameters at this state."""
         del motor, state, load
+        return {}
+
+    def recurrence(self) -> dict[str, Scalars]:
+        """By how much a state of its own can differ and all else goes on alike."""
         return {}
 
     def linear(self) -> AbstractEffect | None:

@@ -21,6 +21,7 @@ class BrushVoltageDrop(AbstractEffect):
     formula: ClassVar = "v_b = V_b sign(i)"
     equation: ClassVar = "electrical"
     holds: ClassVar = "current"
+    affine: ClassVar = True
     ranges: ClassVar = {"voltage_V": ParameterRange("V", 1e-5, 10.0)}
 
     voltage_V: Scalars

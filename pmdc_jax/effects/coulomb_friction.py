@@ -21,6 +21,7 @@ class CoulombFriction(AbstractEffect):
     formula: ClassVar = "T_f = T_c sign(w)"
     equation: ClassVar = "mechanical"
     holds: ClassVar = "speed"
+    affine: ClassVar = True
     ranges: ClassVar = {"torque_Nm": ParameterRange("N m", 1e-7, 1e4)}
 
     torque_Nm: Scalars
@@ -48,6 +49,7 @@ class AsymmetricFriction(AbstractEffect):
     formula: ClassVar = "T_f = T_+ for w > 0, -T_- for w < 0"
     equation: ClassVar = "mechanical"
     holds: ClassVar = "speed"
+    affine: ClassVar = True
     ranges: ClassVar = {
         "forward_Nm": ParameterRange("N m", 1e-7, 1e4),
         "backward_Nm": ParameterRange("N m", 1e-7, 1e4),

@@ -17,34 +17,17 @@ if TYPE_CHECKING:
 CONTACT = 1e-3
 
 
-class _Shaft(AbstractEffect):
-    """Two inertias, (1 - s) J at the motor and s J at the load, with a shaft between them."""
-
-    load_share: eqx.AbstractVar[Scalars]
-
-    def shaft_torque(self, state: State) -> Scalars:
-        """What the shaft takes from the rotor, N m."""
-        raise NotImplementedError
-
-    def parameters(self, motor: Motor, state: State) -> Motor:
-        del state
-        return eqx.tree_at(lambda m: m.J, motor, motor.J * (1 - self.load_share))
-
-    def torque(self, state: State) -> Scalars:
-        return self.shaft_torque(state)
-
-    def load_at_rotor(self, load: Scalars) -> Scalars:
-        return 0.0 * load
-
-    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
-        inertia = motor.J * self.load_share / (1 - self.load_share)
-        return {
-            "load_speed": (self.shaft_torque(state) - load) * (1 / inertia),
-            "twist": state.speed - state.extra["load_speed"],
-        }
+def _rotor(motor: Motor, share: Scalars) -> Motor:
+    """The motor with the inertia that is left on its own side of the shaft."""
+    return eqx.tree_at(lambda m: m.J, motor, motor.J * (1 - share))
 
 
-class ShaftCompliance(_Shaft):
+def _load_acceleration(rotor: Motor, share: Scalars, torque: Scalars) -> Scalars:
+    """rad/s^2 of the inertia behind the shaft under a torque."""
+    return torque * (1 / rotor.J) * (1 / share - 1)
+
+
+class ShaftCompliance(AbstractEffect):
     """Compliant shaft: the load torque acts on an inertia s J behind a spring and damper.
 
     (1 - s) J dw/dt = Kt i - f w - T_s,  s J dw_L/dt = T_s - T_load,
@@ -79,6 +62,23 @@ class ShaftCompliance(_Shaft):
         slip = state.speed - state.extra["load_speed"]
         return self.stiffness_Nm_rad * state.extra["twist"] + self.damping_Nms_rad * slip
 
+    def parameters(self, motor: Motor, state: State) -> Motor:
+        del state
+        return _rotor(motor, self.load_share)
+
+    def torque(self, state: State) -> Scalars:
+        return self.shaft_torque(state)
+
+    def load_at_rotor(self, load: Scalars) -> Scalars:
+        return 0.0 * load
+
+    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
+        net = self.shaft_torque(state) - load
+        return {
+            "load_speed": _load_acceleration(motor, self.load_share, net),
+            "twist": state.speed - state.extra["load_speed"],
+        }
+
     def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del angle
         return {"load_speed": speed, "twist": load * (1 / self.stiffness_Nm_rad)}
@@ -87,7 +87,7 @@ class ShaftCompliance(_Shaft):
         return self
 
 
-class GearBacklash(_Shaft):
+class GearBacklash(AbstractEffect):
     """Backlash: a compliant shaft, or gear, that carries torque only once its play is taken up.
 
     As `shaft_compliance`, with T_s = stiffness (bite + 1 ms d bite/dt), where bite = twist - clip(twist, -gap/2,
@@ -105,7 +105,7 @@ class GearBacklash(_Shaft):
     label: ClassVar = "Gear backlash"
     formula: ClassVar = "T_s = k (bite + t_c dbite/dt), bite = twist - clip(twist, -gap/2, gap/2)"
     equation: ClassVar = "mechanical"
-    states: ClassVar = ("load_speed", "twist")
+    states: ClassVar = ("gear_speed", "gear_twist")
     longest_step: ClassVar = 2.5e-4
     ranges: ClassVar = {
         "gap_rad": ParameterRange("rad", 1e-6, 1.0),
@@ -118,16 +118,33 @@ class GearBacklash(_Shaft):
     load_share: Scalars
 
     def shaft_torque(self, state: State) -> Scalars:
-        twist, slip = state.extra["twist"], state.speed - state.extra["load_speed"]
-        outside = jnp.abs(twist) > self.gap_rad / 2
+        twist, slip = state.extra["gear_twist"], state.speed - state.extra["gear_speed"]
+        outside = jnp.abs(twist) >= self.gap_rad / 2
         bite = jnp.where(outside, twist - jnp.sign(twist) * self.gap_rad / 2, 0.0)
         return self.stiffness_Nm_rad * (bite + jnp.where(outside, CONTACT * slip, 0.0))
+
+    def parameters(self, motor: Motor, state: State) -> Motor:
+        del state
+        return _rotor(motor, self.load_share)
+
+    def torque(self, state: State) -> Scalars:
+        return self.shaft_torque(state)
+
+    def load_at_rotor(self, load: Scalars) -> Scalars:
+        return 0.0 * load
+
+    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
+        net = self.shaft_torque(state) - load
+        return {
+            "gear_speed": _load_acceleration(motor, self.load_share, net),
+            "gear_twist": state.speed - state.extra["gear_speed"],
+        }
 
     def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del angle
         twist = load * (1 / self.stiffness_Nm_rad) + jnp.sign(load) * self.gap_rad / 2
-        return {"load_speed": speed, "twist": twist}
+        return {"gear_speed": speed, "gear_twist": twist}
 
     def linear(self) -> AbstractEffect:
-        k = self.stiffness_Nm_rad
-        return ShaftCompliance(k, CONTACT * k, self.load_share)
+        """Without gap."""
+        return eqx.tree_at(lambda e: e.gap_rad, self, 0.0 * self.gap_rad)

@@ -24,7 +24,6 @@ class StribeckFriction(AbstractEffect):
     formula: ClassVar = "T_f = (T_c + (T_s - T_c) exp(-(w / w_s)^2)) sign(w)"
     equation: ClassVar = "mechanical"
     holds: ClassVar = "speed"
-    longest_step: ClassVar = 5e-4
     ranges: ClassVar = {
         "coulomb_Nm": ParameterRange("N m", 1e-7, 1e4),
         "static_Nm": ParameterRange("N m", 1e-7, 1e4),

@@ -21,7 +21,9 @@ class Unknowns(NamedTuple):
     """What a refinement moves: search coordinates, and what each run does not tell."""
 
     coordinates: Float[Array, " parameters"]
-    local: Float[Array, "runs 4"]  # initial current A and speed rad/s, load offset N m, initial angle rad
+    local: Float[
+        Array, "runs 4"
+    ]  # initial current A and speed rad/s, load offset N m, initial angle rad
 
 
 class Refined(NamedTuple):

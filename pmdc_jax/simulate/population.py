@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ..motor import Motor
 from .solver import HeldInput, Walk, along_grids, held_step, pick_grid, steps_in_sample, walk
-from .tape import Tape
+from .tape import BLOCK, Tape
 
 # Samples of linear motors whose arithmetic XLA fuses into one kernel, measured: small populations gain from fewer
 # kernels, large ones lose by recomputation, and so does every population with effects.
@@ -57,12 +57,22 @@ def _squared_errors(motors: Motor, tape: Tape):
     if motors.effects:
         unroll = 1
 
+    delay = motors.speed_delay()
+    speeds, weights = (jnp.asarray(x)[:, 1].reshape(-1) for x in (tape.measured, tape.weight))
+    ends = BLOCK * jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs), side="right")
+
     def advance(carry, block):
         along, drive = pick_grid(grids, tape, tape.grid[block])
 
         def sample(carry, samples):
             state, errors = carry
-            value, load, measured, weight = samples
+            value, load, measured, weight, k = samples
+            if delay is not None:  # what is seen later is compared with what was measured later
+                late = k + jnp.round(delay / tape.sample_time[tape.grid[block]]).astype(int)
+                inside = late < ends[tape.run[block]]
+                late = jnp.minimum(late, len(speeds) - 1)
+                measured = (measured[0], speeds[late])
+                weight = (weight[0], jnp.where(inside, weights[late], 0.0))
             seen = motors.sensors(state)
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
@@ -71,7 +81,8 @@ def _squared_errors(motors: Motor, tape: Tape):
             return (after, errors), None
 
         run = tape.run[block]
-        initial = motors.rest(*tape.initial[run], tape.load[block, 0], tape.angle[run])
+        current, speed = tape.initial[run]
+        initial = motors.rest(current, speed, tape.load[block, 0], tape.angle[run])
         begins = tape.begins[block]
         state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
         samples = (
@@ -79,6 +90,7 @@ def _squared_errors(motors: Motor, tape: Tape):
             tape.load[block],
             tape.measured[block].T,
             tape.weight[block].T,
+            block * BLOCK + jnp.arange(BLOCK),
         )
         (state, errors), _ = jax.lax.scan(sample, (state, carry.seen), samples, unroll=unroll)
         return Walk(state, errors)

@@ -194,7 +194,8 @@ def _join(
     guess = _guess(motor, own, tape, begins)
     # a linear motor is joined exactly by the correction of its one pass, and its derivatives by the next; any
     # other block is exact once the one before it is, so this ends however hard the motor
-    passes = len(guess) + 1 if not motor.affine else 1 + (columns > begins.shape[1])
+    exact = motor.affine and not motor.sticks
+    passes = 1 + (columns > begins.shape[1]) if exact else len(guess) + 1
 
     def unjoined(carry):
         *_, gap, passed = carry
@@ -203,8 +204,8 @@ def _join(
     def again(carry):
         _, starts, _, _, passed = carry
         run = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
-        joined = _stitch(run, tape, starts, begins)
-        size = jnp.max(jnp.abs(joined), axis=0) + 1e-6
+        size = jnp.max(jnp.abs(jnp.concatenate([starts, run.end])), axis=0) + 1e-6
+        joined = _stitch(run, tape, starts, begins, None if exact else (size, _recurrence(motor)))
         # what the last pass started from is kept: its derivatives belong to it
         return starts, joined, run, jnp.max(jnp.abs(joined - starts) / size), passed + 1
 
@@ -265,17 +266,37 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
     return Pass(seen, d_seen, _pack(end).T, jax.vmap(_pack)(d_end).swapaxes(1, 2))
 
 
-def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts) -> Starts:
-    """Newton's correction: each block starts where the corrected one before it ends."""
+def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts, limits=None) -> Starts:
+    """Newton's correction: each block starts where the corrected one before it ends.
+
+    Far from the end of the road Newton's straight line overshoots. So with `limits`, the size of the states and
+    after how much of them all is as before: whole periods of a state are carried on as they are, and no
+    other change of a start is taken to grow along the block, for a motor forgets how it began.
+    """
     by_start = jnp.moveaxis(passed.d_end[-starts.shape[1] :], 0, -1)
 
     def follow(end, block):
         begin, first, passed_end, jacobian, start = block
         new = jnp.where(first, begin, end)
-        return passed_end + jacobian @ (new - start), new
+        change = new - start
+        if limits is None:
+            return passed_end + jacobian @ change, new
+        size, period = limits
+        whole = jnp.where(period > 0, jnp.round(change / jnp.where(period > 0, period, 1.0)), 0.0)
+        part = change - whole * period
+        most = size * jnp.max(jnp.abs(part) / size)
+        return passed_end + whole * period + jnp.clip(jacobian @ part, -most, most), new
 
     blocks = (begins, jnp.asarray(tape.begins), passed.end, by_start, starts)
     return jax.lax.scan(follow, jnp.zeros_like(starts[0]), blocks)[1]
+
+
+def _recurrence(motor: Motor) -> Float[Array, " states"]:
+    """After how much of each state all is as before; zero for never."""
+    known = {name: p for effect in motor.effects for name, p in effect.recurrence().items()}
+    return jnp.stack(
+        [jnp.zeros(()), jnp.zeros(()), *(known.get(n, jnp.zeros(())) for n in motor.states)]
+    )
 
 
 def _stitch_tangents(
@@ -330,7 +351,9 @@ def _reported(motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs sampl
     x = position - left
     rise = jnp.where(here > first, speed[jnp.minimum(left + 1, here)] - speed[left], 0.0)
     start, end = slope[left] * step, slope_after[left] * step
-    late = speed[left] + x * (start + x * (3 * rise - 2 * start - end + x * (start + end - 2 * rise)))
+    late = speed[left] + x * (
+        start + x * (3 * rise - 2 * start - end + x * (start + end - 2 * rise))
+    )
     return jnp.stack([seen[:, 0], late.reshape(seen[:, 0].shape)], 1)
 
 

@@ -29,39 +29,66 @@ FINEST = 32
 
 
 class Stages(NamedTuple):
-    """What the exponential midpoint rule needs for whatever is not the linear motor."""
+    """Weights of ETDRK4 for whatever is not linear."""
 
     half: Matrix  # exp(A h / 2)
-    half_push: Matrix  # h / 2 phi_1(A h / 2)
+    push: Matrix  # h / 2 phi_1(A h / 2)
+    turn: Matrix  # (exp(A h / 2) - 1) push
+    first: Matrix  # h (phi_1 - 3 phi_2 + 4 phi_3)
+    middle: Matrix  # h (2 phi_2 - 4 phi_3)
+    last: Matrix  # h (4 phi_3 - phi_2)
+
+
+class Weights(NamedTuple):
+    """By what the rest of a motor with effects acts over one step."""
+
     push: Matrix  # h phi_1(A h)
     linear: Matrix  # A
     step: Float[Array, "*batch"]  # s
+    stages: Stages | None = None  # where the rest changes within a step
 
 
 class Propagator(NamedTuple):
     """Everything about a motor and a step length that does not change from step to step.
 
-    x(h) = whole x + inputs u is exact for the linear motor; with effects there are `stages` in place of
-    `inputs`, and the step is one of the equal parts of a sample.
+    x(h) = whole x + inputs u is exact for the linear motor. With effects the step is one of the equal parts of
+    a sample, and the inputs are part of the rest, for which there are `weights`.
     """
 
     whole: Matrix  # exp(A h)
-    inputs: Matrix | None  # h phi_1(A h) B
-    stages: Stages | None = None
+    inputs: Float[Array, "n 2 *batch"]  # h phi_1(A h) B
+    weights: Weights | None = None
 
 
 def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator:
-    """Exact step of the linear part over `step` seconds, and what else the effects need."""
+    """Exact step of the linear part over `step` seconds, and the weights for what the effects add.
+
+    **Source**: ETDRK4, Cox, Matthews, Journal of Computational Physics 176 (2002), equations (26)-(29),
+    doi:10.1006/jcph.2002.6995.
+    """
     A, B = _linear_part(motor, drive)
-    (half0, half1), (phi0, phi1) = phi_functions(A * step, 1)
-    if not motor.effects:
-        return Propagator(phi0, step * product(phi1, B))
-    stages = Stages(half0, step / 2 * half1, step * phi1, A, step * jnp.ones_like(motor.R))
-    return Propagator(phi0, None, stages)
+    if motor.affine:
+        _, (phi0, phi1) = phi_functions(A * step, 1)
+        inputs = step * product(phi1, B)
+        if not motor.effects:
+            return Propagator(phi0, inputs)
+        return Propagator(phi0, inputs, Weights(step * phi1, A, step * jnp.ones_like(motor.R)))
+    (half0, half1, *_), (phi0, phi1, phi2, phi3) = phi_functions(A * step, 3)
+    push = step / 2 * half1
+    stages = Stages(
+        half=half0,
+        push=push,
+        turn=product(half0, push) - push,
+        first=step * (phi1 - 3 * phi2 + 4 * phi3),
+        middle=step * (2 * phi2 - 4 * phi3),
+        last=step * (4 * phi3 - phi2),
+    )
+    weights = Weights(step * phi1, A, step * jnp.ones_like(motor.R), stages)
+    return Propagator(phi0, step * product(phi1, B), weights)
 
 
-def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "2 2 *batch"]]:
-    """A and B of the linear motor, A with the states of its linear effects."""
+def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 *batch"]]:
+    """A and B of the linear motor, with the states of its linear effects."""
     A, B = motor.state_space(drive)
     linear = tuple(e for effect in motor.effects if (e := effect.linear()) is not None)
     if not linear:
@@ -73,15 +100,16 @@ def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "2 2 
     for k in range(count):
         state = _state(core, tuple(one if j == k else zero for j in range(count)), {})
         columns.append(jnp.stack(_vector(core, core.derivative(state, zero, zero, drive))))
-    return jnp.stack(columns, 1), B
+    A = jnp.stack(columns, 1)
+    return A, jnp.concatenate([B, jnp.zeros_like(A[2:, :2])])
 
 
 def steps_in_sample(motor: Motor, tape: Tape) -> int:
     """Into how many equal steps a sample is divided, so that none is longer than the effects allow."""
-    if motor.affine:
+    allowed = [e.longest_step for e in motor.effects if e.holds or not e.affine]
+    if not allowed:
         return 1
-    longest = min(effect.longest_step for effect in motor.effects if not effect.affine)
-    return min(max(round(tape.longest / longest), 1), FINEST)
+    return min(max(round(tape.longest / min(allowed)), 1), FINEST)
 
 
 def held_step(
@@ -89,51 +117,66 @@ def held_step(
     along: Propagator,
     drive: Drive,
     state: State,
-    value: Held,
-    load: Held,
+    value: Scalars,
+    load: Scalars,
     steps: int = 1,
 ) -> State:
     """The state one held sample later, in `steps` equal steps, for one of which `along` is made.
 
-    Motors whose effects leave them linear: exact. Otherwise by the exponential midpoint rule, the linear part
-    exact and the rest by two stages, in which dry elements act in the direction the step began with; a
-    step in which a held state crosses zero is then mended by `_cross`, so that friction sticks at exactly
-    zero without any smoothing.
-
-    **Source**: Hochbruck, Ostermann, "Exponential integrators", Acta Numerica 19 (2010), equation (2.41).
+    Motors whose effects leave them linear: exact. Otherwise the linear part is exact and the rest goes by the
+    four stages of ETDRK4, in which dry elements act in the direction the step began with; a step in which a
+    held state crosses zero is then mended by `_cross`, so that friction sticks at exactly zero without any
+    smoothing.
     """
-    if along.stages is None:
-        x = (state.current, state.speed)
-        return State(*_add(_times(along.whole, x), _times(along.inputs, (value, load))), state.extra)
+    whole, inputs, weights = along
+    if weights is None:
+        x = _times(whole, (state.current, state.speed))
+        current, speed = _add(x, _times(inputs, (value, load)))
+        return State(current, speed, state.extra)
     if steps == 1:
-        return _step(motor, along, drive, state, value, load)
+        return _step(motor, whole, weights, drive, state, value, load)
     return jax.lax.fori_loop(
-        0, steps, lambda _, now: _step(motor, along, drive, now, value, load), state
+        0, steps, lambda _, now: _step(motor, whole, weights, drive, now, value, load), state
     )
 
 
 def _step(
-    motor: Motor, along: Propagator, drive: Drive, state: State, value: Held, load: Held
+    motor: Motor,
+    whole: Matrix,
+    weights: Weights,
+    drive: Drive,
+    state: State,
+    value: Scalars,
+    load: Scalars,
 ) -> State:
-    half, half_push, push, linear, h = along.stages
+    all_push, linear, h, stages = weights
     moving = (jnp.sign(state.current), jnp.sign(state.speed))
     x, slow = _vector(motor, state), _slow(motor, state)
+    moved = _times(whole, x)
 
     def rates(x, slow):
         """What the linear part leaves over, and the rates of the states that are not in it."""
         rate = motor.derivative(_state(motor, x, slow), value, load, drive, moving)
         return _add(_vector(motor, rate), _times(-linear, x)), _slow(motor, rate)
 
-    rest, slow_rate = rates(x, slow)
-    if not motor.affine:
-        middle = _add(_times(half, x), _times(half_push, rest))
-        rest, slow_rate = rates(middle, _shifted(slow, h / 2, slow_rate))
-    moved = _add(_times(along.whole, x), _times(push, rest))
-    now, still = motor.at(state), state._replace(current=0.0 * x[0], speed=0.0 * x[1])
-    for row, holds, unit in ((1, "speed", 1 / now.J), (0, "current", drive.voltage / now.L)):
-        grips = motor.grip(holds, state), motor.grip(holds, still)
-        moved = _cross(row, grips, x, moved, push[:, row] * unit)
-    return _state(motor, moved, _shifted(slow, h, slow_rate))
+    n0, s0 = rates(x, slow)
+    if stages is None:
+        moved, slow = _add(moved, _times(all_push, n0)), _shifted(slow, h, s0)
+    else:
+        half, push, turn, first, middle, last = stages
+        halfway = _times(half, x)
+        n1, s1 = rates(_add(halfway, _times(push, n0)), _shifted(slow, h / 2, s0))
+        n2, s2 = rates(_add(halfway, _times(push, n1)), _shifted(slow, h / 2, s1))
+        end = _add(moved, _times(2 * push, n2), _times(turn, n0))
+        n3, s3 = rates(end, _shifted(slow, h, s2))
+        moved = _add(moved, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
+        slow = _shifted(slow, h / 6, {k: s0[k] + 2 * (s1[k] + s2[k]) + s3[k] for k in slow})
+    if motor.sticks:
+        now, still = motor.at(state), state._replace(current=0.0 * x[0], speed=0.0 * x[1])
+        for row, holds, unit in ((1, "speed", 1 / now.J), (0, "current", drive.voltage / now.L)):
+            grips = motor.grip(holds, state), motor.grip(holds, still)
+            moved = _cross(row, grips, x, moved, all_push[:, row] * unit)
+    return _state(motor, moved, slow)
 
 
 def _cross(
@@ -193,7 +236,7 @@ class HeldInput(diffrax.AbstractSolver):
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
     def order(self, terms):
-        return 2
+        return 4
 
     def init(self, terms, t0, t1, y0, args):
         return None
@@ -229,7 +272,9 @@ def along_grids(motor: Motor, tape: Tape) -> Propagator:
     steps = steps_in_sample(motor, tape)
     grids = [
         propagator(
-            motor, tape.sample_time[g] / steps, Drive(*(jnp.asarray(share)[g] for share in tape.drive))
+            motor,
+            tape.sample_time[g] / steps,
+            Drive(*(jnp.asarray(share)[g] for share in tape.drive)),
         )
         for g in range(tape.sample_time.shape[0])
     ]

@@ -134,7 +134,7 @@ class _Run:
 
 
 def _first(samples: np.ndarray | None) -> float:
-    known = samples[~np.isnan(samples)] if samples is not None else ()
+    known = samples[~np.isnan(samples)] if samples is not None else np.empty(0)
     return float(known[0]) if len(known) else 0.0
 
 
