@@ -155,7 +155,7 @@ PERIODS = (*range(1, 17), 18, 20, 21, 22, 24, 26, 28, 30, 32, 36, 40, 42, 48)
 
 # How often a compliant shaft rings in Hz, and how wide a play is in rad
 RINGING = (6.0, 12.0, 25.0, 50.0, 100.0)
-PLAY = (0.003, 0.01, 0.03, 0.1)
+PLAY = (0.01, 0.05)
 SHARE = 0.5
 
 

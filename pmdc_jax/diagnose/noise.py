@@ -96,7 +96,7 @@ def _lagged(series: Series, order: int) -> Float[np.ndarray, "rows lags"]:
 
 
 # Samples that are filtered by one product of matrices.
-CHUNK = 128
+CHUNK = 32
 
 
 def _filtered(series: Series, filters: Float[np.ndarray, "order outputs outputs"]) -> Rows:

@@ -86,7 +86,7 @@ def diagnose(
         where=_regions(naming.first),
         gap=total,
         gap_of_run=gaps,
-        closed_fraction=_closed(total),
+        closed_fraction=_closed(total) if naming.chosen.effects else None,
         next_experiment=next_experiment(naming, given.training) if verdict == "ambiguous" else None,
         curves=_learned(naming.last) if verdict == "not_in_library" else (),
         detectable=_detectable(naming.last),

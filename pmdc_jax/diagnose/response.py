@@ -115,7 +115,15 @@ def respond(
 def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Drive]:
     """The propagator and the drive of every block, over (samples, blocks)."""
     along, drive = pick_grid(along_grids(motor, tape), tape, tape.grid)
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1)[..., None, :], along), drive
+    samples = tape.value.shape[1]
+
+    def spread(leaf):
+        blocks_last = jnp.moveaxis(leaf, 0, -1)[..., None, :]
+        return jnp.broadcast_to(
+            blocks_last, (*blocks_last.shape[:-2], samples, blocks_last.shape[-1])
+        )
+
+    return jax.tree.map(spread, along), drive
 
 
 def _one_sample(motor: Motor, tape: Tape, path: Path) -> State:

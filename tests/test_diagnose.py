@@ -1,0 +1,228 @@
+"""The diagnosis: its algebra against plain least squares, its columns against full simulation, whole cases."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from benchmarks import virtual_bench as vb
+from pmdc_jax import Recording
+from pmdc_jax.diagnose import diagnose
+from pmdc_jax.diagnose.candidates import TABLE, Scales
+from pmdc_jax.diagnose.evidence import Block, products
+from pmdc_jax.diagnose.naming import log_chance
+from pmdc_jax.diagnose.noise import Series, whitener
+from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
+from pmdc_jax.effects import EFFECTS
+from pmdc_jax.motor import PARAMETERS, Motor
+from pmdc_jax.simulate import Tape, free_run
+
+PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
+SCALES = Scales(10.0, 300.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0)
+
+
+def test_every_effect_has_a_row():
+    assert set(TABLE) == set(EFFECTS)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_candidates_are_within_the_ranges(name):
+    """Each shape is an effect that can be built, and of which a positive coefficient makes a legal one."""
+    for candidate in TABLE[name](name, SCALES):
+        assert candidate.effect == name
+        for values in candidate.columns:
+            EFFECTS[name](**{field: np.asarray(x) for field, x in values.items()})
+        built = candidate.build(np.full(candidate.order, 0.3 * max(candidate.units)), 0.0)
+        assert built is not None
+        for field, r in EFFECTS[name].ranges.items():
+            assert r.scale == "linear" or built[field] > 0
+
+
+# ------------------------------------------------------------------------------- the evidence
+
+
+def random_evidence(seed: int, runs: int = 3, rows: int = 400):
+    rng = np.random.default_rng(seed)
+    J, own, X = ([rng.normal(size=(rows, n)) for _ in range(runs)] for n in (4, 2, 5))
+    r = [rng.normal(size=rows) + j @ np.arange(4) + x[:, 0] for j, x in zip(J, X, strict=True)]
+    return J, own, X, r
+
+
+@pytest.mark.parametrize("own_phase", [False, True])
+def test_regression_is_plain_least_squares(own_phase):
+    """Against numpy on the whole matrix, with every run's own columns written out."""
+    J, own, X, r = random_evidence(0)
+    evidence = products(J, own, X, r)
+    fit = evidence.regress([Block((4, 6), own_phase)])
+    chosen = [x[:, [0, 2]] for x in X]
+    locals_of = [np.hstack([o, x]) for o, x in zip(own, chosen, strict=True)] if own_phase else own
+    shared = J if own_phase else [np.hstack([j, x]) for j, x in zip(J, chosen, strict=True)]
+    wide = np.zeros((sum(map(len, r)), sum(o.shape[1] for o in locals_of)))
+    row = column = 0
+    for o in locals_of:
+        wide[row : row + len(o), column : column + o.shape[1]] = o
+        row, column = row + len(o), column + o.shape[1]
+    matrix = np.hstack([np.concatenate(shared), wide])
+    y = np.concatenate(r)
+    solution, squares, *_ = np.linalg.lstsq(matrix, y)
+    errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)))
+    assert fit.squares == pytest.approx(squares[0], rel=1e-10)
+    np.testing.assert_allclose(fit.moved, solution[:4], rtol=1e-8)
+    if own_phase:
+        first = 4 + own[0].shape[1]
+        np.testing.assert_allclose(fit.coefficients[0][0], solution[first : first + 2], rtol=1e-8)
+    else:
+        np.testing.assert_allclose(fit.coefficients[0], solution[4:6], rtol=1e-8)
+        np.testing.assert_allclose(fit.errors[0], errors[4:6], rtol=1e-8)
+
+
+def test_a_column_that_says_nothing_new_changes_nothing():
+    J, own, X, r = random_evidence(1)
+    X = [np.hstack([x, j[:, :1]]) for x, j in zip(X, J, strict=True)]
+    evidence = products(J, own, X, r)
+    with_it = evidence.regress([Block((4 + 5,))])
+    assert with_it.squares == pytest.approx(evidence.regress().squares, rel=1e-9)
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 12, 42])
+def test_chance_far_out_meets_the_exact_one(freedom):
+    """The leading term of the tail, where the exact one can still be computed."""
+    for gain in (520.0, 700.0):
+        exact = stats.chi2.logsf(gain, freedom)
+        assert log_chance(gain, freedom) == pytest.approx(exact, abs=0.1 * freedom)
+
+
+# ---------------------------------------------------------------------------------- the noise
+
+
+def coloured(seed: int, samples: int, scale: float) -> np.ndarray:
+    """A torque that fluctuates slowly, seen in speed and a little in current, and white sensors."""
+    rng = np.random.default_rng(seed)
+    slow = np.zeros(samples)
+    for k in range(1, samples):
+        slow[k] = 0.97 * slow[k - 1] + rng.normal()
+    return scale * (np.stack([0.1 * slow, slow], 1) + rng.normal(size=(samples, 2)) * [0.3, 2.0])
+
+
+def test_what_is_filtered_is_white():
+    known = np.ones(6000, bool)
+    series = [Series(coloured(k, 6000, s), known, (1e-3, (0, 1))) for k, s in enumerate((1.0, 5.0))]
+    white = whitener(series)
+    for k, s in enumerate(series):
+        rows = white(k, s).reshape(-1, 2)
+        np.testing.assert_allclose(np.cov(rows.T), np.eye(2), atol=0.05)
+        for lag in range(1, 40):
+            correlation = rows[lag:].T @ rows[:-lag] / len(rows)
+            assert np.abs(correlation).max() < 5 / np.sqrt(len(rows)), lag
+
+
+def test_filter_does_not_look_across_what_is_missing():
+    """A sample that is missing spoils no row: the rows that need it are left out."""
+    values = coloured(0, 3000, 1.0)
+    known = np.ones(3000, bool)
+    known[1000:1010] = False
+    spoiled = values.copy()
+    spoiled[~known] = 1e9
+    clean = Series(values, known, (1e-3, (0, 1)))
+    white = whitener([clean])
+    np.testing.assert_array_equal(white(0, clean), white(0, clean._replace(values=spoiled)))
+
+
+# ------------------------------------------------------------------------------- the responses
+
+
+def runs() -> list[Recording]:
+    """Steps through standstill; the second run carries a load."""
+    rng, found = np.random.default_rng(2), []
+    for k, samples in enumerate((500, 300)):
+        time = 1e-3 * np.arange(samples)
+        levels = rng.uniform(-12, 12, 20)
+        voltage = levels[(time / 0.05).astype(int)]
+        zero, load = np.zeros(samples), np.full(samples, 0.1 * k)
+        found.append(Recording(f"run {k}", time, voltage, current=zero, speed=zero, load=load))
+    return found
+
+
+# one effect that acts through a parameter, one with a state of its own, one of a sensor
+SMOOTH = {
+    "torque_constant_saturation": {"per_A2": 1e-9},
+    "resistance_heating": {"rise_per_W": 1e-8, "time_constant_s": 0.2},
+    "speed_sensor_delay": {"delay_s": 2.5e-3},
+}
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_response_is_the_change_of_the_simulation(x64, name):
+    """First-order columns against two full simulations, one with a very small effect."""
+    tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs()))
+    bare = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()})
+    effect = EFFECTS[name](**{f: jnp.asarray(x) for f, x in SMOOTH[name].items()})
+    motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
+    without, with_it = (free_run(m, tape, tape.initial, jnp.zeros(2)) for m in (bare, motor))
+    # the angle and whatever else comes of the measured speed is to come of the simulated one here
+    path = path_of(without, tape, False)
+    if EFFECTS[name].equation == "sensor":
+        found = sensed(motor, tape, path)
+    else:
+        found = respond(bare, tape, path, kicks(motor, bare, tape, path)[..., None])[..., 0]
+    expected = (with_it - without).transpose(2, 1, 0)
+    weight = np.asarray(tape.weight).transpose(2, 1, 0)
+    for c in range(2):
+        scale = np.abs(expected[:, c] * weight[:, c]).max()
+        error = np.abs((found - expected)[:, c] * weight[:, c]).max()
+        assert error <= 0.02 * scale + 1e-12, (name, c, error, scale)
+
+
+# --------------------------------------------------------------------------------- whole cases
+
+
+def recorded(motor: vb.BenchMotor, seed: int, noise: vb.Noise) -> list[Recording]:
+    """Three short runs of the virtual bench, which shares no code with the package."""
+    rng, quantities = np.random.default_rng(seed), ("time_s", "voltage_V", "current_A", "speed_rad_s")
+    excitations = {
+        "prbs": vb.prbs(rng, 2.0),
+        "triangle": vb.slow_triangle(2.0),
+        "loaded": vb.loaded(rng, 2.0),
+    }
+    found = []
+    for name, excitation in excitations.items():
+        columns = vb.record(motor, excitation, rng, noise)
+        load = columns["load_torque_Nm"]
+        found.append(Recording(name, *(columns[q] for q in quantities), load=load))
+    return found
+
+
+NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
+SHAKEN = vb.Noise(current_A=0.1, speed_rad_s=0.5, torque_Nm=0.01, torque_correlation_s=0.02)
+
+
+@pytest.mark.parametrize("noise", [NOISE, SHAKEN], ids=["white", "coloured"])
+def test_hidden_friction_is_named_and_closes_the_gap(noise):
+    truth = vb.BenchMotor(**PAPER, coulomb_Nm=0.08)
+    *training, held_out = recorded(truth, 4, noise)
+    found = diagnose(training, [held_out])
+    assert found.verdict == "named"
+    (effect,) = found.effects
+    assert (effect.name, effect.equation) == ("coulomb_friction", "mechanical")
+    low, high = effect.parameters["torque_Nm"].ci95
+    assert 0.075 < low < 0.08 < high < 0.085
+    assert effect.p_value < 1e-6
+    assert found.closed_fraction > 0.99
+    assert any(r.equation == "mechanical" and r.variable == "speed" for r in found.where)
+    (friction,) = found.final.motor.effects
+    assert float(friction.torque_Nm) == effect.parameters["torque_Nm"].value
+    # the motor without friction had bought some of it with viscous friction
+    assert found.base.parameters["f"].value > found.final.parameters["f"].value
+
+
+@pytest.mark.parametrize("noise", [NOISE, SHAKEN], ids=["white", "coloured"])
+def test_nothing_is_found_where_nothing_is_missing(noise):
+    found = diagnose(recorded(vb.BenchMotor(**PAPER), 5, noise))
+    assert found.verdict == "none_detected"
+    assert found.effects == ()
+    assert found.final is found.base
+    by_name = {d.effect: d for d in found.detectable}
+    assert 0 < by_name["coulomb_friction"].amplitude < 0.05
