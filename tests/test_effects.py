@@ -402,6 +402,17 @@ def test_agrees_with_an_independent_integrator(x64, name):
     assert found[0] < CASES[name].tolerance, found
 
 
+@pytest.mark.parametrize("name", ["resistance_heating", "stribeck_friction"])
+def test_slow_sampling_is_as_exact(x64, name):
+    """At 10 ms, in equal steps of a millisecond or less."""
+    runs = [
+        Recording(r.name, *(c[:64] for c in (r.time, r.voltage, r.current, r.speed, r.load)))
+        for r in recordings(1e-2)
+    ]
+    found = relative_errors(simulated(with_effect(name), runs), [reference(name, r) for r in runs])
+    assert found[0] < CASES[name].tolerance, found
+
+
 @every_effect
 def test_converges_to_the_independent_integrator(x64, name):
     """Samples four times as short: better than first order, over the time that both cover."""
