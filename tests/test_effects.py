@@ -46,7 +46,9 @@ class Case(NamedTuple):
     # within a sample, which costs the current a share of what it changes by in one
     tolerance: float = 1e-4
     dissipates: bool = True  # takes energy whatever the motor does
-    shows: float = 0.02  # by how much at least the outputs change, root mean square over the largest
+    shows: float = (
+        0.02  # by how much at least the outputs change, root mean square over the largest
+    )
 
 
 def electrical(i, w, v, L=None, R=None):
@@ -88,7 +90,7 @@ def rippled(x, v, load, values):
 
 
 def two_inertias(x, v, load, values, torque):
-    i, w, load_speed, twist = x
+    i, w, load_speed, _ = x
     share = values["load_share"]
     return [
         electrical(i, w, v),
@@ -104,10 +106,10 @@ def sprung(x, v, load, values):
 
 
 def geared(x, v, load, values):
-    """Nothing between the flanks; beyond them a spring, and a damper of 1 ms times its stiffness."""
+    """A spring only beyond the flanks, a damper everywhere."""
     bite = x[3] - np.clip(x[3], -values["gap_rad"] / 2, values["gap_rad"] / 2)
-    push = bite + 1e-3 * (x[1] - x[2]) if bite else 0.0
-    return two_inertias(x, v, load, values, values["stiffness_Nm_rad"] * push)
+    torque = values["stiffness_Nm_rad"] * bite + values["damping_Nms_rad"] * (x[1] - x[2])
+    return two_inertias(x, v, load, values, torque)
 
 
 def lagging(x, v, load, values):
@@ -140,7 +142,7 @@ CASES = {
         friction=lambda w, way, p: p["forward_Nm"] if way > 0 else p["backward_Nm"],
         tolerance=2e-3,
     ),
-    "quadratic_drag": Case({"drag_Nms2_rad2": 3e-5}, "drag_Nms2_rad2", rates=dragged),
+    "quadratic_drag": Case({"drag_Nms2_rad2": 6e-5}, "drag_Nms2_rad2", rates=dragged),
     "cogging_torque": Case(
         {"amplitude_Nm": 0.1} | WAVE,
         "amplitude_Nm",
@@ -171,15 +173,18 @@ CASES = {
         dissipates=False,
     ),
     "gear_backlash": Case(
-        {"gap_rad": 0.1, "stiffness_Nm_rad": 10.0, "load_share": 0.5},
+        {
+            "gap_rad": 0.1,
+            "stiffness_Nm_rad": 10.0,
+            "damping_Nms_rad": 3e-3,
+            "load_share": 0.5,
+        },
         "",
         rates=geared,
         start=lambda w, load, p: [
             w,
             load / p["stiffness_Nm_rad"] + np.sign(load) * p["gap_rad"] / 2,
         ],
-        # the torque of the damper jumps where the teeth meet, somewhere within a step
-        tolerance=1e-2,
         dissipates=False,
     ),
     "brush_voltage_drop": Case(
@@ -206,6 +211,7 @@ CASES = {
     "inductance_saturation": Case(
         {"per_A2": 5e-4},
         "per_A2",
+        shows=0.01,
         rates=lambda x, v, load, p: [
             electrical(x[0], x[1], v, L=PAPER["L"] / (1 + p["per_A2"] * x[0] ** 2)),
             mechanical(x[0], x[1], load),
@@ -297,8 +303,8 @@ def reference(name: str, run: Recording) -> np.ndarray:
     own = case.start(run.speed[0], run.load[0], values) if case.start else []
     states = integrated(case, run, np.array([*start, *own]), run.time)
     if "delay_s" in values:
-        late = np.maximum(run.time - values["delay_s"], 0.0)
-        states = np.stack([states[0], integrated(case, run, np.array(start), late)[1]])
+        late, back = np.unique(np.maximum(run.time - values["delay_s"], 0.0), return_inverse=True)
+        states[1] = integrated(case, run, np.array(start), late)[1, back]
     return (case.reported or (lambda x, p: x[:2]))(states, values).T
 
 
@@ -367,9 +373,12 @@ def _one_mode(case, t, end, x, v, load, inside, got):
 
     start, event = t, slips if sticks else stops
     event.terminal, event.direction = True, 1 if sticks else -1
-    solved = solve_ivp(rates, (t, end), x, events=event, dense_output=True, max_step=2e-3, **PRECISE)
+    solved = solve_ivp(
+        rates, (t, end), x, events=event, dense_output=True, max_step=2e-3, **PRECISE
+    )
     now = (inside >= t - 1e-12) & (inside < solved.t[-1] + 1e-12)
-    got[:, now] = solved.sol(np.maximum(inside[now], t))
+    if now.any():
+        got[:, now] = solved.sol(np.maximum(inside[now], t))
     x = solved.y[:, -1]
     if solved.status == 1 and not sticks:
         x[1] = 0.0
@@ -450,11 +459,6 @@ def apart(local: np.ndarray) -> tuple[np.ndarray, ...]:
     return local[:, :2], local[:, 2], local[:, 3]
 
 
-def apart(local: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Initial current and speed, load offset, initial angle."""
-    return local[:, :2], local[:, 2], local[:, 3]
-
-
 @every_effect
 def test_sensitivities_are_central_differences(x64, name):
     """By every parameter of motor and effect, and each run's own start and load offset."""
@@ -495,20 +499,6 @@ def test_the_search_sees_what_the_free_run_sees(x64, name):
     expected = (((seen - tape.measured) ** 2) * tape.weight).sum((0, 2))
     found = squared_errors(jax.tree.map(lambda x: np.full(2, x), motor), tape)
     np.testing.assert_allclose(np.array(found)[:, 1], expected, rtol=1e-6)
-
-
-@every_effect
-def test_finite_all_over_its_ranges(x64, name):
-    """At every corner of the table's ranges, values and sensitivities are numbers."""
-    bounds = {n: (x / 2, x * 2) for n, x in PAPER.items()}
-    parameters = Parameters.of(bounds, [EFFECTS[name]])
-    tape = Tape.from_recordings(RUNS)
-    base = np.log(list(PAPER.values()))
-    limits = np.stack([parameters.lower[6:], parameters.upper[6:]])
-    for corner in np.ndindex(*(2,) * limits.shape[1]):
-        at = jnp.asarray(np.append(base, limits[list(corner), np.arange(limits.shape[1])]))
-        seen, jacobian = sensitivities(parameters, at, tape, tape.initial, np.zeros(3))
-        assert jnp.all(jnp.isfinite(seen)) and jnp.all(jnp.isfinite(jacobian)), (corner, at[6:])
 
 
 @every_effect
