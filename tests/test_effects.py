@@ -45,6 +45,8 @@ class Case(NamedTuple):
     # worst error at 1 ms, relative to the largest value of each output; dry elements start and stop
     # within a sample, which costs the current a share of what it changes by in one
     tolerance: float = 1e-4
+    # of the sensitivities, relative to central differences
+    slope_tolerance: float = 1e-4
     dissipates: bool = True  # takes energy whatever the motor does
     shows: float = (
         0.02  # by how much at least the outputs change, root mean square over the largest
@@ -185,6 +187,9 @@ CASES = {
             w,
             load / p["stiffness_Nm_rad"] + np.sign(load) * p["gap_rad"] / 2,
         ],
+        # flanks make kinks, which a finite difference straddles: its step changed from 1e-5 to 1e-7, it moves by
+        # as much about the sensitivity
+        slope_tolerance=1e-2,
         dissipates=False,
     ),
     "brush_voltage_drop": Case(
@@ -487,7 +492,11 @@ def test_sensitivities_are_central_differences(x64, name):
             assert not jacobian[..., column].any()
             continue
         error = np.linalg.norm(jacobian[..., column] - expected) / np.linalg.norm(expected)
-        assert error < 1e-4, (column, parameters.names[column : column + 1], error)
+        assert error < CASES[name].slope_tolerance, (
+            column,
+            parameters.names[column : column + 1],
+            error,
+        )
 
 
 @every_effect
