@@ -13,10 +13,6 @@ if TYPE_CHECKING:
     from ..motor import Motor
 
 
-# Damping of the teeth in contact over their stiffness, s
-CONTACT = 1e-3
-
-
 def _rotor(motor: Motor, share: Scalars) -> Motor:
     """The motor with the inertia that is left on its own side of the shaft."""
     return eqx.tree_at(lambda m: m.J, motor, motor.J * (1 - share))
@@ -90,12 +86,14 @@ class ShaftCompliance(AbstractEffect):
 class GearBacklash(AbstractEffect):
     """Backlash: a compliant shaft, or gear, that carries torque only once its play is taken up.
 
-    As `shaft_compliance`, with T_s = stiffness (bite + 1 ms d bite/dt), where bite = twist - clip(twist, -gap/2,
-    gap/2) is how far the teeth are pressed together. Without gap it is a compliant shaft. A run begins with the
-    teeth in contact on the side that the load presses them to, or in the middle without load.
+    As `shaft_compliance`, with T_s = stiffness bite + damping (w - w_L), where bite = twist - clip(twist,
+    -gap/2, gap/2) is how far the teeth are pressed together; the damping is that of the oil too, so it acts inside
+    the gap as well, and the torque never jumps. Without gap it is a compliant shaft. A run begins with the teeth in
+    contact on the side that the load presses them to, or in the middle without load.
 
     **Fields**: `gap_rad`, the whole play in rad, > 0, usually 0.001 to 0.1; `stiffness_Nm_rad` of the teeth in
-    contact in N m/rad, > 0; `load_share`, s, the share of the inertia behind the gear, between 0 and 1.
+    contact in N m/rad, > 0; `damping_Nms_rad` in N m s/rad, > 0; `load_share`, s, the share of the inertia behind the
+    gear, between 0 and 1.
     **Excitation needed**: torque through zero again and again, at two amplitudes.
     **Source**: Nordin, Gutman, "Controlling mechanical systems with backlash: a survey", Automatica 38
     (2002), doi:10.1016/S0005-1098(02)00047-X, section 2.
@@ -103,25 +101,26 @@ class GearBacklash(AbstractEffect):
 
     name: ClassVar = "gear_backlash"
     label: ClassVar = "Gear backlash"
-    formula: ClassVar = "T_s = k (bite + t_c dbite/dt), bite = twist - clip(twist, -gap/2, gap/2)"
+    formula: ClassVar = "T_s = k bite + d (w - w_L), bite = twist - clip(twist, -gap/2, gap/2)"
     equation: ClassVar = "mechanical"
     states: ClassVar = ("gear_speed", "gear_twist")
     longest_step: ClassVar = 2.5e-4
     ranges: ClassVar = {
         "gap_rad": ParameterRange("rad", 1e-6, 1.0),
         "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-3, 1e6),
+        "damping_Nms_rad": ParameterRange("N m s/rad", 1e-7, 1e3),
         "load_share": ParameterRange("", 1e-2, 0.99),
     }
 
     gap_rad: Scalars
     stiffness_Nm_rad: Scalars
+    damping_Nms_rad: Scalars
     load_share: Scalars
 
     def shaft_torque(self, state: State) -> Scalars:
         twist, slip = state.extra["gear_twist"], state.speed - state.extra["gear_speed"]
-        outside = jnp.abs(twist) >= self.gap_rad / 2
-        bite = jnp.where(outside, twist - jnp.sign(twist) * self.gap_rad / 2, 0.0)
-        return self.stiffness_Nm_rad * (bite + jnp.where(outside, CONTACT * slip, 0.0))
+        bite = twist - jnp.clip(twist, -self.gap_rad / 2, self.gap_rad / 2)
+        return self.stiffness_Nm_rad * bite + self.damping_Nms_rad * slip
 
     def parameters(self, motor: Motor, state: State) -> Motor:
         del state
