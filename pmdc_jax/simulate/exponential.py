@@ -15,7 +15,7 @@ ORDER = 10
 HALVINGS = 20
 
 
-def product(a: Matrix, b: Matrix) -> Matrix:
+def product(a: Float[Array, "2 2 *#batch"], b: Float[Array, "2 2 *#batch"]) -> Matrix:
     """Matrix product over the two leading axes; written out, since XLA on CPU is slow on batches of tiny dots."""
     return jnp.stack([a[i, 0] * b[0] + a[i, 1] * b[1] for i in range(2)])
 
