@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..errors import InputError
 from ..simulate import Tape, squared_errors
@@ -97,30 +98,22 @@ def search(
     chosen = METHODS[method]
     size, rounds = population or chosen.population, generations or chosen.generations
     low, high = np.asarray(parameters.lower), np.asarray(parameters.upper)
-    key = jax.random.key(seed)
     fitness_of = _Fitness(parameters, tape, noise)
 
-    algorithm = _algorithm(method, size, len(low))
-    settings = algorithm.default_params
-    if chosen.distribution:
-        settings = settings.replace(std_init=SPREAD)
+    begin, go_on = _programs(method, size, len(low))
     start = _scattered(seed, SCATTERED if chosen.distribution else size, len(low))
     seen = [(start, fitness_of.scattered(low + (high - low) * start, size))]
     if chosen.distribution:
-        state = algorithm.init(key, jnp.asarray(start[np.argmin(seen[0][1])]), settings)
+        asked, state = begin(seed, start[np.argmin(seen[0][1])])
     else:
-        state = algorithm.init(key, jnp.asarray(start), jnp.asarray(seen[0][1]), settings)
+        asked, state = begin(seed, start, seen[0][1])
 
     interrupted = False
     try:
         for generation in range(1, rounds):
-            ask, tell = jax.random.split(jax.random.fold_in(key, generation))
-            asked, state = algorithm.ask(ask, state, settings)
-            cube = np.clip(np.asarray(asked), 0.0, 1.0)
+            cube = np.asarray(asked)
             fitness = fitness_of(low + (high - low) * cube)
-            state, _ = algorithm.tell(
-                tell, jnp.asarray(cube), jnp.asarray(fitness), state, settings
-            )
+            asked, state = go_on(seed, generation, cube, fitness, state)
             seen.append((cube, fitness))
             if progress:
                 best = min(f.min() for _, f in seen)
@@ -134,9 +127,40 @@ def search(
 
 
 @functools.cache
-def _algorithm(method: str, population: int, dimensions: int):
-    """One instance for each size: evosax compiles its steps anew for every instance."""
-    return METHODS[method].algorithm()(population, jnp.zeros(dimensions))
+def _programs(method: str, population: int, dimensions: int):
+    """How a search begins and how it goes on, compiled as two programs: step by step evosax compiles dozens.
+
+    `begin(seed, *start)` and `go_on(seed, generation, cube, fitness, state)` give the next points of the unit cube
+    to try, (population, dimensions), and the state to go on from. Cached, as are then the programs.
+    """
+    algorithm = METHODS[method].algorithm()(population, jnp.zeros(dimensions))
+
+    def settings():
+        default = algorithm.default_params
+        return default.replace(std_init=SPREAD) if METHODS[method].distribution else default
+
+    def keys(seed, generation):
+        return jax.random.split(jax.random.fold_in(jax.random.key(seed), generation))
+
+    def ask(seed, generation, state):
+        asked, state = algorithm.ask(keys(seed, generation)[0], state, settings())
+        return jnp.clip(asked, 0.0, 1.0), jax.tree.map(_settled, state)
+
+    @jax.jit
+    def begin(seed, *start):
+        return ask(seed, 1, algorithm.init(jax.random.key(seed), *start, settings()))
+
+    @jax.jit
+    def go_on(seed, generation, cube, fitness, state):
+        state, _ = algorithm.tell(keys(seed, generation)[1], cube, fitness, state, settings())
+        return ask(seed, generation + 1, state)
+
+    return begin, go_on
+
+
+def _settled(leaf: Array) -> Array:
+    """With a type that is not weak, as it is after a step: otherwise the first step would be compiled apart."""
+    return jax.lax.convert_element_type(leaf, leaf.dtype)
 
 
 class _Fitness:

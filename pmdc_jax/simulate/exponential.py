@@ -15,7 +15,9 @@ ORDER = 10
 HALVINGS = 20
 
 
-def product(a: Matrix, b: Float[Array, "n m *batch"]) -> Float[Array, "n m *batch"]:
+def product(
+    a: Float[Array, "n n *#batch"], b: Float[Array, "n m *#batch"]
+) -> Float[Array, "n m ..."]:
     """Matrix product over the two leading axes; a sum, since XLA on CPU is slow on batches of tiny dots."""
     return (a[:, :, None] * b[None]).sum(1)
 

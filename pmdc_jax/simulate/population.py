@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -11,14 +13,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..effects.base import State
 from ..motor import Motor
-from .solver import HeldInput, Walk, along_grids, held_step, pick_grid, steps_in_sample, walk
-from .tape import BLOCK, Tape
+from .exponential import Matrix, product
+from .solver import (
+    HeldInput,
+    Propagator,
+    Walk,
+    along_grids,
+    held_step,
+    pick_grid,
+    steps_in_sample,
+    walk,
+)
+from .tape import BLOCK, Samples, Tape
 
-# Samples of linear motors whose arithmetic XLA fuses into one kernel, measured: small populations gain from fewer
-# kernels, large ones lose by recomputation, and so does every population with effects.
-SMALL, UNROLL_SMALL, UNROLL_LARGE = 64, 8, 4
-
+# Samples in a stride of linear motors, a power of two that divides a block: measured, 8 and 32 are slower.
+STRIDE = 16
 
 # Candidates a thread takes at least: below this, handing them over costs more than it saves.
 SHARE = 64
@@ -35,13 +46,13 @@ def squared_errors(
     size = motors.R.shape[0]
     shares = max(1, min(os.cpu_count() or 1, size // SHARE))
     if shares == 1 or size % shares:  # unequal shares would be compiled once more
-        return _squared_errors(motors, tape)
+        return _errors(motors, tape)
     double = jax.config.read("jax_enable_x64")
 
     def part(k: int):
         with jax.enable_x64(double):  # the setting belongs to the thread
             mine = slice(k * size // shares, (k + 1) * size // shares)
-            return _squared_errors(jax.tree.map(lambda leaf: leaf[mine], motors), tape)
+            return _errors(jax.tree.map(lambda leaf: leaf[mine], motors), tape)
 
     # XLA walks a population on one core; the cores share it out among them
     with ThreadPoolExecutor(shares) as pool:
@@ -49,14 +60,106 @@ def squared_errors(
     return jnp.concatenate(current), jnp.concatenate(speed)
 
 
-@eqx.filter_jit
-def _squared_errors(motors: Motor, tape: Tape):
-    """One share: its blocks one after another, the whole population in the state."""
-    grids, steps = along_grids(motors, tape), steps_in_sample(motors, tape)
-    unroll = UNROLL_SMALL if motors.R.shape[0] <= SMALL else UNROLL_LARGE
-    if motors.effects:
-        unroll = 1
+def _errors(motors: Motor, tape: Tape):
+    return _errors_with_effects(motors, tape) if motors.effects else _errors_of_linear(motors, tape)
 
+
+class Stride(NamedTuple):
+    """The exact step of linear motors over `STRIDE` samples: x(end) = whole x(start) + from_rest inputs."""
+
+    whole: Matrix  # exp(A h)^STRIDE
+    # by what drives at each sample, then by the loads
+    from_rest: Float[Array, "inputs 2 population"]
+
+
+def _stride(along: Propagator) -> Stride:
+    """Doubled up from one sample: what the earlier inputs have done is carried on through the later half."""
+    whole, from_rest = along.whole[:, :, None], along.inputs[:, :, None]
+    for _ in range(STRIDE.bit_length() - 1):
+        from_rest = jnp.concatenate([product(whole, from_rest), from_rest], axis=2)
+        whole = product(whole, whole)
+    by_input = jnp.moveaxis(from_rest, 0, 2)
+    return Stride(whole[:, :, 0], by_input.reshape(2 * STRIDE, 2, -1))
+
+
+def _starts(stride: Stride, state: State, value: Samples, load: Samples) -> tuple[State, State]:
+    """Linear motors at the end of a block, and at the start of each of its strides, (strides, population).
+
+    The inputs of all strides go through one matrix product, so that little is left to do one after the other.
+    """
+    inputs = jnp.concatenate([_in_strides(value), _in_strides(load)], axis=1)
+    pushes = jnp.tensordot(inputs, stride.from_rest, 1)
+
+    def follow(x, push):
+        return stride.whole[:, 0] * x[0] + stride.whole[:, 1] * x[1] + push, x
+
+    end, starts = jax.lax.scan(follow, jnp.stack([state.current, state.speed]), pushes)
+    return State(end[0], end[1], {}), State(starts[:, 0], starts[:, 1], {})
+
+
+def _in_strides(samples: Float[Samples, "... samples"]) -> Float[Array, "... strides stride"]:
+    return jnp.asarray(samples).reshape(*samples.shape[:-1], -1, STRIDE)
+
+
+# the widest vectors, where the processor has them: by default XLA uses half of their width
+@partial(jax.jit, compiler_options={"xla_cpu_prefer_vector_width": 512})
+def _errors_of_linear(motors: Motor, tape: Tape):
+    """One share of linear motors: its blocks one after another, the whole population in the state.
+
+    The strides of a block go side by side: XLA makes one loop over strides and candidates of all the
+    arithmetic of a stride.
+    """
+    grids = along_grids(motors, tape)
+    strides, rows = jax.vmap(_stride)(grids), BLOCK // STRIDE
+
+    def advance(carry, block):
+        along, drive = pick_grid(grids, tape, tape.grid[block])
+        samples = (tape.value[block], tape.load[block], tape.measured[block], tape.weight[block])
+        initial = motors.rest(*tape.initial[tape.run[block]])
+        begins = tape.begins[block]
+        state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
+        stride = jax.tree.map(lambda leaf: leaf[tape.grid[block]], strides)
+        end, starts = _starts(stride, state, *samples[:2])
+        along = jax.tree.map(partial(_repeated, rows=rows), along)
+        # samples of a stride in front, behind them a row for each stride
+        by_sample = jax.tree.map(lambda s: jnp.moveaxis(_in_strides(s), -1, 0)[..., None], samples)
+
+        def sample(carry, samples):
+            state, errors = carry
+            value, load, measured, weight = samples
+            seen = (state.current, state.speed)
+            errors = tuple(
+                e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
+            )
+            return (held_step(motors, along, drive, state, value, load), errors), None
+
+        (_, errors), _ = jax.lax.scan(sample, (starts, carry.seen), by_sample, unroll=STRIDE)
+        return Walk(end, errors)
+
+    zero = jnp.zeros_like(motors.R)
+    nothing = jnp.zeros((rows, len(zero)))
+    start = Walk(motors.rest(zero, zero), (nothing, nothing))
+    saveat = diffrax.SaveAt(t1=True)
+    errors = walk(HeldInput(advance), start, tape.value.shape[0], saveat).seen
+    # rows are summed only here: XLA would merge the sum into the arithmetic and give up vector instructions
+    current, speed = (e[0].sum(0) for e in errors)
+    return _finite(current), _finite(speed)
+
+
+def _finite(errors: Float[Array, " population"]) -> Float[Array, " population"]:
+    return jnp.where(jnp.isfinite(errors), errors, jnp.inf)
+
+
+def _repeated(
+    leaf: Float[Array, "... population"], rows: int
+) -> Float[Array, "... rows population"]:
+    return jnp.broadcast_to(leaf[..., None, :], (*leaf.shape[:-1], rows, leaf.shape[-1]))
+
+
+@eqx.filter_jit
+def _errors_with_effects(motors: Motor, tape: Tape):
+    """One share of motors with effects, from sample to sample."""
+    grids, steps = along_grids(motors, tape), steps_in_sample(motors, tape)
     delay = motors.speed_delay()
     speeds, weights = (jnp.asarray(x)[:, 1].reshape(-1) for x in (tape.measured, tape.weight))
     ends = BLOCK * jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs), side="right")
@@ -92,12 +195,11 @@ def _squared_errors(motors: Motor, tape: Tape):
             tape.weight[block].T,
             block * BLOCK + jnp.arange(BLOCK),
         )
-        (state, errors), _ = jax.lax.scan(sample, (state, carry.seen), samples, unroll=unroll)
+        (state, errors), _ = jax.lax.scan(sample, (state, carry.seen), samples)
         return Walk(state, errors)
 
     zero = jnp.zeros_like(motors.R)
     start = Walk(motors.rest(zero, zero), (zero, zero))
     saveat = diffrax.SaveAt(t1=True)
     errors = walk(HeldInput(advance), start, tape.value.shape[0], saveat).seen
-    current, speed = (jnp.where(jnp.isfinite(e[0]), e[0], jnp.inf) for e in errors)
-    return current, speed
+    return _finite(errors[0][0]), _finite(errors[1][0])
