@@ -159,20 +159,20 @@ PLAY = (0.01, 0.05)
 SHARE = 0.5
 
 
-def _stiffness(hertz: float, share: float, scales: Scales) -> float:
-    """Stiffness at which two inertias ring at `hertz`."""
-    return (2 * np.pi * hertz) ** 2 * scales.inertia * share * (1 - share)
+def _shaft(hertz: float, scales: Scales) -> Values:
+    """A shaft with a twentieth of the critical damping, on which two inertias ring at `hertz`."""
+    rate = 2 * np.pi * hertz
+    stiffness = rate**2 * scales.inertia * SHARE * (1 - SHARE)
+    return {
+        "stiffness_Nm_rad": stiffness,
+        "damping_Nms_rad": 2 * 0.05 * stiffness / rate,
+        "load_share": SHARE,
+    }
 
 
 def _compliance(name: str, scales: Scales) -> list[Candidate]:
     def candidate(hertz: float) -> Candidate:
-        stiffness = _stiffness(hertz, SHARE, scales)
-        damping = 2 * 0.05 * stiffness / (2 * np.pi * hertz)
-        values = {
-            "stiffness_Nm_rad": stiffness,
-            "damping_Nms_rad": damping,
-            "load_share": SHARE,
-        }
+        values = _shaft(hertz, scales)
         return Candidate(
             name, (values,), (1.0,), lambda c, dry: values if c[0] > 0 else None, whole=True
         )
@@ -182,11 +182,7 @@ def _compliance(name: str, scales: Scales) -> list[Candidate]:
 
 def _backlash(name: str, scales: Scales) -> list[Candidate]:
     def candidate(gap: float) -> Candidate:
-        values = {
-            "gap_rad": gap,
-            "stiffness_Nm_rad": _stiffness(80.0, SHARE, scales),
-            "load_share": SHARE,
-        }
+        values = {"gap_rad": gap, **_shaft(80.0, scales)}
         return Candidate(
             name, (values,), (1.0,), lambda c, dry: values if c[0] > 0 else None, whole=True
         )

@@ -138,7 +138,7 @@ def prepare(
     # hold-outs lie on the tape too, but do not count: only what is their own is fitted to them
     problem = Problem(
         parameters,
-        jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded)),
+        jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True)),
         jnp.asarray(noise),
         free=jnp.ones(len(parameters.names), bool),
         counts=jnp.arange(len(runs)) < len(recordings),

@@ -231,11 +231,14 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
     d_load = jnp.broadcast_to(d_load[:, None], (columns, len(starts)))
     value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T + offset
 
+    turn = jnp.asarray(tape.turn).T
+
     def advance(carry, k):
         state, d_state = carry.state
 
         def look_and_step(motor, along, state, load):
             after = held_step(motor, along, drive, state, value[k], load, steps)
+            after = _turned(state, after, turn[k])
             return after, _outputs(motor, drive, state, after, value[k], load)
 
         (state, seen), (d_state, d_seen) = jax.vmap(
@@ -264,6 +267,15 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
     )
     end, d_end = jax.tree.map(lambda leaf: leaf[0], (end, d_end))
     return Pass(seen, d_seen, _pack(end).T, jax.vmap(_pack)(d_end).swapaxes(1, 2))
+
+
+def _turned(before: State, after: State, turn: Float[Array, " blocks"]) -> State:
+    """The state with the rotor turned as it was measured to, where it was."""
+    if "angle" not in after.extra:
+        return after
+    followed = before.extra["angle"] + jnp.nan_to_num(turn)
+    angle = jnp.where(jnp.isnan(turn), after.extra["angle"], followed)
+    return after._replace(extra={**after.extra, "angle": angle})
 
 
 def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts, limits=None) -> Starts:

@@ -43,15 +43,21 @@ class Tape(eqx.Module):
     load_unknown: Bool[Samples, " runs"]
     angle: Float[Samples, " runs"]  # rad at the start, zero where unknown
     angle_known: Bool[Samples, " runs"]
+    # rad over each sample by the measured speed, where the simulated rotor is to turn as the real one; else NaN
+    turn: Float[Samples, "blocks samples"]
     # longest sample time, rounded up to few values: it decides how a sample is divided
     longest: float = eqx.field(static=True)
 
     @classmethod
-    def from_recordings(cls, recordings: Sequence[Recording], unloaded: bool = False) -> Tape:
+    def from_recordings(
+        cls, recordings: Sequence[Recording], unloaded: bool = False, follow: bool = False
+    ) -> Tape:
         """Lay recordings end to end.
 
         **Arguments**: `recordings`, each with a uniform sample time (see `pmdc_jax.simulate.uniform`);
-        `unloaded` declares the load of runs without a load column to be zero instead of unknown.
+        `unloaded` declares the load of runs without a load column to be zero instead of unknown; `follow` makes
+        the rotor turn as measured where the speed was: torques that depend on its angle keep step with
+        the real ones, which a free run would lose after a few turns.
         """
         runs = [_Run(recording) for recording in recordings]
         grids = list(dict.fromkeys(run.grid for run in runs))
@@ -62,6 +68,7 @@ class Tape(eqx.Module):
             "load": np.zeros((blocks, BLOCK)),
             "measured": np.zeros((blocks, 2, BLOCK)),
             "weight": np.zeros((blocks, 2, BLOCK)),
+            "turn": np.full((blocks, BLOCK), np.nan),
             "run": np.full(blocks, len(runs) - 1),
             "begins": np.zeros(blocks, bool),
             "grid": np.full(blocks, grids.index(runs[-1].grid)),
@@ -75,6 +82,8 @@ class Tape(eqx.Module):
                 missing = np.isnan(samples)
                 tape["measured"][part, channel] = run.fill(np.where(missing, 0.0, samples))
                 tape["weight"][part, channel] = run.fill(np.where(missing, 0.0, 1.0))
+            if follow:
+                tape["turn"][part] = run.fill(run.turn(), hold=True)
             tape["run"][part], tape["grid"][part] = index, grids.index(run.grid)
             tape["begins"][first] = True
             first += run.blocks
@@ -127,6 +136,12 @@ class _Run:
         # rounded: two runs of one clock must share a grid, whatever the last bits of their time stamps
         self.grid = (float(f"{recording.sample_time:.9g}"), drive)
         self.initial = (_first(self.current), _first(self.speed))
+
+    def turn(self) -> np.ndarray:
+        """Angle over each sample in rad, NaN where the speed is not known."""
+        sample_time, _ = self.grid
+        ahead = np.append(self.speed[1:], self.speed[-1])
+        return sample_time * (self.speed + ahead) / 2
 
     def fill(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
         spare = self.blocks * BLOCK - self.length
