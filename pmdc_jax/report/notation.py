@@ -62,6 +62,13 @@ def significant(value: float | None, digits: int = 3) -> str:
     return fixed(value, max(0, digits - 1 - _magnitude(value)))
 
 
+def amount(value: float, unit: str, digits: int = 3) -> str:
+    """A number with its unit, (0.00321, "N m") as "3.21 mN·m"."""
+    exponent = engineering_exponent(value)
+    scaled = significant(value / 10.0**exponent, digits)
+    return f"{scaled} {scaled_unit(unit, exponent)}".strip()
+
+
 def thousands(count: int) -> str:
     """Groups of three digits, held together by narrow spaces."""
     return f"{count:,}".replace(",", NARROW)
@@ -75,11 +82,11 @@ def engineering_exponent(value: float) -> int:
 
 
 def scaled_unit(unit: str, exponent: int) -> str:
-    """The unit with its prefix, ("N m/A", -3) as "mN·m/A"; kilograms take a power of ten."""
+    """The unit with its prefix, ("N m/A", -3) as "mN·m/A"; kilograms and reciprocals take a power of ten."""
     unit = pretty_unit(unit)
     if not exponent:
         return unit
-    if not unit or unit.startswith("kg"):
+    if not unit or unit.startswith(("kg", "1/")):
         return f"×10{str(exponent).translate(_SUPERSCRIPT)} {unit}".strip()
     return PREFIXES[exponent] + unit
 
