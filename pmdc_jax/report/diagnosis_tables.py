@@ -9,10 +9,10 @@ from rich.table import Table
 from rich.text import Text
 
 from ..diagnose.diagnosis import Diagnosis
-from .notation import amount, significant, write_estimate
+from .notation import amount, chance, field_words, significant, words_of, write_estimate
 from .summary import runs_in_order, status_word
 from .terminal import STATUS_STYLES, console_for, parameter_table, plain_table
-from .verdict import chance, drifts, field_words, moved, verdict_sentences, words_of, would_be_seen
+from .verdict import drifts, moved, verdict_sentences, would_be_seen
 
 
 def print_diagnosis(diagnosis: Diagnosis) -> None:

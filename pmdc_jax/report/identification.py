@@ -21,6 +21,7 @@ from .notation import (
     PARAMETER_NAMES,
     Written,
     fixed,
+    parameter_words,
     percent,
     significant,
     thousands,
@@ -37,17 +38,23 @@ def write_report(identification: Identification, path: str | Path) -> None:
         "identification.html.jinja",
         summary=summary(identification),
         tiles=_tiles(identification),
-        parameters=_parameters(identification),
-        directions=identification.unidentified_directions,
-        findings=identification.findings,
-        messages=identification.messages,
-        runs=_runs(identification),
-        show_load_offset=any(fit.load_offset is not None for fit in identification.fit.values()),
-        search=_search(identification),
-        correlation=_correlation(identification),
-        seed=identification.seed,
-        seconds={name: f"{value:.1f} s" for name, value in identification.seconds.items()},
+        **identification_content(identification),
     )
+
+
+def identification_content(identification: Identification) -> dict[str, Any]:
+    """What the sections on the motor, its data and its fit are filled with."""
+    return {
+        "parameters": _parameters(identification),
+        "findings": identification.findings,
+        "messages": identification.messages,
+        "runs": _runs(identification),
+        "show_load_offset": any(f.load_offset is not None for f in identification.fit.values()),
+        "search": _search(identification),
+        "correlation": _correlation(identification),
+        "seed": identification.seed,
+        "seconds": {name: f"{value:.1f} s" for name, value in identification.seconds.items()},
+    }
 
 
 @frozen
@@ -92,7 +99,10 @@ def _tiles(identification: Identification) -> list[tuple[str, str, str]]:
 
 def _parameters(identification: Identification) -> list[_Parameter]:
     def row(symbol: str, estimate: Estimate) -> _Parameter:
-        name = PARAMETER_NAMES.get(symbol, "")
+        if "." in symbol:  # of an effect: it has a name and no symbol
+            symbol, name = "", parameter_words(*symbol.split("."))
+        else:
+            name = PARAMETER_NAMES.get(symbol, "")
         word = status_word(estimate.status)
         return _Parameter(symbol, name, write_estimate(estimate), estimate.status, word)
 

@@ -1,4 +1,4 @@
-"""Numbers and units as an engineer writes them: 157.3 mΩ, not 0.157312 ohm."""
+"""Numbers, units and names as an engineer writes them: 157.3 mΩ, not 0.157312 ohm."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from math import floor, isfinite, log10
 
 from attrs import frozen
 
+from ..effects import EFFECTS
 from ..identify.identification import Estimate
 
 UNKNOWN = "–"
@@ -113,6 +114,32 @@ def fixed(value: float | None, decimals: int) -> str:
     if value is None or not isfinite(value):
         return UNKNOWN
     return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def words_of(effect: str) -> str:
+    """An effect in running text: "Coulomb friction", "dead zone of the input"."""
+    label = EFFECTS[effect].label
+    named_after_someone = label.startswith(("Coulomb", "Stribeck"))
+    return label if named_after_someone else label[0].lower() + label[1:]
+
+
+def field_words(effect: str, field: str) -> str:
+    """A field without the unit in its name: "time constant" for time_constant_s."""
+    unit = EFFECTS[effect].ranges[field].unit
+    suffix = unit.removeprefix("1/").replace(" ", "").replace("^", "").replace("/", "_")
+    if field == f"per_{suffix}":
+        return "coefficient"
+    return field.removesuffix(f"_{suffix}").removesuffix("_per").replace("_", " ")
+
+
+def parameter_words(effect: str, field: str) -> str:
+    """ "Stribeck friction, static"."""
+    return f"{words_of(effect)}, {field_words(effect, field)}"
+
+
+def chance(p_value: float) -> str:
+    """ "p < 0.001" or "p = 0.21"."""
+    return "p < 0.001" if p_value < 1e-3 else f"p = {significant(p_value, 2)}"
 
 
 def enumerate_words(words: Sequence[str]) -> str:

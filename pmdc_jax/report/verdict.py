@@ -8,9 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from ..diagnose.diagnosis import Detectable, Diagnosis, EffectFound, Region
-from ..effects import EFFECTS
-from ..identify.identification import Estimate, RunFit
-from .notation import amount, enumerate_words, percent, significant, write_estimate
+from ..identify.identification import Estimate, Role, RunFit
+from .notation import (
+    amount,
+    chance,
+    enumerate_words,
+    field_words,
+    percent,
+    significant,
+    words_of,
+    write_estimate,
+)
 from .summary import as_sentence, cautions
 
 VERDICTS = {
@@ -194,27 +202,6 @@ def place(variable: str, value: float) -> str:
     return f"at {significant(float(value))} {VARIABLE_UNITS.get(variable, '')}".strip()
 
 
-def words_of(effect: str) -> str:
-    """An effect in running text: "Coulomb friction", "dead zone of the input"."""
-    label = EFFECTS[effect].label
-    named_after_someone = label.startswith(("Coulomb", "Stribeck"))
-    return label if named_after_someone else label[0].lower() + label[1:]
-
-
-def field_words(effect: str, field: str) -> str:
-    """A field without the unit in its name: "time constant" for time_constant_s."""
-    unit = EFFECTS[effect].ranges[field].unit
-    suffix = unit.removeprefix("1/").replace(" ", "").replace("^", "").replace("/", "_")
-    if field == f"per_{suffix}":
-        return "coefficient"
-    return field.removesuffix(f"_{suffix}").removesuffix("_per").replace("_", " ")
-
-
-def chance(p_value: float) -> str:
-    """ "p < 0.001" or "p = 0.21"."""
-    return "p < 0.001" if p_value < 1e-3 else f"p = {significant(p_value, 2)}"
-
-
 def _rivals(diagnosis: Diagnosis) -> list[str]:
     return list(dict.fromkeys(r for effect in diagnosis.effects for r in effect.also_possible))
 
@@ -247,8 +234,13 @@ def _would_have_been_seen(begin: str, diagnosis: Diagnosis) -> str:
     return f"{begin}: {enumerate_words(parts)} would have shown, nine times of ten."
 
 
+def role_that_counts(diagnosis: Diagnosis) -> Role:
+    """Hold-outs are the test where there are any."""
+    return "holdout" if "holdout" in diagnosis.gap else "train"
+
+
 def _gap(diagnosis: Diagnosis) -> str:
-    role = "holdout" if "holdout" in diagnosis.gap else "train"
+    role = role_that_counts(diagnosis)
     gap = diagnosis.gap[role]
     what = "Hold-out" if role == "holdout" else "Training"
     sentence = f"{what} error {significant(gap.before)} to {significant(gap.after)} times the noise"
