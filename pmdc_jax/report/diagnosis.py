@@ -42,8 +42,8 @@ from .verdict import (
     would_be_seen,
 )
 
-# traces that a run has in a picture of residuals, and those of its simulation
-TRACES_OF_RUN = 4 + 7
+# traces that a run has in the picture of its residuals, and in that of its simulation
+OF_RESIDUALS, OF_SIMULATION = 4, 7
 
 
 def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
@@ -66,7 +66,7 @@ def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
         curves=[_curve(curve) for curve in diagnosis.curves],
         drifts=_drifts(diagnosis),
         detectable=_detectable(diagnosis),
-        **identification_content(diagnosis.final),
+        **identification_content(diagnosis.final, OF_RESIDUALS * len(diagnosis.final.fit)),
     )
 
 
@@ -152,7 +152,7 @@ def _residuals(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     if not diagnosis.effects:
         return []
     runs = runs_in_order(diagnosis.final)
-    points = points_per_trace(TRACES_OF_RUN * len(runs))
+    points = points_per_trace((OF_RESIDUALS + OF_SIMULATION) * len(runs))
     figures = {
         name: residual_figure(diagnosis.base.fit[name], fit, diagnosis.final.noise, points)
         for name, fit in runs
@@ -162,20 +162,26 @@ def _residuals(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 def _against(diagnosis: Diagnosis) -> dict[str, Any] | None:
     """The residual over the variable in which the plain motor was most clearly off."""
-    if not diagnosis.where:
-        return None
-    clearest = diagnosis.where[0]
-    wanted = "current" if clearest.equation == "electrical" else "speed"
+    equation, variable = _gave_away(diagnosis)
+    wanted = "current" if equation == "electrical" else "speed"
     for channel in (wanted, "speed", "current"):
         fits = diagnosis.base.fit, diagnosis.final.fit
-        figure = against_figure(*fits, clearest.variable, channel)
+        figure = against_figure(*fits, variable, channel)
         if figure:
             return {
-                "variable": clearest.variable,
+                "variable": variable,
                 "channel": channel,
                 "figure": figure_json(figure),
             }
     return None
+
+
+def _gave_away(diagnosis: Diagnosis) -> tuple[str, str]:
+    """The equation and the variable of the clearest misfit."""
+    if diagnosis.where:
+        return diagnosis.where[0].equation, diagnosis.where[0].variable
+    electrical = any(effect.equation == "electrical" for effect in diagnosis.effects)
+    return ("electrical", "current") if electrical else ("mechanical", "speed")
 
 
 def _curve(curve: LearnedCurve) -> dict[str, Any]:
@@ -203,7 +209,3 @@ def _detectable(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         (parameter_words(one.effect, one.parameter), amount(one.amplitude, one.unit, 2))
         for one in would_be_seen(diagnosis)
     ]
-
-
-def figure_json(figure: go.Figure) -> str:
-    return figure_json(figure)

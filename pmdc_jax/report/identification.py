@@ -42,13 +42,18 @@ def write_report(identification: Identification, path: str | Path) -> None:
     )
 
 
-def identification_content(identification: Identification) -> dict[str, Any]:
-    """What the sections on the motor, its data and its fit are filled with."""
+def identification_content(identification: Identification, other_traces: int = 0) -> dict[str, Any]:
+    """What the sections on the motor, its data and its fit are filled with.
+
+    `other_traces` are drawn elsewhere on the page, which is to stay small.
+    """
+    traces = other_traces + sum(count_traces(fit) for fit in identification.fit.values())
+    points = points_per_trace(traces)
     return {
         "parameters": _parameters(identification),
         "findings": identification.findings,
         "messages": identification.messages,
-        "runs": _runs(identification),
+        "runs": _runs(identification, points),
         "show_load_offset": any(f.load_offset is not None for f in identification.fit.values()),
         "search": _search(identification),
         "correlation": _correlation(identification),
@@ -109,9 +114,7 @@ def _parameters(identification: Identification) -> list[_Parameter]:
     return [row(*item) for item in identification.parameters.items()]
 
 
-def _runs(identification: Identification) -> list[_Run]:
-    runs = runs_in_order(identification)
-    points = points_per_trace(sum(count_traces(fit) for _, fit in runs))
+def _runs(identification: Identification, points: int) -> list[_Run]:
     return [
         _Run(
             name=name,
@@ -121,7 +124,7 @@ def _runs(identification: Identification) -> list[_Run]:
             figure=figure_json(run_figure(fit, identification.noise, points)),
             caption=_caption(fit, points),
         )
-        for number, (name, fit) in enumerate(runs, start=1)
+        for number, (name, fit) in enumerate(runs_in_order(identification), start=1)
     ]
 
 
