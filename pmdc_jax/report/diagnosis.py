@@ -58,7 +58,7 @@ def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
         rivals=_rivals(diagnosis),
         experiment=_experiment(diagnosis.next_experiment),
         where=[_region(region) for region in diagnosis.where],
-        where_figure=figure_json(where_figure(diagnosis.where)) if diagnosis.where else None,
+        where_figure=_where_figure(diagnosis),
         gaps=_gaps(diagnosis),
         gap_figure=figure_json(gap_figure(_gap_by_run(diagnosis))),
         residuals=_residuals(diagnosis),
@@ -118,6 +118,12 @@ def _experiment(experiment: NextExperiment | None) -> dict[str, Any] | None:
         "power": percent(100 * experiment.power),
         "figure": figure_json(experiment_figure(experiment, 4000)),
     }
+
+
+def _where_figure(diagnosis: Diagnosis) -> str | None:
+    if not diagnosis.where:
+        return None
+    return figure_json(where_figure(diagnosis.where, diagnosis.base.fit))
 
 
 def _region(region: Region) -> dict[str, str]:

@@ -29,12 +29,15 @@ BINS = 30
 FAR = 20.0
 
 
-def where_figure(regions: Sequence[Region]) -> go.Figure:
-    """The misfit over its standard error in every region, a panel for each equation and variable."""
+def where_figure(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> go.Figure:
+    """The misfit over its standard error in every region, a panel for each equation and variable.
+
+    Axes span what the runs (`fits`) have of the variable.
+    """
     kinds = list(dict.fromkeys((one.equation, one.variable) for one in regions))
     titles = [f"{equation} equation over {variable}" for equation, variable in kinds]
     figure = make_subplots(
-        rows=len(kinds), cols=1, subplot_titles=titles, vertical_spacing=0.3 / len(kinds)
+        rows=len(kinds), cols=1, subplot_titles=titles, vertical_spacing=0.42 / len(kinds)
     )
     for row, kind in enumerate(kinds, start=1):
         for one in (r for r in regions if (r.equation, r.variable) == kind):
@@ -49,9 +52,10 @@ def where_figure(regions: Sequence[Region]) -> go.Figure:
                 name=f"z = {one.z:.1f}",
             )
             figure.add_trace(block, row=row, col=1)
-        figure.update_xaxes(title_text=AXES.get(kind[1], kind[1]), row=row, col=1)
+        axis = {"title_text": AXES.get(kind[1], kind[1]), "range": _range(fits, kind[1])}
+        figure.update_xaxes(**axis, row=row, col=1)
         figure.update_yaxes(title_text="z", row=row, col=1)
-    style(figure, height=60 + 190 * len(kinds))
+    style(figure, height=60 + 210 * len(kinds))
     figure.update_annotations(font_size=13)
     figure.update_yaxes(zeroline=True, zerolinecolor=INK)
     return figure
@@ -184,6 +188,14 @@ def experiment_figure(experiment: NextExperiment, points: int) -> go.Figure:
 
 def _two_deviations(noise: float | None) -> tuple[float, ...]:
     return (-2 * noise, 2 * noise) if noise else ()
+
+
+def _range(fits: Mapping[str, RunFit], variable: str) -> list[float] | None:
+    """From the lowest to the highest of all runs; None where no run has it."""
+    found = [values for fit in fits.values() if (values := _values(fit, variable)) is not None]
+    if not found:
+        return None
+    return [float(np.nanmin(np.concatenate(found))), float(np.nanmax(np.concatenate(found)))]
 
 
 def _values(fit: RunFit, variable: str) -> np.ndarray | None:
