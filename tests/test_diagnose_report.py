@@ -152,7 +152,7 @@ def test_rivals_and_the_run_that_decides_in_words():
 def test_what_is_not_in_the_library_in_words():
     told = words(not_in_library())
     assert "no effect of the library explains" in told
-    assert "over speed, up to −30.0 mN·m at 40.0 rad/s" in told
+    assert "over speed, clearest with −30.0 mN·m at 40.0 rad/s" in told
     part = words(evolve(not_in_library(), effects=named().effects))
     assert "Stribeck friction (" in part
     assert "explains part of it and was added" in part

@@ -94,7 +94,10 @@ def residual_figure(
     for row, channel in enumerate(channels, start=1):
         title, deviation = RESIDUALS[channel]
         for name, fit, colour in (("before", before, BEFORE), ("after", after, AFTER)):
-            time, values = envelope(fit.time, residual(fit, channel), points)
+            left = residual(fit, channel)
+            if left is None:
+                continue
+            time, values = envelope(fit.time, left, points)
             line = {"color": colour, "width": 0.8}
             trace = go.Scatter(
                 x=time, y=values, name=name, line=line, showlegend=row == 1, legendgroup=name

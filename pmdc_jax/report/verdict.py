@@ -89,11 +89,12 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
         sentences.append("Something is missing that no effect of the library explains.")
     if diagnosis.curves:
         curve = diagnosis.curves[0]
-        peak = int(np.argmax(np.abs(curve.value)))
+        known = curve.stderr > 0
+        peak = int(np.argmax(np.abs(curve.value) / np.where(known, curve.stderr, np.inf)))
         kind = "torque opposing motion" if curve.unit == "N m" else "voltage at the terminals"
         sentences.append(
-            f"Drawn by the data it looks most like a {kind} over {curve.variable}, up to"
-            f" {amount(curve.value[peak], curve.unit)} {place(curve.variable, curve.x[peak])}"
+            f"Drawn by the data it looks most like a {kind} over {curve.variable}, clearest"
+            f" with {amount(curve.value[peak], curve.unit)} {place(curve.variable, curve.x[peak])}"
             f" ({chance(curve.p_value)})."
         )
     return sentences
