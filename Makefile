@@ -1,5 +1,5 @@
 # Everything is set up once, in .venv: Python 3.11, make and a way to PyPI are all it takes.
-#   make demo     identify the packaged sample; results and a report go to demo_out/
+#   make demo     diagnose the packaged sample; results and a report go to demo_out/
 #   make test     style, types, tests
 #   make lint     style and types alone
 #   make bench    speed, beside other ways of doing the same

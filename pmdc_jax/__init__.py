@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .demo import demo
+    from .diagnose.diagnosis import Diagnosis
+    from .diagnose.pipeline import diagnose
     from .errors import InputError
     from .identify.identification import Identification
     from .identify.pipeline import identify
@@ -19,11 +21,13 @@ if TYPE_CHECKING:
 
 # Names are loaded when first used: importing this package costs nothing and changes no setting.
 _HOME = {
+    "Diagnosis": "diagnose.diagnosis",
     "Identification": "identify.identification",
     "InputError": "errors",
     "Motor": "motor",
     "Recording": "recording",
     "demo": "demo",
+    "diagnose": "diagnose.pipeline",
     "identify": "identify.pipeline",
     "load_motor": "motor_file",
     "read_recording": "recording",
@@ -33,11 +37,13 @@ _HOME = {
 }
 
 __all__ = [
+    "Diagnosis",
     "Identification",
     "InputError",
     "Motor",
     "Recording",
     "demo",
+    "diagnose",
     "identify",
     "load_motor",
     "read_recording",

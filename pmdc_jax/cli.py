@@ -8,11 +8,11 @@ Everything heavy is imported inside the commands, so that help and usage errors 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import TextIOWrapper
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -22,11 +22,13 @@ from .errors import InputError
 if TYPE_CHECKING:
     from .identify.identification import Identification
 
+Result = TypeVar("Result")
+
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
 app = typer.Typer(
     name="pmdc",
-    help="Identify brushed permanent-magnet DC motors from recorded data.",
+    help="Identify and diagnose brushed permanent-magnet DC motors from recorded data.",
     epilog="Start with: pmdc demo",
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -52,6 +54,12 @@ Json = Annotated[
 ]
 Report = Annotated[
     Path | None, typer.Option(metavar="OUT.html", help="Write a report with pictures.")
+]
+Experiment = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="OUT.csv", help="Write the voltage to record next, where these runs cannot tell."
+    ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the search.")]
 Column = Annotated[
@@ -123,23 +131,67 @@ def identify(
 
     check_outputs({"--save": save, "--json": json, "--report": report}, [*runs, *holdout])
     columns = dict(_pairs("--column", column))
-    options = {
-        "tie": tuple(_pairs("--tie", tie)),
-        "known": {name: _number("--known", name, text) for name, text in _pairs("--known", known)},
-        "unloaded": unloaded,
-        "effects": tuple(effect),
-        "search": search,
-        "seed": seed,
-    }
+    options = _options(tie, known, unloaded, search, seed) | {"effects": tuple(effect)}
     from .identify import identify
-    from .recording import read_recording
-    from .report.terminal import progress
 
-    with progress() as on_progress:
-        recordings = [read_recording(run, columns) for run in runs]
-        held_out = [read_recording(run, columns) for run in holdout]
-        identification = identify(recordings, holdout=held_out, progress=on_progress, **options)
-    _deliver(identification, save, json, report)
+    identification = _work_on(identify, runs, holdout, columns, options)
+    from .report.json import identification_json
+    from .report.terminal import print_identification
+
+    _save(identification, save)
+    if report:
+        from .report.identification import write_report
+
+        write_report(identification, report)
+    _tell(identification, json, identification_json, print_identification)
+
+
+@app.command(
+    epilog="Example: pmdc diagnose *.csv --holdout drive.csv --report diagnosis.html"
+    " --save motor.json"
+)
+def diagnose(
+    runs: Runs,
+    holdout: Holdout = [],
+    save: Save = None,
+    json: Json = None,
+    report: Report = None,
+    experiment: Experiment = None,
+    seed: Seed = 0,
+    column: Column = [],
+    tie: Tie = [],
+    known: Known = [],
+    unloaded: Unloaded = False,
+    search: Search = "cma_es",
+) -> None:
+    """Find what a motor has that its model lacks.
+
+    Says where simulation and measurement disagree, names the missing effect, adds it, and shows
+    how much of the disagreement is gone. The motor saved is the completed one.
+    """
+    from .report.files import check_outputs
+
+    outputs = {"--save": save, "--json": json, "--report": report, "--experiment": experiment}
+    check_outputs(outputs, [*runs, *holdout])
+    columns = dict(_pairs("--column", column))
+    options = _options(tie, known, unloaded, search, seed)
+    from .diagnose import diagnose
+
+    diagnosis = _work_on(diagnose, runs, holdout, columns, options)
+    from .report.diagnosis_tables import print_diagnosis
+    from .report.json import diagnosis_json
+
+    _save(diagnosis.final, save)
+    if experiment:
+        from .report.experiment import write_experiment
+
+        if not write_experiment(diagnosis, experiment):
+            typer.echo(f"note: no experiment to write to {experiment}", err=True)
+    if report:
+        from .report.diagnosis import write_diagnosis
+
+        write_diagnosis(diagnosis, report)
+    _tell(diagnosis, json, diagnosis_json, print_diagnosis)
 
 
 @app.command(epilog="Example: pmdc simulate motor.json --input drive.csv --out simulated.csv")
@@ -161,42 +213,76 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
 
 @app.command(epilog="Example: pmdc demo --out tour")
 def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
-    """Take the tour: identify the packaged sample.
+    """Take the tour: identify and diagnose the packaged sample.
 
     Four runs are fitted, a fifth tests the motor; results and a report go to a folder.
     """
     from .demo import demo
-    from .report.terminal import print_findings, print_identification, progress
+    from .report.diagnosis_tables import print_diagnosis
+    from .report.terminal import print_findings, progress
 
     with progress() as on_progress:
-        identification = demo(out, seed=seed, progress=on_progress)
-    print_findings(identification)
-    print_identification(identification)
-    for name in ("report.html", "identification.json", "motor.json"):
+        diagnosis = demo(out, seed=seed, progress=on_progress)
+    print_findings(diagnosis.final)
+    print_diagnosis(diagnosis)
+    for name in ("report.html", "diagnosis.json", "motor.json"):
         typer.echo(out / name)
 
 
-def _deliver(
-    identification: Identification, save: Path | None, json: str | None, report: Path | None
-) -> None:
-    """Write what was asked for, and print the tables unless standard output is taken."""
-    from .report.terminal import print_findings, print_identification
+def _options(
+    tie: list[str], known: list[str], unloaded: bool, search: str, seed: int
+) -> dict[str, Any]:
+    """What identification and diagnosis are told beside the runs."""
+    return {
+        "tie": tuple(_pairs("--tie", tie)),
+        "known": {name: _number("--known", name, text) for name, text in _pairs("--known", known)},
+        "unloaded": unloaded,
+        "search": search,
+        "seed": seed,
+    }
+
+
+def _work_on(
+    work: Callable[..., Result],
+    runs: list[Path],
+    holdout: list[Path],
+    columns: dict[str, str],
+    options: dict[str, Any],
+) -> Result:
+    """Read the runs and do the long work on them, telling how far it got."""
+    from .recording import read_recording
+    from .report.terminal import progress
+
+    with progress() as on_progress:
+        recordings = [read_recording(run, columns) for run in runs]
+        held_out = [read_recording(run, columns) for run in holdout]
+        return work(recordings, holdout=held_out, progress=on_progress, **options)
+
+
+def _save(identification: Identification, path: Path | None) -> None:
+    """Tell what was found about the recordings, and save the motor where that was asked for."""
+    from .report.terminal import print_findings
 
     print_findings(identification)
-    if save:
+    if path:
         from .motor_file import save_motor
 
-        save_motor(save, identification.motor, identification)
-    if report:
-        from .report.identification import write_report
+        save_motor(path, identification.motor, identification)
 
-        write_report(identification, report)
+
+def _tell(
+    result: Result,
+    json: str | None,
+    as_json: Callable[[Result], dict[str, Any]],
+    print_result: Callable[[Result], None],
+) -> None:
+    """Write JSON where that was asked for; print the result unless standard output is taken."""
     if json:
-        from .report.json import identification_json, write_json
+        from .report.json import write_json
 
-        write_json(identification_json(identification), json)
+        write_json(as_json(result), json)
     if json != "-":
-        print_identification(identification)
+        print_result(result)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

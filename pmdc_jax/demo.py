@@ -1,4 +1,4 @@
-"""The tour: identify the motor of the packaged sample and report on it."""
+"""The tour: identify and diagnose the motor of the packaged sample and report on it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from .errors import InputError
 
 if TYPE_CHECKING:
-    from .identify.identification import Identification
+    from .diagnose.diagnosis import Diagnosis
     from .report.terminal import ReportProgress
 
 SAMPLE = Path(__file__).parent / "sample"
@@ -18,29 +18,29 @@ HOLDOUT = ("drive",)
 
 def demo(
     out: str | Path = "demo_out", seed: int = 0, progress: ReportProgress | None = None
-) -> Identification:
-    """Identify the packaged sample; write report.html, motor.json and identification.json to `out`.
+) -> Diagnosis:
+    """Diagnose the packaged sample; write report.html, motor.json and diagnosis.json to `out`.
 
     **Arguments**: `out`, a folder, made where it does not exist; `seed` of the search; `progress`,
     called now and then with what is being done.
 
-    **Returns**: the identification.
+    **Returns**: the diagnosis, whose `final` is the identification of the completed motor.
     """
     folder = _folder(Path(out))
-    from .identify import identify
+    from .diagnose import diagnose
     from .motor_file import save_motor
     from .recording import read_recording
-    from .report.identification import write_report
-    from .report.json import identification_json, write_json
+    from .report.diagnosis import write_diagnosis
+    from .report.json import diagnosis_json, write_json
 
     training, held_out = (
         [read_recording(SAMPLE / f"{name}.csv") for name in names] for names in (TRAINING, HOLDOUT)
     )
-    identification = identify(training, holdout=held_out, seed=seed, progress=progress)
-    save_motor(folder / "motor.json", identification.motor, identification)
-    write_json(identification_json(identification), folder / "identification.json")
-    write_report(identification, folder / "report.html")
-    return identification
+    diagnosis = diagnose(training, holdout=held_out, seed=seed, progress=progress)
+    save_motor(folder / "motor.json", diagnosis.final.motor, diagnosis.final)
+    write_json(diagnosis_json(diagnosis), folder / "diagnosis.json")
+    write_diagnosis(diagnosis, folder / "report.html")
+    return diagnosis
 
 
 def _folder(path: Path) -> Path:

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 from attrs import evolve
+from test_diagnose_report import ambiguous, named
 from test_report import fake_identification, partial_identification
 
 from pmdc_jax import cli
@@ -32,12 +33,17 @@ def replace_function(monkeypatch, module: str, name: str, function) -> None:
 def faked(monkeypatch, tmp_path):
     """Reading, identifying and saving replaced; what they were called with is kept."""
     calls = SimpleNamespace(identify=None, read=[], saved=[], result=fake_identification(400))
+    calls.diagnosis = named()
 
     def identify(recordings, **options):
         calls.identify = (recordings, options)
         if isinstance(calls.result, BaseException):
             raise calls.result
         return calls.result
+
+    def diagnose(recordings, **options):
+        identify(recordings, **options)
+        return calls.diagnosis
 
     def read_recording(path, columns=None):
         calls.read.append((str(path), columns))
@@ -48,6 +54,7 @@ def faked(monkeypatch, tmp_path):
         Path(path).write_text("{}")
 
     replace_function(monkeypatch, "pmdc_jax.identify", "identify", identify)
+    replace_function(monkeypatch, "pmdc_jax.diagnose", "diagnose", diagnose)
     replace_function(monkeypatch, "pmdc_jax.recording", "read_recording", read_recording)
     replace_function(monkeypatch, "pmdc_jax.motor_file", "save_motor", save_motor)
     for variable in ("FORCE_COLOR", "TTY_COMPATIBLE"):  # rich takes these for a terminal
@@ -67,7 +74,7 @@ def refused(capsys, *arguments: str) -> str:
     return err
 
 
-@pytest.mark.parametrize("command", [(), ("identify",), ("simulate",), ("demo",)])
+@pytest.mark.parametrize("command", [(), ("identify",), ("diagnose",), ("simulate",), ("demo",)])
 def test_help_shows_an_example(capsys, command):
     assert cli.main([*command, "--help"]) == 0
     out, err = capsys.readouterr()
@@ -151,6 +158,51 @@ def test_outputs_are_written(faked, capsys, tmp_path):
     assert json.loads((tmp_path / "fit.json").read_text())["converged"] is True
 
 
+def test_diagnose_passes_every_option_on(faked, capsys):
+    arguments = (
+        "diagnose a.csv b.csv --holdout c.csv --seed 7 --column speed=rpm_meas:rpm --tie Kt=Kb"
+        " --known R=0.157 --unloaded --search genetic"
+    )
+    assert cli.main(arguments.split()) == 0
+    recordings, options = faked.identify
+    assert recordings == ["a", "b"]
+    assert options == {
+        "holdout": ["c"],
+        "tie": (("Kt", "Kb"),),
+        "known": {"R": 0.157},
+        "unloaded": True,
+        "search": "genetic",
+        "seed": 7,
+        "progress": None,
+    }
+    assert faked.read[0] == ("a.csv", {"speed": "rpm_meas:rpm"})
+    out, err = capsys.readouterr()
+    assert "Missing: Stribeck friction" in out
+    assert err == ""
+
+
+def test_diagnose_writes_what_is_asked_for(faked, capsys, tmp_path):
+    faked.diagnosis = ambiguous()
+    arguments = "diagnose a.csv --save m.json --json d.json --report d.html --experiment next.csv"
+    assert cli.main(arguments.split()) == 0
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["d.html", "d.json", "m.json", "next.csv"]
+    assert json.loads((tmp_path / "d.json").read_text())["verdict"] == "ambiguous"
+
+
+def test_diagnose_without_an_experiment_says_so(faked, capsys, tmp_path):
+    assert cli.main(["diagnose", "a.csv", "--json", "-", "--experiment", "next.csv"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["verdict"] == "named"
+    assert "no experiment" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_diagnose_tells_bad_input_in_one_message(faked, capsys):
+    faked.result = InputError("a.csv, line 3", "time runs backwards", "Sort the rows")
+    assert "a.csv, line 3: time" in refused(capsys, "diagnose", "a.csv")
+
+
 @pytest.mark.parametrize(
     ("arguments", "names"),
     [
@@ -169,6 +221,11 @@ def test_outputs_are_written(faked, capsys, tmp_path):
         ("identify a.csv --report -", ["--report", "--json"]),
         ("identify a.csv --json a.csv", ["--json", "a.csv", "an input"]),
         ("identify a.csv --json x --report x", ["--report", "where --json is written"]),
+        ("diagnose", ["RUN", "pmdc diagnose --help"]),
+        ("diagnose a.csv --tie Kt", ["--tie Kt", "Kt=Kb"]),
+        ("diagnose a.csv --known R=much", ["--known R=much", "not a number"]),
+        ("diagnose a.csv --experiment a.csv", ["--experiment", "an input"]),
+        ("diagnose a.csv --json x --experiment x", ["--experiment", "where --json is written"]),
         ("simulate motor.json --input a.csv", ["--out"]),
         ("simulate motor.json --input a.csv --out a.csv", ["--out", "an input"]),
     ],
@@ -225,7 +282,7 @@ def test_simulate_reads_simulates_and_writes(faked, monkeypatch, capsys):
 def test_demo_writes_into_its_folder(faked, capsys, tmp_path):
     assert cli.main(["demo", "--out", "deep/tour"]) == 0
     names = {path.name for path in (tmp_path / "deep" / "tour").iterdir()}
-    assert names == {"report.html", "identification.json", "motor.json"}
+    assert names == {"report.html", "diagnosis.json", "motor.json"}
     recordings, options = faked.identify
     assert recordings == ["staircase", "prbs", "triangle", "loaded"]
     assert options["holdout"] == ["drive"]

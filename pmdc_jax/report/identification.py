@@ -21,6 +21,7 @@ from .notation import (
     PARAMETER_NAMES,
     Written,
     fixed,
+    parameter_words,
     percent,
     significant,
     thousands,
@@ -37,17 +38,28 @@ def write_report(identification: Identification, path: str | Path) -> None:
         "identification.html.jinja",
         summary=summary(identification),
         tiles=_tiles(identification),
-        parameters=_parameters(identification),
-        directions=identification.unidentified_directions,
-        findings=identification.findings,
-        messages=identification.messages,
-        runs=_runs(identification),
-        show_load_offset=any(fit.load_offset is not None for fit in identification.fit.values()),
-        search=_search(identification),
-        correlation=_correlation(identification),
-        seed=identification.seed,
-        seconds={name: f"{value:.1f} s" for name, value in identification.seconds.items()},
+        **identification_content(identification),
     )
+
+
+def identification_content(identification: Identification, other_traces: int = 0) -> dict[str, Any]:
+    """What the sections on the motor, its data and its fit are filled with.
+
+    `other_traces` are drawn elsewhere on the page, which is to stay small.
+    """
+    traces = other_traces + sum(count_traces(fit) for fit in identification.fit.values())
+    points = points_per_trace(traces)
+    return {
+        "parameters": _parameters(identification),
+        "findings": identification.findings,
+        "messages": identification.messages,
+        "runs": _runs(identification, points),
+        "show_load_offset": any(f.load_offset is not None for f in identification.fit.values()),
+        "search": _search(identification),
+        "correlation": _correlation(identification),
+        "seed": identification.seed,
+        "seconds": {name: f"{value:.1f} s" for name, value in identification.seconds.items()},
+    }
 
 
 @frozen
@@ -92,16 +104,17 @@ def _tiles(identification: Identification) -> list[tuple[str, str, str]]:
 
 def _parameters(identification: Identification) -> list[_Parameter]:
     def row(symbol: str, estimate: Estimate) -> _Parameter:
-        name = PARAMETER_NAMES.get(symbol, "")
+        if "." in symbol:  # of an effect: it has a name and no symbol
+            symbol, name = "", parameter_words(*symbol.split("."))
+        else:
+            name = PARAMETER_NAMES.get(symbol, "")
         word = status_word(estimate.status)
         return _Parameter(symbol, name, write_estimate(estimate), estimate.status, word)
 
     return [row(*item) for item in identification.parameters.items()]
 
 
-def _runs(identification: Identification) -> list[_Run]:
-    runs = runs_in_order(identification)
-    points = points_per_trace(sum(count_traces(fit) for _, fit in runs))
+def _runs(identification: Identification, points: int) -> list[_Run]:
     return [
         _Run(
             name=name,
@@ -111,7 +124,7 @@ def _runs(identification: Identification) -> list[_Run]:
             figure=figure_json(run_figure(fit, identification.noise, points)),
             caption=_caption(fit, points),
         )
-        for number, (name, fit) in enumerate(runs, start=1)
+        for number, (name, fit) in enumerate(runs_in_order(identification), start=1)
     ]
 
 

@@ -6,11 +6,16 @@ import json
 import sys
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from attrs import asdict
 
 from ..identify.identification import Estimate, Identification, RunFit, Search
 from ..recording import Finding
 from .files import write_text
+
+if TYPE_CHECKING:
+    from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, NextExperiment
 
 
 def identification_json(identification: Identification) -> dict[str, Any]:
@@ -39,6 +44,25 @@ def identification_json(identification: Identification) -> dict[str, Any]:
     )
 
 
+def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """A diagnosis: what an identification holds, of the completed motor, and what was missing."""
+    before = diagnosis.base.parameters.items()
+    gap = {role: _gap(diagnosis.gap.get(role)) for role in ("train", "holdout")}
+    found = {
+        "verdict": diagnosis.verdict,
+        "effects": [_effect(effect) for effect in diagnosis.effects],
+        "where": [asdict(region) for region in diagnosis.where],
+        "gap": {**gap, "closed_fraction": diagnosis.closed_fraction},
+        "gap_of_run": {run: _gap(one) for run, one in diagnosis.gap_of_run.items()},
+        "next_experiment": _experiment(diagnosis.next_experiment),
+        "curves": [asdict(curve) for curve in diagnosis.curves],
+        "detectable": [asdict(one) for one in diagnosis.detectable],
+        "p_nothing_missing": diagnosis.p_nothing,
+        "before": {"parameters": {name: _estimate(estimate) for name, estimate in before}},
+    }
+    return identification_json(diagnosis.final) | _plain(found)
+
+
 def write_json(obj: Any, path: str | Path) -> None:
     """Write `obj` to a file, whole or not at all, or to standard output where the path is "-"."""
     to_stdout = str(path) == "-"  # whose encoding is anybody's guess, hence plain ASCII
@@ -58,6 +82,27 @@ def _estimate(estimate: Estimate) -> dict[str, Any]:
         "unit": estimate.unit,
         "status": estimate.status,
     }
+
+
+def _effect(effect: EffectFound) -> dict[str, Any]:
+    return {
+        "name": effect.name,
+        "equation": effect.equation,
+        "parameters": {name: _estimate(one) for name, one in effect.parameters.items()},
+        "p_value": effect.p_value,
+        "also_possible": list(effect.also_possible),
+    }
+
+
+def _gap(gap: Gap | None) -> dict[str, Any] | None:
+    return None if gap is None else asdict(gap)
+
+
+def _experiment(experiment: NextExperiment | None) -> dict[str, Any] | None:
+    """What to record; the waveform itself is what --experiment writes."""
+    if experiment is None:
+        return None
+    return {name: getattr(experiment, name) for name in ("why", "description", "power")}
 
 
 def _run_fit(fit: RunFit) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Numbers and units as an engineer writes them: 157.3 mΩ, not 0.157312 ohm."""
+"""Numbers, units and names as an engineer writes them: 157.3 mΩ, not 0.157312 ohm."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from math import floor, isfinite, log10
 
 from attrs import frozen
 
+from ..effects import EFFECTS
 from ..identify.identification import Estimate
 
 UNKNOWN = "–"
@@ -62,6 +63,13 @@ def significant(value: float | None, digits: int = 3) -> str:
     return fixed(value, max(0, digits - 1 - _magnitude(value)))
 
 
+def amount(value: float, unit: str, digits: int = 3) -> str:
+    """A number with its unit, (0.00321, "N m") as "3.21 mN·m"."""
+    exponent = engineering_exponent(value)
+    scaled = significant(value / 10.0**exponent, digits)
+    return f"{scaled} {scaled_unit(unit, exponent)}".strip()
+
+
 def thousands(count: int) -> str:
     """Groups of three digits, held together by narrow spaces."""
     return f"{count:,}".replace(",", NARROW)
@@ -75,11 +83,11 @@ def engineering_exponent(value: float) -> int:
 
 
 def scaled_unit(unit: str, exponent: int) -> str:
-    """The unit with its prefix, ("N m/A", -3) as "mN·m/A"; kilograms take a power of ten."""
+    """The unit with its prefix, ("N m/A", -3) as "mN·m/A"; kilograms and reciprocals take a power of ten."""
     unit = pretty_unit(unit)
     if not exponent:
         return unit
-    if not unit or unit.startswith("kg"):
+    if not unit or unit.startswith(("kg", "1/")):
         return f"×10{str(exponent).translate(_SUPERSCRIPT)} {unit}".strip()
     return PREFIXES[exponent] + unit
 
@@ -106,6 +114,32 @@ def fixed(value: float | None, decimals: int) -> str:
     if value is None or not isfinite(value):
         return UNKNOWN
     return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def words_of(effect: str) -> str:
+    """An effect in running text: "Coulomb friction", "dead zone of the input"."""
+    label = EFFECTS[effect].label
+    named_after_someone = label.startswith(("Coulomb", "Stribeck"))
+    return label if named_after_someone else label[0].lower() + label[1:]
+
+
+def field_words(effect: str, field: str) -> str:
+    """A field without the unit in its name: "time constant" for time_constant_s."""
+    unit = EFFECTS[effect].ranges[field].unit
+    suffix = unit.removeprefix("1/").replace(" ", "").replace("^", "").replace("/", "_")
+    if field == f"per_{suffix}":
+        return "coefficient"
+    return field.removesuffix(f"_{suffix}").removesuffix("_per").replace("_", " ")
+
+
+def parameter_words(effect: str, field: str) -> str:
+    """ "Stribeck friction, static"."""
+    return f"{words_of(effect)}, {field_words(effect, field)}"
+
+
+def chance(p_value: float) -> str:
+    """ "p < 0.001" or "p = 0.21"."""
+    return "p < 0.001" if p_value < 1e-3 else f"p = {significant(p_value, 2)}"
 
 
 def enumerate_words(words: Sequence[str]) -> str:

@@ -26,9 +26,13 @@ def status_word(status: str) -> str:
 
 def summary(identification: Identification) -> list[str]:
     """The sentences at the top of the report, the most important first."""
-    sentences = [_found(identification), _held_out(identification)]
-    sentences += [
-        f"{_sentence(direction.why)} {_sentence(direction.mend)}"
+    return [_found(identification), _held_out(identification), *cautions(identification)]
+
+
+def cautions(identification: Identification) -> list[str]:
+    """What the recordings cannot tell, and where the numbers are not to be trusted."""
+    sentences = [
+        f"{as_sentence(direction.why)} {as_sentence(direction.mend)}"
         for direction in identification.unidentified_directions
     ]
     at_bound = _with_status(identification, "at_bound")
@@ -138,6 +142,6 @@ def _with_status(identification: Identification, status: str) -> list[str]:
     return [name for name, one in identification.parameters.items() if one.status == status]
 
 
-def _sentence(text: str) -> str:
+def as_sentence(text: str) -> str:
     text = text.strip()
     return text if not text or text[-1] in ".!?" else f"{text}."

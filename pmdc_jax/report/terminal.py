@@ -30,12 +30,12 @@ class ReportProgress(Protocol):
 
 def print_identification(identification: Identification) -> None:
     """Summary, parameters and fits on standard output."""
-    _console(stderr=False).print(identification_tables(identification))
+    console_for(stderr=False).print(identification_tables(identification))
 
 
 def print_findings(identification: Identification) -> None:
     """What the data checks found, and remarks of the identification, on standard error."""
-    console = _console(stderr=True)
+    console = console_for(stderr=True)
     for finding in identification.findings:
         line = Text(f"{finding.severity}: ", SEVERITY_STYLES.get(finding.severity, ""))
         place = ", ".join(str(part) for part in (finding.run, finding.column) if part)
@@ -49,7 +49,7 @@ def print_findings(identification: Identification) -> None:
 def identification_tables(identification: Identification) -> RenderableType:
     """Summary, parameter table and fit table, one under the other."""
     sentences = [Text(sentence) for sentence in summary(identification)]
-    return Group(_parameter_table(identification), "", _fit_table(identification), "", *sentences)
+    return Group(parameter_table(identification), "", _fit_table(identification), "", *sentences)
 
 
 @contextmanager
@@ -71,8 +71,9 @@ def progress() -> Iterator[ReportProgress | None]:
         yield report
 
 
-def _parameter_table(identification: Identification) -> Table:
-    table = _table("Parameters")
+def parameter_table(identification: Identification) -> Table:
+    """Every parameter with its uncertainty and status."""
+    table = plain_table("Parameters")
     for header in ("Parameter", "Value", "Unit", "Std. error", "95 % interval", "Status"):
         left = header in ("Parameter", "Unit", "Status")
         table.add_column(header, justify="left" if left else "right", no_wrap=True)
@@ -85,7 +86,7 @@ def _parameter_table(identification: Identification) -> Table:
 
 
 def _fit_table(identification: Identification) -> Table:
-    table = _table("Free-run simulation")
+    table = plain_table("Free-run simulation")
     table.add_column("Run", overflow="fold")
     table.add_column("Role", no_wrap=True)
     for header in ("Speed RMSE\n[rad/s]", "Speed fit", "Current RMSE\n[A]", "Current fit"):
@@ -102,13 +103,15 @@ def _fit_table(identification: Identification) -> Table:
     return table
 
 
-def _table(title: str) -> Table:
+def plain_table(title: str) -> Table:
+    """A table without lines."""
     return Table(
         title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0)
     )
 
 
-def _console(stderr: bool) -> Console:
+def console_for(stderr: bool) -> Console:
+    """Standard output or standard error, wide enough where it is a pipe."""
     console = Console(stderr=stderr, highlight=False)
     return (
         console

@@ -1,0 +1,209 @@
+"""Plotly figures of a diagnosis: where it was off, by how much, and what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from ..diagnose.diagnosis import Gap, LearnedCurve, NextExperiment, Region
+from ..identify.identification import RunFit
+from .figures import DASHED, INK, INPUT, RESIDUAL, SIMULATED, envelope, style
+
+BEFORE, AFTER = RESIDUAL, SIMULATED
+AXES = {
+    "speed": "speed [rad/s]",
+    "current": "current [A]",
+    "voltage": "voltage [V]",
+    "angle": "angle [rad]",
+    "time": "share of a run",
+}
+RESIDUALS = {
+    "speed": ("Δ speed<br>[rad/s]", "speed_rad_s"),
+    "current": ("Δ current<br>[A]", "current_A"),
+}
+BINS = 30
+# ratio of the gaps from which on bars need a logarithmic axis
+FAR = 20.0
+
+
+def where_figure(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> go.Figure:
+    """The misfit over its standard error in every region, a panel for each equation and variable.
+
+    Axes span what the runs (`fits`) have of the variable.
+    """
+    kinds = list(dict.fromkeys((one.equation, one.variable) for one in regions))
+    titles = [f"{equation} equation over {variable}" for equation, variable in kinds]
+    figure = make_subplots(
+        rows=len(kinds), cols=1, subplot_titles=titles, vertical_spacing=0.42 / len(kinds)
+    )
+    for row, kind in enumerate(kinds, start=1):
+        for one in (r for r in regions if (r.equation, r.variable) == kind):
+            low, high = one.region
+            block = go.Scatter(
+                x=[low, low, high, high],
+                y=[0, one.z, one.z, 0],
+                fill="tozeroy",
+                mode="lines",
+                line={"color": RESIDUAL, "width": 1},
+                showlegend=False,
+                name=f"z = {one.z:.1f}",
+            )
+            figure.add_trace(block, row=row, col=1)
+        axis = {"title_text": AXES.get(kind[1], kind[1]), "range": _range(fits, kind[1])}
+        figure.update_xaxes(**axis, row=row, col=1)
+        figure.update_yaxes(title_text="z", row=row, col=1)
+    style(figure, height=60 + 210 * len(kinds))
+    figure.update_annotations(font_size=13)
+    figure.update_yaxes(zeroline=True, zerolinecolor=INK)
+    return figure
+
+
+def gap_figure(gaps: Mapping[str, Gap]) -> go.Figure:
+    """Bars of the error over the noise before and after, and the noise floor, for every run."""
+    runs = list(gaps)
+    figure = go.Figure()
+    for name, colour in (("before", BEFORE), ("after", AFTER)):
+        heights = [getattr(gap, name) for gap in gaps.values()]
+        figure.add_trace(go.Bar(x=runs, y=heights, name=name, marker_color=colour))
+    floor = go.Scatter(
+        x=runs,
+        y=[gap.floor for gap in gaps.values()],
+        name="noise floor",
+        mode="markers",
+        marker={"symbol": "line-ew", "size": 34, "line": {"color": INK, "width": 2}},
+    )
+    figure.add_trace(floor)
+    style(figure, height=340)
+    far = max(gap.before for gap in gaps.values()) > FAR
+    figure.update_yaxes(title_text="error over the noise", type="log" if far else "linear")
+    figure.update_xaxes(type="category")
+    return figure
+
+
+def residual_figure(
+    before: RunFit, after: RunFit, noise: Mapping[str, float | None], points: int
+) -> go.Figure | None:
+    """What free-run simulation missed over time, by the motor without and with the effects."""
+    channels = [one for one in RESIDUALS if residual(before, one) is not None]
+    if not channels:
+        return None
+    figure = make_subplots(rows=len(channels), cols=1, shared_xaxes=True, vertical_spacing=0.05)
+    for row, channel in enumerate(channels, start=1):
+        title, deviation = RESIDUALS[channel]
+        for name, fit, colour in (("before", before, BEFORE), ("after", after, AFTER)):
+            left = residual(fit, channel)
+            if left is None:
+                continue
+            time, values = envelope(fit.time, left, points)
+            line = {"color": colour, "width": 0.8}
+            trace = go.Scatter(
+                x=time, y=values, name=name, line=line, showlegend=row == 1, legendgroup=name
+            )
+            figure.add_trace(trace, row=row, col=1)
+        for level in _two_deviations(noise.get(deviation)):
+            figure.add_hline(y=level, line=DASHED, row=row)  # pyright: ignore[reportArgumentType]
+        figure.update_yaxes(title_text=title, row=row, col=1)
+    figure.update_xaxes(title_text="time [s]", row=len(channels), col=1)
+    style(figure, height=80 + 150 * len(channels))
+    return figure
+
+
+def against_figure(
+    before: Mapping[str, RunFit], after: Mapping[str, RunFit], variable: str, channel: str
+) -> go.Figure | None:
+    """The residual of all runs, averaged over stretches of a variable, before and after."""
+    figure = go.Figure()
+    for name, fits, colour in (("before", before, BEFORE), ("after", after, AFTER)):
+        averaged = averages(fits, variable, channel)
+        if averaged is None:
+            return None
+        line = {"color": colour, "width": 2}
+        trace = go.Scatter(x=averaged[0], y=averaged[1], name=name, mode="lines+markers", line=line)
+        figure.add_trace(trace)
+    style(figure, height=320)
+    figure.update_xaxes(title_text=AXES.get(variable, variable))
+    figure.update_yaxes(
+        title_text=f"mean {RESIDUALS[channel][0]}", zeroline=True, zerolinecolor=INK
+    )
+    return figure
+
+
+def averages(
+    fits: Mapping[str, RunFit], variable: str, channel: str
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Mean variable and mean residual in bins that hold equally many samples, of all runs together."""
+    pairs = [(_values(fit, variable), residual(fit, channel)) for fit in fits.values()]
+    there = [(x, r) for x, r in pairs if x is not None and r is not None]
+    if not there:
+        return None
+    x, left = (np.concatenate(parts) for parts in zip(*there, strict=True))
+    known = np.isfinite(x) & np.isfinite(left)
+    order = np.argsort(x[known], kind="stable")
+    groups = [g for g in np.array_split(order, BINS) if len(g)]
+    means = [(x[known][g].mean(), left[known][g].mean()) for g in groups]
+    return np.array([m[0] for m in means]), np.array([m[1] for m in means])
+
+
+def residual(fit: RunFit, channel: str) -> np.ndarray | None:
+    """Measured minus simulated of "speed" or "current", None where the run does not hold it."""
+    measured, simulated = getattr(fit, channel), getattr(fit, f"{channel}_simulated")
+    return None if measured is None or simulated is None else np.asarray(measured - simulated)
+
+
+def curve_figure(curve: LearnedCurve) -> go.Figure:
+    """A term of an equation as the data draw it, with a band of two standard errors either side."""
+    over, under = curve.value + 2 * curve.stderr, curve.value - 2 * curve.stderr
+    figure = go.Figure()
+    band = go.Scatter(
+        x=np.concatenate([curve.x, curve.x[::-1]]),
+        y=np.concatenate([over, under[::-1]]),
+        fill="toself",
+        mode="none",
+        fillcolor="rgba(11, 95, 204, 0.16)",
+        name="two standard errors",
+        hoverinfo="skip",
+    )
+    line = {"color": AFTER, "width": 2}
+    figure.add_trace(band)
+    figure.add_trace(
+        go.Scatter(x=curve.x, y=curve.value, mode="lines+markers", line=line, name="learned")
+    )
+    style(figure, height=300)
+    figure.update_xaxes(title_text=AXES.get(curve.variable, curve.variable))
+    kind = "torque [N·m]" if curve.unit == "N m" else f"voltage [{curve.unit}]"
+    figure.update_yaxes(title_text=kind, zeroline=True, zerolinecolor=INK)
+    return figure
+
+
+def experiment_figure(experiment: NextExperiment, points: int) -> go.Figure:
+    """The voltage to record next."""
+    time, voltage = envelope(experiment.time, experiment.voltage, points)
+    line = {"color": INPUT, "width": 1.2, "shape": "hv"}
+    figure = go.Figure(go.Scatter(x=time, y=voltage, mode="lines", line=line, name="voltage"))
+    style(figure, height=230)
+    figure.update_xaxes(title_text="time [s]")
+    figure.update_yaxes(title_text="voltage [V]")
+    return figure
+
+
+def _two_deviations(noise: float | None) -> tuple[float, ...]:
+    return (-2 * noise, 2 * noise) if noise else ()
+
+
+def _range(fits: Mapping[str, RunFit], variable: str) -> list[float] | None:
+    """From the lowest to the highest of all runs; None where no run has it."""
+    found = [values for fit in fits.values() if (values := _values(fit, variable)) is not None]
+    if not found:
+        return None
+    return [float(np.nanmin(np.concatenate(found))), float(np.nanmax(np.concatenate(found)))]
+
+
+def _values(fit: RunFit, variable: str) -> np.ndarray | None:
+    """The variable along a run; simulated where it was not measured."""
+    if variable == "time":
+        return np.linspace(0, 1, len(fit.time))
+    measured = getattr(fit, variable, None)
+    return getattr(fit, f"{variable}_simulated", None) if measured is None else np.asarray(measured)

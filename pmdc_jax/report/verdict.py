@@ -1,0 +1,294 @@
+"""A diagnosis in plain English: where it disagrees, what is missing, what adding it did."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..diagnose.diagnosis import Detectable, Diagnosis, EffectFound, Region
+from ..identify.identification import Estimate, Role, RunFit
+from .notation import (
+    amount,
+    chance,
+    enumerate_words,
+    field_words,
+    percent,
+    significant,
+    words_of,
+    write_estimate,
+)
+from .summary import as_sentence, cautions
+
+VERDICTS = {
+    "named": "named",
+    "ambiguous": "ambiguous",
+    "none_detected": "none detected",
+    "not_in_library": "not in the library",
+}
+VARIABLE_UNITS = {"speed": "rad/s", "current": "A", "voltage": "V", "angle": "rad"}
+# a parameter that moved by less is not worth a sentence, in per cent
+NOTEWORTHY = 1.0
+# ends of both directions closer than this ratio are told as one
+ALIKE = 2.0
+
+Interval = tuple[float, float]
+
+
+def verdict_sentences(diagnosis: Diagnosis) -> list[str]:
+    """What was found and what it means, the most important first."""
+    tell = {
+        "none_detected": _none_detected,
+        "named": _named,
+        "ambiguous": _ambiguous,
+        "not_in_library": _not_in_library,
+    }
+    sentences = tell[diagnosis.verdict](diagnosis)
+    if diagnosis.effects:
+        sentences += [_gap(diagnosis), _moved(diagnosis)]
+    return [sentence for sentence in sentences if sentence] + cautions(diagnosis.final)
+
+
+def _none_detected(diagnosis: Diagnosis) -> list[str]:
+    return [
+        "No missing effect was detected: what simulation and measurement differ by is no more than"
+        f" noise may do ({chance(diagnosis.p_nothing)}).",
+        _would_have_been_seen("One would have been seen from these amplitudes on", diagnosis),
+    ]
+
+
+def _named(diagnosis: Diagnosis) -> list[str]:
+    return [
+        _disagreement(diagnosis),
+        f"Missing: {_found(diagnosis)}. Added.",
+        _would_have_been_seen("These runs call for nothing else in the library", diagnosis),
+    ]
+
+
+def _ambiguous(diagnosis: Diagnosis) -> list[str]:
+    names = [effect.name for effect in diagnosis.effects]
+    sets = [names, *(rival.split(" + ") for rival in _rivals(diagnosis))]
+    either = " or ".join(enumerate_words([words_of(name) for name in one]) for one in sets)
+    return [
+        _disagreement(diagnosis),
+        f"These runs cannot tell what is missing: {either} would explain them equally well.",
+        f"Added, as the one that fits best: {_found(diagnosis)}.",
+        _next(diagnosis),
+    ]
+
+
+def _not_in_library(diagnosis: Diagnosis) -> list[str]:
+    sentences = [_disagreement(diagnosis)]
+    if diagnosis.effects:
+        sentences.append(
+            f"{_capital(_found(diagnosis))} explains part of it and was added; what is left is no"
+            " effect of the library."
+        )
+    else:
+        sentences.append("Something is missing that no effect of the library explains.")
+    if diagnosis.curves:
+        curve = diagnosis.curves[0]
+        known = curve.stderr > 0
+        peak = int(np.argmax(np.abs(curve.value) / np.where(known, curve.stderr, np.inf)))
+        kind = "torque opposing motion" if curve.unit == "N m" else "voltage at the terminals"
+        sentences.append(
+            f"Drawn by the data it looks most like a {kind} over {curve.variable}, clearest"
+            f" with {amount(curve.value[peak], curve.unit)} {place(curve.variable, curve.x[peak])}"
+            f" ({chance(curve.p_value)})."
+        )
+    return sentences
+
+
+def disagreement(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> str:
+    """Which equation is off, and where, by the clearest region and those like it."""
+    if not regions:
+        return "by more than noise"
+    clearest = regions[0]
+    alike = [r.region for r in regions if _kind(r) == _kind(clearest)]
+    reach = _reach(clearest.variable, fits)
+    return f"in the {clearest.equation} equation, {stretch(clearest.variable, alike, reach)}"
+
+
+def stretch(variable: str, intervals: Sequence[Interval], reach: float | None = None) -> str:
+    """Intervals of one variable in words; `reach` is the largest size the runs have of it."""
+    joined = _joined(intervals)
+    if variable == "time":
+        parts = [f"{percent(100 * low)} to {percent(100 * high)}" for low, high in joined]
+        return f"from {enumerate_words(parts)} of a run"
+    unit = VARIABLE_UNITS.get(variable, "")
+    ends = _symmetric(joined)
+    if ends is None:
+        parts = [f"from {significant(low)} to {significant(high)} {unit}" for low, high in joined]
+        named = "" if variable == "speed" else f"at a {variable} "
+        return named + enumerate_words(parts)
+    low, high = ends
+    size = f"from {significant(low)} to {significant(high)} {unit}"
+    if low == 0:
+        size = f"below {significant(high)} {unit}"
+    if reach is not None and low == 0 and high > 0.95 * reach:
+        return f"at every {variable}, in both directions"
+    named = "" if variable == "speed" else f"at a {variable} "
+    return f"{named}{size}, in both directions"
+
+
+def _joined(intervals: Sequence[Interval]) -> list[Interval]:
+    """Intervals in order, those that touch made one."""
+    joined: list[Interval] = []
+    for low, high in sorted(intervals):
+        if joined and low <= joined[-1][1]:
+            begin, end = joined.pop()
+            low, high = begin, max(high, end)
+        joined.append((low, high))
+    return joined
+
+
+def _symmetric(intervals: Sequence[Interval]) -> Interval | None:
+    """The sizes that both directions have in common, or None where they do not."""
+    forward = [(max(low, 0.0), high) for low, high in intervals if high > 0]
+    backward = [(max(-high, 0.0), -low) for low, high in intervals if low < 0]
+    if not (forward and backward):
+        return None
+    (nearest, farthest) = zip(*(_hull(side) for side in (forward, backward)), strict=True)
+    if max(farthest) > ALIKE * min(farthest):
+        return None
+    return min(nearest), max(farthest)
+
+
+def _hull(intervals: Sequence[Interval]) -> Interval:
+    lows, highs = zip(*intervals, strict=True)
+    return min(lows), max(highs)
+
+
+def _reach(variable: str, fits: Mapping[str, RunFit]) -> float | None:
+    values = [getattr(fit, variable, None) for fit in fits.values()]
+    sizes = [np.nanmax(np.abs(one)) for one in values if one is not None and len(one)]
+    return float(max(sizes)) if sizes else None
+
+
+def _kind(region: Region) -> tuple[str, str]:
+    return region.equation, region.variable
+
+
+def _disagreement(diagnosis: Diagnosis) -> str:
+    where = disagreement(diagnosis.where, diagnosis.base.fit)
+    return f"Simulation and measurement disagree {where}."
+
+
+def _found(diagnosis: Diagnosis) -> str:
+    return enumerate_words([_effect(effect) for effect in diagnosis.effects])
+
+
+def _effect(effect: EffectFound) -> str:
+    """ "Stribeck friction (coulomb 61 mN·m, static 148 mN·m, speed 11 rad/s; p < 0.001)"."""
+    values = [
+        f"{field_words(effect.name, field)} {_value(estimate)}"
+        for field, estimate in effect.parameters.items()
+    ]
+    if len(values) == 1:
+        (only,) = effect.parameters.values()
+        return f"{words_of(effect.name)} of {_value(only)} ({chance(effect.p_value)})"
+    return f"{words_of(effect.name)} ({', '.join(values)}; {chance(effect.p_value)})"
+
+
+def _value(estimate: Estimate) -> str:
+    written = write_estimate(estimate)
+    return f"{written.value} {written.unit}".strip()
+
+
+def place(variable: str, value: float) -> str:
+    """Where on the axis of a variable."""
+    if variable == "time":
+        return f"at {percent(100 * float(value))} of a run"
+    return f"at {significant(float(value))} {VARIABLE_UNITS.get(variable, '')}".strip()
+
+
+def _rivals(diagnosis: Diagnosis) -> list[str]:
+    return list(dict.fromkeys(r for effect in diagnosis.effects for r in effect.also_possible))
+
+
+def _next(diagnosis: Diagnosis) -> str:
+    experiment = diagnosis.next_experiment
+    if experiment is None:
+        return "No run within the recorded voltage was found that would tell them apart."
+    return (
+        f"To decide, record this: {as_sentence(experiment.description)} It tells them apart with a"
+        f" chance of {percent(100 * experiment.power)}; --experiment OUT.csv writes its voltage."
+    )
+
+
+def would_be_seen(diagnosis: Diagnosis) -> list[Detectable]:
+    """The smallest amplitudes of the effects that were not found."""
+    found = {effect.name for effect in diagnosis.effects}
+    return [one for one in diagnosis.detectable if one.effect not in found]
+
+
+# the three that drives most often have, for a sentence; the table has them all
+TOLD = ("coulomb_friction", "constant_load", "brush_voltage_drop")
+
+
+def _would_have_been_seen(begin: str, diagnosis: Diagnosis) -> str:
+    told = [one for one in would_be_seen(diagnosis) if one.effect in TOLD]
+    parts = [f"{words_of(x.effect)} above {amount(x.amplitude, x.unit)}" for x in told]
+    if not parts:
+        return ""
+    return f"{begin}: {enumerate_words(parts)} would have shown, nine times of ten."
+
+
+def role_that_counts(diagnosis: Diagnosis) -> Role:
+    """Hold-outs are the test where there are any."""
+    return "holdout" if "holdout" in diagnosis.gap else "train"
+
+
+def _gap(diagnosis: Diagnosis) -> str:
+    role = role_that_counts(diagnosis)
+    gap = diagnosis.gap[role]
+    what = "Hold-out" if role == "holdout" else "Training"
+    sentence = f"{what} error {significant(gap.before)} to {significant(gap.after)} times the noise"
+    if diagnosis.closed_fraction is None:
+        return f"{sentence}."
+    return f"{sentence}: {percent(100 * diagnosis.closed_fraction)} of the gap is closed."
+
+
+class Drift(NamedTuple):
+    """A parameter of the plain motor before and after the effects were added."""
+
+    name: str
+    before: Estimate
+    after: Estimate
+
+    @property
+    def percent(self) -> float | None:
+        """By how much it moved."""
+        if not self.before.value or self.after.value is None:
+            return None
+        return 100 * (self.after.value / self.before.value - 1)
+
+
+def drifts(diagnosis: Diagnosis) -> list[Drift]:
+    """How the parameters that both motors have moved."""
+    after = diagnosis.final.parameters
+    return [
+        Drift(name, estimate, after[name])
+        for name, estimate in diagnosis.base.parameters.items()
+        if name in after
+    ]
+
+
+def moved(one: Drift) -> str:
+    """The change in per cent with its sign."""
+    if one.percent is None:
+        return percent(None)
+    return ("+" if one.percent > 0 else "") + percent(one.percent)
+
+
+def _moved(diagnosis: Diagnosis) -> str:
+    far = [one for one in drifts(diagnosis) if abs(one.percent or 0.0) > NOTEWORTHY]
+    far = sorted(far, key=lambda one: -abs(one.percent or 0.0))[:3]
+    if not far:
+        return f"No parameter of the motor moved by more than {NOTEWORTHY:g} %."
+    return f"Adding it moved {enumerate_words([f'{one.name} by {moved(one)}' for one in far])}."
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

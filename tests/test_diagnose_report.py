@@ -1,0 +1,299 @@
+"""The words, tables, JSON and page of a diagnosis, on made-up ones with plausible numbers."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+
+import numpy as np
+import pytest
+from attrs import evolve
+from rich.console import Console
+from test_report import Page, fake_identification, partial_identification
+
+from pmdc_jax.diagnose.diagnosis import (
+    Detectable,
+    Diagnosis,
+    EffectFound,
+    Gap,
+    LearnedCurve,
+    NextExperiment,
+    Region,
+)
+from pmdc_jax.effects import EFFECTS
+from pmdc_jax.identify.identification import Estimate
+from pmdc_jax.report import notation
+from pmdc_jax.report.diagnosis import write_diagnosis
+from pmdc_jax.report.diagnosis_figures import averages
+from pmdc_jax.report.diagnosis_tables import diagnosis_tables
+from pmdc_jax.report.experiment import write_experiment
+from pmdc_jax.report.json import diagnosis_json
+from pmdc_jax.report.verdict import drifts, stretch, verdict_sentences
+
+STRIBECK = {
+    "coulomb_Nm": Estimate(0.0612, 4e-4, (0.0604, 0.0620), "N m", "identified"),
+    "static_Nm": Estimate(0.148, 9e-4, (0.1462, 0.1498), "N m", "identified"),
+    "speed_rad_s": Estimate(11.0, 0.2, (10.6, 11.4), "rad/s", "identified"),
+}
+COULOMB = {"torque_Nm": Estimate(0.05, 1e-3, (0.048, 0.052), "N m", "identified")}
+GAP = Gap(4.9, 1.02, 1.0)
+
+
+def named(**changes) -> Diagnosis:
+    """Stribeck friction found; `changes` replace fields."""
+    base = fake_identification(400)
+    friction = evolve(base.parameters["f"], value=0.4 * base.parameters["f"].value)
+    beside = {f"stribeck_friction.{field}": one for field, one in STRIBECK.items()}
+    parameters = {**base.parameters, "f": friction, **beside}
+    fields = {
+        "verdict": "named",
+        "effects": (EffectFound("stribeck_friction", "mechanical", STRIBECK, 1e-9),),
+        "where": (
+            Region("mechanical", "speed", (-20.0, 0.0), -31.0),
+            Region("mechanical", "speed", (0.0, 18.0), 28.0),
+            Region("mechanical", "time", (0.2, 0.4), 9.0),
+        ),
+        "gap": {"train": Gap(5.1, 1.0, 1.0), "holdout": GAP},
+        "gap_of_run": dict.fromkeys(base.fit, GAP),
+        "closed_fraction": 0.998,
+        "next_experiment": None,
+        "curves": (),
+        "detectable": (
+            Detectable("constant_load", "torque_Nm", 0.004, "N m"),
+            Detectable("torque_constant_saturation", "per_A2", 2e-6, "1/A^2"),
+            Detectable("stribeck_friction", "static_Nm", 0.001, "N m"),
+        ),
+        "base": base,
+        "final": evolve(base, parameters=parameters),
+        "p_nothing": 1e-30,
+        "seconds": {"total": 12.0},
+    }
+    return Diagnosis(**(fields | changes))
+
+
+def none_detected() -> Diagnosis:
+    base = partial_identification()
+    return named(
+        verdict="none_detected",
+        effects=(),
+        where=(),
+        gap={"train": Gap(1.0, 1.0, 1.0)},
+        gap_of_run=dict.fromkeys(base.fit, Gap(1.0, 1.0, 1.0)),
+        closed_fraction=None,
+        base=base,
+        final=base,
+        p_nothing=0.37,
+    )
+
+
+def ambiguous() -> Diagnosis:
+    rivals = ("brush_voltage_drop", "asymmetric_friction + constant_load")
+    time = np.arange(5) * 1e-3
+    return named(
+        verdict="ambiguous",
+        effects=(EffectFound("coulomb_friction", "mechanical", COULOMB, 0.002, rivals),),
+        next_experiment=NextExperiment(
+            "both explain these runs", "creep through zero, 6 s within 12 V", 0.93, time, 3 * time
+        ),
+    )
+
+
+def not_in_library() -> Diagnosis:
+    x = np.array([-100.0, 0.0, 40.0, 100.0])
+    value, stderr = np.array([0.0, 0.001, -0.03, 0.0]), np.full(4, 0.002)
+    curve = LearnedCurve("mechanical", "speed", "N m", x, value, stderr, 1e-8)
+    return named(verdict="not_in_library", effects=(), curves=(curve,))
+
+
+CASES = {one.__name__: one for one in (named, none_detected, ambiguous, not_in_library)}
+
+
+def words(diagnosis: Diagnosis) -> str:
+    return " ".join(verdict_sentences(diagnosis)).replace(notation.NARROW, " ")
+
+
+def test_a_named_effect_in_words():
+    told = words(named())
+    where = "disagree in the mechanical equation, below 20.0 rad/s, in both directions."
+    found = (
+        "Stribeck friction (coulomb 61.20 mN·m, static 148.00 mN·m, speed 11.00 rad/s; p < 0.001)"
+    )
+    assert where in told
+    assert f"Missing: {found}. Added." in told
+    assert "Hold-out error 4.90 to 1.02 times the noise: 99.80 % of the gap is closed." in told
+    assert "f by −60.0 %" in told
+    assert "constant load above 4.00 mN·m would have shown" in told
+    assert "static_Nm" not in told
+
+
+def test_nothing_found_says_what_would_have_been_seen():
+    told = words(none_detected())
+    assert "No missing effect was detected" in told
+    assert "p = 0.37" in told
+    assert "constant load above 4.00 mN·m" in told
+    assert "gap" not in told
+    assert "--tie Kt=Kb" in told  # what identification warns of is not lost
+
+
+def test_rivals_and_the_run_that_decides_in_words():
+    told = words(ambiguous())
+    rivals = (
+        "Coulomb friction or brush voltage drop or"
+        " friction that differs with direction and constant load would explain them equally well"
+    )
+    assert rivals in told
+    assert "Coulomb friction of 50.0 mN·m (p = 0.0020)" in told
+    assert "record this: creep through zero, 6 s within 12 V." in told
+    assert "93.00 %" in told
+    assert "No run within" in words(evolve(ambiguous(), next_experiment=None))
+
+
+def test_what_is_not_in_the_library_in_words():
+    told = words(not_in_library())
+    assert "no effect of the library explains" in told
+    assert "over speed, clearest with −30.0 mN·m at 40.0 rad/s" in told
+    part = words(evolve(not_in_library(), effects=named().effects))
+    assert "Stribeck friction (" in part
+    assert "explains part of it and was added" in part
+
+
+@pytest.mark.parametrize(
+    ("variable", "intervals", "reach", "told"),
+    [
+        ("speed", [(-20.0, 0.0), (0.0, 18.0)], 100.0, "below 20.0 rad/s, in both directions"),
+        ("speed", [(-99.0, 99.0)], 100.0, "at every speed, in both directions"),
+        (
+            "speed",
+            [(-60.0, -30.0), (32.0, 60.0)],
+            None,
+            "from 30.0 to 60.0 rad/s, in both directions",
+        ),
+        ("speed", [(5.0, 20.0), (20.0, 30.0)], None, "from 5.00 to 30.0 rad/s"),
+        (
+            "speed",
+            [(-100.0, -50.0), (5.0, 20.0)],
+            None,
+            "from −100 to −50.0 rad/s and from 5.00 to 20.0 rad/s",
+        ),
+        ("current", [(3.0, 4.0)], None, "at a current from 3.00 to 4.00 A"),
+        ("time", [(0.25, 0.5)], None, "from 25.0 % to 50.0 % of a run"),
+    ],
+)
+def test_stretches_in_words(variable, intervals, reach, told):
+    assert stretch(variable, intervals, reach).replace(notation.NARROW, " ") == told
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_every_effect_has_words_without_units(effect):
+    for field, about in EFFECTS[effect].ranges.items():
+        told = notation.parameter_words(effect, field)
+        assert "_" not in told
+        assert not re.search(r"\d|Nm\b|\bper\b|\brad\b|\bs$|\bV$|\bA$", told), told
+        assert notation.amount(0.00123, about.unit)
+        assert "m1" not in notation.amount(0.00123, about.unit)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_json_follows_the_contract(case):
+    diagnosis = CASES[case]()
+    found = diagnosis_json(diagnosis)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert found["verdict"] == case
+    assert set(found) >= {
+        "parameters",
+        "unidentified_directions",
+        "fit",
+        "noise",
+        "converged",
+        "seed",
+        "seconds",
+    }
+    assert set(found["gap"]) == {"train", "holdout", "closed_fraction"}
+    for effect in found["effects"]:
+        assert set(effect) == {"name", "equation", "parameters", "p_value", "also_possible"}
+        for estimate in effect["parameters"].values():
+            assert set(estimate) >= {"value", "stderr", "ci95", "unit"}
+    for region in found["where"]:
+        assert set(region) == {"equation", "variable", "region", "z"}
+
+
+def test_json_holds_the_numbers():
+    found = diagnosis_json(named())
+    assert found["gap"]["holdout"] == {"before": 4.9, "after": 1.02, "floor": 1.0}
+    assert found["where"][0]["region"] == [-20.0, 0.0]
+    assert found["effects"][0]["parameters"]["static_Nm"]["ci95"] == [0.1462, 0.1498]
+    assert found["before"]["parameters"]["f"]["value"] > found["parameters"]["f"]["value"]
+    assert diagnosis_json(none_detected())["gap"]["holdout"] is None
+    assert found["next_experiment"] is None
+    assert set(diagnosis_json(ambiguous())["next_experiment"]) == {"why", "description", "power"}
+    assert diagnosis_json(not_in_library())["curves"][0]["value"] == [0.0, 0.001, -0.03, 0.0]
+
+
+def test_json_has_null_for_what_is_unknown():
+    region = Region("mechanical", "speed", (0.0, 1.0), float("inf"))
+    assert diagnosis_json(named(where=(region,)))["where"][0]["z"] is None
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_tables_show_everything(case):
+    diagnosis = CASES[case]()
+    console = Console(width=140, record=True, file=io.StringIO())
+    console.print(diagnosis_tables(diagnosis))
+    told = console.export_text()
+    assert "nan" not in told.lower()
+    for run in diagnosis.base.fit:
+        assert run in told
+    for effect in diagnosis.effects:
+        assert EFFECTS[effect.name].label in told
+    assert ("Moved" in told) == bool(diagnosis.effects)
+    assert ("Would have been seen" in told) == (case == "none_detected")
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_page_is_whole_and_loads_nothing(case, tmp_path):
+    diagnosis = CASES[case]()
+    write_diagnosis(diagnosis, tmp_path / "d.html")
+    html = (tmp_path / "d.html").read_text(encoding="utf-8")
+    page = Page(html)
+    assert page.open == []
+    assert len(html) < 6_000_000
+    assert all(url.startswith(("#", "data:")) for url in page.loads), page.loads
+    assert not re.search(r"\b(nan|NaN|inf|Infinity|None)\b", page.text)
+    for sentence in verdict_sentences(diagnosis):
+        assert sentence in page.text
+    for effect in diagnosis.effects:
+        assert EFFECTS[effect.name].formula in page.text
+    drawn = 1 + len(diagnosis.curves) + (diagnosis.next_experiment is not None)
+    drawn += len(diagnosis.base.fit) * (2 if diagnosis.effects else 1)
+    drawn += bool(diagnosis.where)  # where
+    drawn += 1  # against the variable
+    drawn += 2 if len(diagnosis.final.search.best) else 0
+    assert len(page.figures) == drawn
+
+
+def test_what_is_kept_of_a_residual_over_a_variable():
+    """A residual that is a function of speed comes out as that function."""
+    fit = fake_identification(3000).fit["triangle"]
+    made = evolve(fit, speed=fit.speed_simulated + 0.1 * np.sign(fit.speed_simulated))
+    x, mean = averages({"one": made}, "speed", "speed")
+    clear = np.abs(x) > 5
+    np.testing.assert_allclose(mean[clear], 0.1 * np.sign(x[clear]), rtol=1e-9)
+
+
+def test_drift_is_of_the_parameters_that_both_motors_have():
+    found = {one.name: one.percent for one in drifts(named())}
+    assert set(found) == {"R", "L", "Kb", "Kt", "J", "f"}
+    assert found["f"] == pytest.approx(-60)
+    assert found["R"] == 0
+
+
+def test_the_next_experiment_can_be_played(tmp_path):
+    path = tmp_path / "next.csv"
+    assert write_experiment(ambiguous(), path)
+    header, *rows = path.read_text().splitlines()
+    assert header == "time_s,voltage_V"
+    table = np.array([row.split(",") for row in rows], float)
+    np.testing.assert_allclose(table[:, 1], 3 * table[:, 0])
+    assert not write_experiment(named(), tmp_path / "none.csv")
+    assert not (tmp_path / "none.csv").exists()
