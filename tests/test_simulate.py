@@ -331,6 +331,14 @@ def test_squared_errors_are_those_of_the_free_run(x64, candidates):
         np.testing.assert_allclose([current[k], speed[k]], expected, rtol=1e-8)
 
 
+def test_squared_errors_add_up_over_runs_of_different_rates(x64, candidates):
+    runs = [recording(), recording(step=4e-3)]
+    motors = population(candidates)
+    apart = [np.stack(squared_errors(motors, Tape.from_recordings([run]))) for run in runs]
+    together = np.stack(squared_errors(motors, Tape.from_recordings(runs)))
+    np.testing.assert_allclose(together, apart[0] + apart[1], rtol=1e-10)
+
+
 NONSENSE = {
     "R": np.nan,
     "L": 0.0,

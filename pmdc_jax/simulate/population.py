@@ -8,10 +8,9 @@ from functools import partial
 from typing import NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..effects.base import State
 from ..motor import Motor
@@ -30,6 +29,9 @@ from .tape import BLOCK, Samples, Tape
 
 # Samples in a stride of linear motors, a power of two that divides a block: measured, 8 and 32 are slower.
 STRIDE = 16
+
+# The widest vectors, where the processor has them: by default XLA uses half of their width.
+_compiled = partial(jax.jit, compiler_options={"xla_cpu_prefer_vector_width": 512})
 
 # Candidates a thread takes at least: below this, handing them over costs more than it saves.
 SHARE = 64
@@ -101,8 +103,7 @@ def _in_strides(samples: Float[Samples, "... samples"]) -> Float[Array, "... str
     return jnp.asarray(samples).reshape(*samples.shape[:-1], -1, STRIDE)
 
 
-# the widest vectors, where the processor has them: by default XLA uses half of their width
-@partial(jax.jit, compiler_options={"xla_cpu_prefer_vector_width": 512})
+@_compiled
 def _errors_of_linear(motors: Motor, tape: Tape):
     """One share of linear motors: its blocks one after another, the whole population in the state.
 
@@ -113,14 +114,15 @@ def _errors_of_linear(motors: Motor, tape: Tape):
     strides, rows = jax.vmap(_stride)(grids), BLOCK // STRIDE
 
     def advance(carry, block):
-        along, drive = pick_grid(grids, tape, tape.grid[block])
+        grid = jnp.asarray(tape.grid)[block]
+        _, drive = pick_grid(grids, tape, grid)
+        along = jax.tree.map(lambda leaf: _repeated(_taken(leaf, grid), rows), grids)
         samples = (tape.value[block], tape.load[block], tape.measured[block], tape.weight[block])
         initial = motors.rest(*tape.initial[tape.run[block]])
         begins = tape.begins[block]
         state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
-        stride = jax.tree.map(lambda leaf: leaf[tape.grid[block]], strides)
+        stride = jax.tree.map(lambda leaf: leaf[grid], strides)
         end, starts = _starts(stride, state, *samples[:2])
-        along = jax.tree.map(partial(_repeated, rows=rows), along)
         # samples of a stride in front, behind them a row for each stride
         by_sample = jax.tree.map(lambda s: jnp.moveaxis(_in_strides(s), -1, 0)[..., None], samples)
 
@@ -150,13 +152,20 @@ def _finite(errors: Float[Array, " population"]) -> Float[Array, " population"]:
     return jnp.where(jnp.isfinite(errors), errors, jnp.inf)
 
 
+def _taken(grids: Float[Array, "grids ..."], grid: Int[Array, ""]) -> Float[Array, "..."]:
+    """One grid's part, by a matrix product: XLA would merge an index into the arithmetic and give up vectors."""
+    if len(grids) == 1:
+        return grids[0]
+    return jnp.tensordot(jnp.where(jnp.arange(len(grids)) == grid, 1.0, 0.0), grids, 1)
+
+
 def _repeated(
     leaf: Float[Array, "... population"], rows: int
 ) -> Float[Array, "... rows population"]:
     return jnp.broadcast_to(leaf[..., None, :], (*leaf.shape[:-1], rows, leaf.shape[-1]))
 
 
-@eqx.filter_jit
+@_compiled
 def _errors_with_effects(motors: Motor, tape: Tape):
     """One share of motors with effects, from sample to sample."""
     grids, steps = along_grids(motors, tape), steps_in_sample(motors, tape)
