@@ -15,6 +15,7 @@ from .law import Model
 from .objective import Task, exact_cost, score, smooth_cost
 
 STARTS, SCREENED, ITERATIONS = 64, 512, 100
+FINALISTS = 16  # go on with all the motors, after the starts have been followed on the first one alone
 RATE = 0.06  # of the logarithms of the gains, falling to nothing
 WIDTHS = 0.5, 0.05  # of the smooth metrics, at the beginning and at the end
 
@@ -29,7 +30,7 @@ def tuned(
     starts: int = STARTS,
     also: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates of the gains that each start led to, best first, and their exact costs.
+    """Coordinates of the gains that the starts led to, best first, and their exact costs.
 
     Gains are drawn evenly over the logarithms of their ranges; the best of them, and those given, are followed
     down the gradient by Adam, each keeping the best point it has seen.
@@ -42,12 +43,20 @@ def tuned(
     if also is not None:
         drawn[: len(also)] = np.clip(also, lower, upper)
     model = Model.of(space.motor, task.hardware.sample_time)
-    costs = _screen(task, space, model, jax.tree.map(lambda m: m[:1], motors), jnp.asarray(drawn))
-    best = np.argsort(np.asarray(costs), kind="stable")[:starts]
-    refined = _descend(task, space, model, motors, jnp.asarray(drawn[best]), ITERATIONS)
-    exact = _rank(task, space, model, motors, refined)
-    order = np.argsort(np.asarray(exact), kind="stable")
-    return np.asarray(refined)[order], np.asarray(exact)[order]
+    nominal = jax.tree.map(lambda leaf: leaf[:1], motors)
+    costs = _screen(task, space, model, nominal, jnp.asarray(drawn))
+    first = jnp.asarray(drawn[np.argsort(np.asarray(costs), kind="stable")[:starts]])
+    found = _sorted(task, space, model, nominal, _descend(task, space, model, nominal, first))
+    if motors.R.shape[0] > 1:
+        few = jnp.asarray(found[0][:FINALISTS])
+        found = _sorted(task, space, model, motors, _descend(task, space, model, motors, few))
+    return found
+
+
+def _sorted(task, space, model, motors, coordinates: Coordinates) -> tuple[np.ndarray, np.ndarray]:
+    costs = np.asarray(_rank(task, space, model, motors, coordinates))
+    order = np.argsort(costs, kind="stable")
+    return np.asarray(coordinates)[order], costs[order]
 
 
 def _costs(task, space, model, motors, coordinates, width):
@@ -71,10 +80,10 @@ def _rank(task, space, model, motors, coordinates) -> Float[Array, " starts"]:
 
 
 @eqx.filter_jit
-def _descend(task, space, model, motors, start: Coordinates, iterations: int) -> Coordinates:
+def _descend(task, space, model, motors, start: Coordinates) -> Coordinates:
     """All starts at once: the sum of their costs has each one's own gradient."""
     lower, upper = (jnp.asarray(bound) for bound in space.bounds())
-    schedule = optax.cosine_decay_schedule(RATE, iterations)
+    schedule = optax.cosine_decay_schedule(RATE, ITERATIONS)
     optimiser = optax.adam(schedule, b1=0.8, b2=0.95)
 
     def total(x, width):
@@ -83,10 +92,10 @@ def _descend(task, space, model, motors, start: Coordinates, iterations: int) ->
 
     def iteration(carry, k):
         x, state, best, lowest = carry
-        width = WIDTHS[0] * (WIDTHS[1] / WIDTHS[0]) ** jnp.minimum(2 * k / iterations, 1.0)
+        width = WIDTHS[0] * (WIDTHS[1] / WIDTHS[0]) ** jnp.minimum(2 * k / ITERATIONS, 1.0)
         (_, costs), gradient = jax.value_and_grad(total, has_aux=True)(x, width)
         # while the metrics still sharpen, costs of different iterations cannot be compared
-        better = (costs < lowest) | (2 * k <= iterations)
+        better = (costs < lowest) | (2 * k <= ITERATIONS)
         best = jnp.where(better[:, None], x, best)
         lowest = jnp.where(better, costs, lowest)
         updates, state = optimiser.update(jnp.nan_to_num(gradient), state)
@@ -94,5 +103,5 @@ def _descend(task, space, model, motors, start: Coordinates, iterations: int) ->
         return (x, state, best, lowest), None
 
     first = (start, optimiser.init(start), start, jnp.full(start.shape[0], jnp.inf))
-    (_, _, best, _), _ = jax.lax.scan(iteration, first, jnp.arange(iterations))
+    (_, _, best, _), _ = jax.lax.scan(iteration, first, jnp.arange(ITERATIONS))
     return best

@@ -98,6 +98,7 @@ class Margins:
 def margins(motor: Motor, law: Law) -> Margins:
     """Stability and robustness of the linear range, and the amplification of white noise of the measured speed."""
     loop = jax.tree.map(np.asarray, linear_loop(motor, law))
+    loop = _connected(loop)
     step = float(law.hardware.sample_time)
     closed = loop.A + np.outer(loop.B, loop.C)
     if np.abs(np.linalg.eigvals(closed)).max() >= 1 - 1e-12:
@@ -115,6 +116,15 @@ def margins(motor: Motor, law: Law) -> Margins:
         voltage_per_noise=float(np.sqrt(loop.C @ covariance @ loop.C + loop.D**2)),
         speed_per_noise=float(np.sqrt(covariance[1, 1])),
     )
+
+
+def _connected(loop: Loop) -> Loop:
+    """Without the states of the law that no voltage depends on, such as the memory of a filter it has not got."""
+    link = (loop.A != 0).astype(int) + np.outer(loop.B != 0, loop.C != 0) + np.eye(len(loop.A), dtype=int)
+    reaches = np.linalg.matrix_power(link, len(link))
+    needed = (reaches[:2] > 0).any(axis=0) | ((loop.C != 0) @ reaches > 0)
+    A, B, C, N, D = loop
+    return Loop(A[np.ix_(needed, needed)], B[needed], C[needed], N[needed], D)
 
 
 def loop_gain(loop: Loop, angle: np.ndarray) -> np.ndarray:

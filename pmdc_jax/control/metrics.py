@@ -84,9 +84,15 @@ def smooth_settling(
     settling time. A loop that does not settle counts its whole duration.
     """
     outside = jnp.abs((speed - final) / (final - initial)) / BAND - 1
-    to_come = width * jax.lax.cumlogsumexp(outside / width, reverse=True)
+    # jax.lax.cumlogsumexp is the same, but unrolls into a tree that takes the compiler seconds
+    _, to_come = jax.lax.scan(_largest, jnp.asarray(-jnp.inf), outside / width, reverse=True)
     step = time[1] - time[0]
-    return step * jnp.sum(jax.nn.sigmoid(to_come / width))
+    return step * jnp.sum(jax.nn.sigmoid(to_come))
+
+
+def _largest(so_far: Number, value: Number) -> tuple[Number, Number]:
+    largest = jnp.logaddexp(so_far, value)
+    return largest, largest
 
 
 def smooth_overshoot(

@@ -24,6 +24,8 @@ from .metrics import (
 
 # Share of the motors that decides, the worst of them: the tail beyond a 95th percentile, and a little more.
 TAIL = 0.1
+# Cost of a relative steady error: one that fills the band costs as much as half the fastest settling.
+STEADY = 25.0
 
 
 class Task(eqx.Module):
@@ -81,12 +83,18 @@ def _smooth_cost(task: Task, law: Law, motor: Motor, width: Number) -> Float[Arr
         settling / task.limit
         + overshoot_cost(overshoot, 0.8 * task.max_overshoot)
         + 0.1 * recovery / task.limit
-        # draws loops that do not settle yet, and takes out steady errors
+        # draws loops that do not settle yet
         + jnp.mean(error[:split])
         + jnp.mean(error[split:])
-        + 5 * (jnp.mean(error[split * 3 // 4 : split]) + jnp.mean(error[-(split // 4) :]))
+        + STEADY * _late_error(error, split)
         + 0.01 * jnp.mean(jnp.abs(jnp.diff(response.voltage))) / task.hardware.voltage_limit
     )
+
+
+def _late_error(error: Float[Array, " samples"], split: int) -> Float[Array, ""]:
+    """Mean relative error over the last quarter of the step, and of the load."""
+    late = split // 4
+    return jnp.mean(error[split - late : split]) + jnp.mean(error[-late:])
 
 
 def overshoot_cost(overshoot: Number, allowed: Number) -> Float[Array, ""]:
@@ -101,6 +109,7 @@ class Score(NamedTuple):
     settling: Float[Array, " motors"]
     overshoot: Float[Array, " motors"]
     recovery: Float[Array, " motors"]
+    late_error: Float[Array, " motors"]
     peak_current: Float[Array, " motors"]
     sensitivity: Float[Array, ""]
 
@@ -118,8 +127,9 @@ def score(
             response.time[:split], response.speed[:split], task.setpoint, task.initial
         )
         after = load_metrics(response.time[split:], response.speed[split:], task.setpoint)
+        late = _late_error(jnp.abs(response.speed / task.setpoint - 1), split)
         peak = jnp.max(jnp.abs(response.current))
-        return found.SettlingTime, found.Overshoot, after.RecoveryTime, peak
+        return found.SettlingTime, found.Overshoot, after.RecoveryTime, late, peak
 
     first = jax.tree.map(lambda leaf: leaf[0], motors)
     return Score(*jax.vmap(of)(motors), sensitivity_peak(linear_loop(first, law)))
@@ -130,6 +140,7 @@ def exact_cost(task: Task, found: Score) -> Float[Array, ""]:
     never = 10.0 * task.limit
     settling = jnp.nan_to_num(found.settling, nan=never)
     costs = settling / task.limit + 0.1 * jnp.nan_to_num(found.recovery, nan=never) / task.limit
+    costs = costs + STEADY * found.late_error
     costs = costs + 3 * overshoot_cost(found.overshoot, 0.97 * task.max_overshoot)
     cost = _mean_and_tail(costs)
     if task.max_sensitivity is None:

@@ -1,0 +1,403 @@
+"""From a motor and a specification to gains that work on the sampled, limited loop."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from attrs import field, frozen
+
+from ..errors import InputError
+from ..motor import Motor
+from ..motor_file import Uncertainty
+from ..precision import double_precision
+from .classical import ziegler_nichols
+from .controllers import CONTROLLERS, AbstractController
+from .descent import STARTS, tuned
+from .gains import GainSpace
+from .hardware import Hardware
+from .law import Law, Model
+from .limit import fastest_settling
+from .loop import Response, closed_loop
+from .margins import Margins, margins
+from .metrics import load_metrics, step_metrics
+from .objective import Score, Task, score
+from .requirements import check_positive, check_reachable, check_time, reach, spare_torque
+from .spread import drawn_motors
+from .steady import steady_state
+
+if TYPE_CHECKING:
+    from ..report.terminal import ReportProgress
+
+# Motors that take part in the tuning, and that judge it afterwards.
+TUNED_ON, JUDGED_ON = 32, 256
+SUBSTEPS = 10  # instants a sample in what is reported
+NOMINAL_VOLTAGE = 24.0
+MAX_SENSITIVITY = 2.0
+
+
+@frozen
+class Robustness:
+    """The metrics over motors drawn from the uncertainty: 95th percentiles, None where more than 5 % never settle."""
+
+    samples: int
+    Overshoot_p95: float
+    SettlingTime_p95: float | None
+    overshoot: np.ndarray = field(repr=False)  # % of each motor
+    settling: np.ndarray = field(repr=False)  # s of each motor, infinite where it never settles
+
+
+@frozen
+class Candidate:
+    """One way of choosing the gains, and what comes of it."""
+
+    name: str
+    controller: AbstractController
+    metrics: Mapping[str, float | None]
+    robust: Robustness | None
+    stable: bool
+
+
+@frozen
+class Tuning:
+    """Gains, how well they do, and how far that is from what is possible."""
+
+    law: Law
+    motor: Motor
+    setpoint: float
+    max_overshoot: float
+    max_settling: float | None
+    load_torque: float  # N m, the load step that the loop was tried with
+    metrics: Mapping[str, float | None]
+    load: Mapping[str, float | None]
+    peak_current: float
+    margins: Margins
+    fastest_possible_settling: float
+    robust: Robustness | None
+    candidates: tuple[Candidate, ...]
+    response: Response = field(repr=False)
+    load_from: float = 0.0  # s, when the load sets in
+    bundle: np.ndarray | None = field(repr=False, default=None)  # (motors, instants) rad/s
+    seed: int = 0
+    seconds: Mapping[str, float] = field(factory=dict)
+    messages: tuple[str, ...] = ()
+
+    @property
+    def controller(self) -> AbstractController:
+        """The controller with its gains."""
+        return self.law.controller
+
+    @property
+    def hardware(self) -> Hardware:
+        """What it was tuned on."""
+        return self.law.hardware
+
+    @property
+    def meets_specification(self) -> bool:
+        """Are overshoot and, where it was limited, settling within the specification, on the nominal motor?"""
+        overshoot, settling = self.metrics["Overshoot"], self.metrics["SettlingTime"]
+        if overshoot is None or settling is None or overshoot > self.max_overshoot:
+            return False
+        return self.max_settling is None or settling <= self.max_settling
+
+
+@double_precision
+def tune(
+    motor: Motor,
+    controller: str = "pid",
+    *,
+    setpoint: float | None = None,
+    voltage_limit: float | None = None,
+    current_limit: float | None = None,
+    sample_time: float | None = None,
+    max_overshoot: float = 1.0,
+    max_settling: float | None = None,
+    load_torque: float | None = None,
+    delay: int = 1,
+    speed_step: float | None = None,
+    speed_noise: float = 0.0,
+    measures_current: bool = True,
+    uncertainty: Uncertainty | None = None,
+    spread: float | None = None,
+    max_sensitivity: float | None = MAX_SENSITIVITY,
+    starts: int = STARTS,
+    seed: int = 0,
+    progress: ReportProgress | None = None,
+) -> Tuning:
+    """Find the gains with which a motor settles fastest at a set point, within the specification.
+
+    The loop is simulated as it will run: sampled, late, limited in voltage and current, with the anti-windup on the
+    voltage really applied. Gains are screened at random, the best followed down the gradient of the settling time,
+    and judged by exact metrics between the samples.
+
+    **Arguments**: `motor`, of scalars; `controller`, a key of `CONTROLLERS`; `setpoint`, rad/s, by default 80 % of
+    what the voltage reaches; `voltage_limit`, V, by default a quarter above what the set point takes;
+    `current_limit`, A; `sample_time`, s, by default 1 ms or a fortieth of the fastest settling;
+    `max_overshoot`, %; `max_settling`, s; `load_torque`, N m, a load step to withstand, by default half of what
+    can be held; `delay`, samples, 0 or 1; `speed_step`, rad/s, quantum of the speed sensor; `speed_noise`, rad/s;
+    `measures_current`; `uncertainty` of the motor, from its file, or `spread`, a standard deviation of the
+    logarithm of each parameter: then the worst tenth of 32 drawn motors counts for half, and 256 others judge;
+    `max_sensitivity`, of the loop; `starts`, how many are followed; `seed`; `progress`.
+
+    **Raises**: `InputError` for a specification that no controller can meet, with the limit.
+    """
+    begin = time.perf_counter()
+    if controller not in CONTROLLERS:
+        raise InputError(
+            "--controller",
+            f"there is no controller {controller!r}",
+            f"Choose of {', '.join(CONTROLLERS)}",
+        )
+    _check(setpoint, load_torque, max_overshoot, delay, speed_noise, spread)
+    check_positive(
+        voltage_limit=voltage_limit,
+        current_limit=current_limit,
+        sample_time=sample_time,
+        max_settling=max_settling,
+        speed_step=speed_step,
+        max_sensitivity=max_sensitivity,
+    )
+    motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
+    messages: list[str] = []
+    setpoint, voltage_limit = _ask(motor, setpoint, voltage_limit, messages)
+    check_reachable(motor, setpoint, voltage_limit, current_limit, 0.0)
+    if load_torque:
+        check_reachable(motor, setpoint, voltage_limit, current_limit, load_torque, "--load-torque")
+    fastest = fastest_settling(motor, setpoint, voltage_limit, current_limit)
+    fastest = check_time(max_settling, fastest, setpoint)
+    if sample_time is None:
+        sample_time = min(1e-3, _round_number(fastest / 40))
+        messages.append(f"no sample time given: {sample_time:g} s")
+    load = load_torque
+    if load is None:
+        load = spare_torque(motor, setpoint, voltage_limit, current_limit)
+    hardware = Hardware(
+        sample_time=jnp.asarray(sample_time),
+        voltage_limit=jnp.asarray(voltage_limit),
+        current_limit=None if current_limit is None else jnp.asarray(current_limit),
+        speed_step=None if speed_step is None else jnp.asarray(speed_step),
+        delay=delay,
+        measures_current=measures_current,
+    )
+    samples = _few_lengths(max(2.5 * fastest, fastest + 20 * _dead_time(motor, hardware)), hardware)
+    noise = speed_noise * np.random.default_rng(seed).standard_normal(2 * samples)
+    task = Task(
+        hardware=hardware,
+        setpoint=jnp.asarray(setpoint),
+        initial=jnp.asarray(0.0),
+        load=jnp.asarray(load),
+        limit=jnp.asarray(fastest),
+        max_overshoot=jnp.asarray(max(max_overshoot, 0.01)),
+        max_sensitivity=None if max_sensitivity is None else jnp.asarray(max_sensitivity),
+        noise=jnp.asarray(noise),
+        step_samples=samples,
+    )
+    uncertain = spread is not None or uncertainty is not None
+
+    def drawn(count: int, seed: int) -> Motor:
+        known = {} if uncertainty is None else uncertainty._asdict()
+        given = {"spread": spread} if spread is not None else known
+        return drawn_motors(motor, count, seed, **given)
+
+    nominal = jax.tree.map(lambda leaf: leaf[None], motor)
+    among = nominal
+    if uncertain:
+        others = drawn(TUNED_ON, seed)
+        among = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), nominal, others)
+    space = GainSpace(
+        kind=controller,
+        stiffness=jnp.asarray(voltage_limit / abs(setpoint)),
+        duration=jnp.asarray(fastest),
+        sample_time=jnp.asarray(sample_time),
+        motor=motor,
+        setpoint=jnp.asarray(setpoint),
+    )
+    if progress:
+        progress("tuning from many starts")
+    coordinates, _ = tuned(task, space, among, seed, starts)
+    found = space.controller(jnp.asarray(coordinates[0]))
+    if progress:
+        progress("judging the loop", fraction=0.8)
+    judges = drawn(JUDGED_ON, seed + 1) if uncertain else None
+    ours = _candidate("tuned", task, motor, found, judges)
+    others = tuple(_rivals(task, motor, controller, judges))
+    law = Law.of(found, hardware, motor)
+    response, step, after = _judged(task, motor, law)
+    result = Tuning(
+        law=law,
+        motor=motor,
+        setpoint=setpoint,
+        max_overshoot=max_overshoot,
+        max_settling=max_settling,
+        load_torque=load,
+        metrics=step,
+        load=after,
+        peak_current=float(jnp.max(jnp.abs(response.current))),
+        margins=margins(motor, law),
+        fastest_possible_settling=fastest,
+        robust=ours.robust,
+        candidates=(ours, *others),
+        response=Response(*(np.asarray(x) for x in response)),
+        load_from=samples * sample_time,
+        bundle=_bundle(task, law, judges),
+        seed=seed,
+        seconds={"total": time.perf_counter() - begin},
+    )
+    return _with_messages(result, messages)
+
+
+def _ask(
+    motor: Motor, setpoint: float | None, voltage_limit: float | None, messages: list[str]
+) -> tuple[float, float]:
+    """Set point and voltage, from one another where one is missing."""
+    if voltage_limit is None:
+        voltage_limit = NOMINAL_VOLTAGE
+        if setpoint is not None:
+            voltage_limit = float(f"{1.25 * abs(float(steady_state(motor, setpoint)[1])):.3g}")
+        messages.append(f"no voltage limit given: {voltage_limit:g} V")
+    if setpoint is None:
+        setpoint = float(f"{0.8 * reach(motor, voltage_limit):.3g}")
+        messages.append(f"no set point given: {setpoint:g} rad/s, 80 % of what the voltage reaches")
+    return setpoint, voltage_limit
+
+
+def _check(
+    setpoint: float | None,
+    load_torque: float | None,
+    max_overshoot: float,
+    delay: int,
+    speed_noise: float,
+    spread: float | None,
+) -> None:
+    """Refuse what cannot be meant."""
+    if setpoint is not None and not (math.isfinite(setpoint) and setpoint != 0):
+        raise InputError("--setpoint", f"{setpoint:g} is no speed to go to", "Give it in rad/s")
+    if load_torque is not None and not math.isfinite(load_torque):
+        raise InputError("--load-torque", f"{load_torque:g} is not a number", "Give it in N m")
+    for option, value in {
+        "--max-overshoot": max_overshoot,
+        "--speed-noise": speed_noise,
+        "--spread": 0.0 if spread is None else spread,
+    }.items():
+        if not (math.isfinite(value) and value >= 0):
+            raise InputError(option, f"{value:g} is not a number from 0 up", "Give it in SI units")
+    if delay not in (0, 1):
+        raise InputError("--delay", f"{delay} samples are not supported", "Choose 0 or 1")
+
+
+def _round_number(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return float(f"{max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power:.3g}")
+
+
+def _dead_time(motor: Motor, hardware: Hardware) -> float:
+    """What a loop cannot be faster than by much, s: electrical time constant, hold and delay."""
+    return float(motor.L / motor.R) / 4 + (1 + hardware.delay) * float(hardware.sample_time)
+
+
+def _few_lengths(duration: float, hardware: Hardware) -> int:
+    """Samples that cover a duration, rounded up so that few shapes are ever compiled."""
+    needed = max(32, math.ceil(duration / float(hardware.sample_time)))
+    if needed > 20_000:
+        raise InputError(
+            "--sample-time",
+            f"{float(hardware.sample_time):g} s makes {needed} samples of one step",
+            "Choose a longer sample time",
+        )
+    power = 2 ** math.floor(math.log2(needed))
+    return next(n for n in (power, power * 3 // 2, power * 2) if n >= needed)
+
+
+_score = eqx.filter_jit(score)
+
+
+@eqx.filter_jit
+def _simulated(task: Task, motor: Motor, law: Law) -> Response:
+    return closed_loop(motor, law, task.course(), SUBSTEPS)
+
+
+def _judged(task: Task, motor: Motor, law: Law):
+    """The whole response, and the exact metrics of the step and of the load."""
+    response = _simulated(task, motor, law)
+    split = task.step_samples * SUBSTEPS
+    first = (response.time[:split], response.speed[:split], task.setpoint, task.initial)
+    second = (response.time[split:], response.speed[split:], task.setpoint)
+    return response, _known(step_metrics(*first)), _known(load_metrics(*second))
+
+
+def _known(metrics) -> dict[str, float | None]:
+    """Numbers by name, None for what never happens."""
+    values = {name: float(value) for name, value in metrics._asdict().items()}
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+def _candidate(
+    name: str, task: Task, motor: Motor, controller: AbstractController, judges: Motor | None
+) -> Candidate:
+    controller = jax.tree.map(jnp.asarray, controller)
+    law = Law.of(controller, task.hardware, motor)
+    metrics = _judged(task, motor, law)[1]
+    robust = None
+    if judges is not None:
+        model = Model.of(motor, task.hardware.sample_time)
+        robust = _robustness(_score(task, model, judges, controller))
+    return Candidate(name, controller, metrics, robust, margins(motor, law).stable)
+
+
+def _rivals(task: Task, motor: Motor, kind: str, judges: Motor | None):
+    """What the textbook would have chosen."""
+    if kind in ("pi", "pid"):
+        rule = ziegler_nichols(motor, task.hardware, kind)
+        yield _candidate("Ziegler-Nichols", task, motor, rule, judges)
+
+
+def _robustness(found: Score) -> Robustness:
+    settling = np.nan_to_num(np.asarray(found.settling), nan=np.inf)
+    overshoot = np.asarray(found.overshoot)
+    slow = float(np.quantile(settling, 0.95, method="higher"))
+    return Robustness(
+        samples=len(settling),
+        Overshoot_p95=float(np.quantile(overshoot, 0.95, method="higher")),
+        SettlingTime_p95=slow if math.isfinite(slow) else None,
+        overshoot=overshoot,
+        settling=settling,
+    )
+
+
+def _bundle(task: Task, law: Law, judges: Motor | None) -> np.ndarray | None:
+    """Speeds of all drawn motors at every sample, (motors, samples)."""
+    if judges is None:
+        return None
+    return np.asarray(_speeds(task, judges, law))
+
+
+@eqx.filter_jit
+def _speeds(task: Task, motors: Motor, law: Law):
+    return jax.vmap(lambda motor: closed_loop(motor, law, task.course()).speed)(motors)
+
+
+def _with_messages(result: Tuning, messages: list[str]) -> Tuning:
+    from attrs import evolve
+
+    overshoot, settling = result.metrics["Overshoot"], result.metrics["SettlingTime"]
+    if settling is None:
+        messages.append("the loop does not settle: try another controller or a shorter sample time")
+    elif result.max_settling is not None and settling > result.max_settling:
+        messages.append(
+            f"settling takes {settling:.4g} s, longer than the {result.max_settling:g} s asked for"
+        )
+    if overshoot is not None and overshoot > result.max_overshoot:
+        messages.append(
+            f"overshoot is {overshoot:.3g} %, above the {result.max_overshoot:g} % asked for"
+        )
+    peak = result.margins.sensitivity_peak
+    if peak is not None and peak > 1.1 * MAX_SENSITIVITY:
+        messages.append(f"the loop has thin margins: its sensitivity reaches {peak:.2f}")
+    return evolve(result, messages=tuple(messages))
