@@ -8,12 +8,16 @@ import types
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .control.controller_file import load_controller, save_controller
+    from .control.export import export
+    from .control.limit import fastest_settling
+    from .control.tuning import Tuning, tune
     from .demo import demo
     from .errors import InputError
     from .identify.identification import Identification
     from .identify.pipeline import identify
     from .motor import Motor
-    from .motor_file import load_motor, save_motor
+    from .motor_file import load_motor, load_uncertainty, save_motor
     from .recording import Recording, read_recording, write_recording
     from .simulate import simulate
 
@@ -23,12 +27,19 @@ _HOME = {
     "InputError": "errors",
     "Motor": "motor",
     "Recording": "recording",
+    "Tuning": "control.tuning",
     "demo": "demo",
+    "export": "control.export",
+    "fastest_settling": "control.limit",
     "identify": "identify.pipeline",
+    "load_controller": "control.controller_file",
     "load_motor": "motor_file",
+    "load_uncertainty": "motor_file",
     "read_recording": "recording",
+    "save_controller": "control.controller_file",
     "save_motor": "motor_file",
     "simulate": "simulate",
+    "tune": "control.tuning",
     "write_recording": "recording",
 }
 
@@ -37,12 +48,19 @@ __all__ = [
     "InputError",
     "Motor",
     "Recording",
+    "Tuning",
     "demo",
+    "export",
+    "fastest_settling",
     "identify",
+    "load_controller",
     "load_motor",
+    "load_uncertainty",
     "read_recording",
+    "save_controller",
     "save_motor",
     "simulate",
+    "tune",
     "write_recording",
 ]
 

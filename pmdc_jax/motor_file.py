@@ -74,7 +74,9 @@ def load_uncertainty(path: str | Path) -> Uncertainty | None:
     known = {*PARAMETERS, *(f"{e}.{f}" for e, kind in EFFECTS.items() for f in kind.ranges)}
     if not np.isfinite(matrix).all() or not known.issuperset(names):
         raise InputError(
-            where, '"covariance" is not a matrix with its names', "Write it with pmdc identify --save"
+            where,
+            '"covariance" is not a matrix with its names',
+            "Write it with pmdc identify --save",
         )
     return Uncertainty(names, matrix)
 

@@ -15,7 +15,9 @@ from .law import Model
 from .objective import Task, exact_cost, score, smooth_cost
 
 STARTS, SCREENED, ITERATIONS = 64, 512, 100
-FINALISTS = 16  # go on with all the motors, after the starts have been followed on the first one alone
+FINALISTS = (
+    16  # go on with all the motors, after the starts have been followed on the first one alone
+)
 RATE = 0.06  # of the logarithms of the gains, falling to nothing
 WIDTHS = 0.5, 0.05  # of the smooth metrics, at the beginning and at the end
 

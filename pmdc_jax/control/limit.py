@@ -58,9 +58,7 @@ def _with_one_switch(motor: Motor, duration: float, *bounds) -> float:
     early, late = 0, INSTANTS
     while not stays and late - early > 1:
         switch = (early + late) // 2
-        trial, trial_stays = _dash(
-            motor, jnp.asarray(1.5 * duration), jnp.asarray(switch), *bounds
-        )
+        trial, trial_stays = _dash(motor, jnp.asarray(1.5 * duration), jnp.asarray(switch), *bounds)
         if not trial_stays:
             late = switch
             continue

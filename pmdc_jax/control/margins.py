@@ -120,7 +120,11 @@ def margins(motor: Motor, law: Law) -> Margins:
 
 def _connected(loop: Loop) -> Loop:
     """Without the states of the law that no voltage depends on, such as the memory of a filter it has not got."""
-    link = (loop.A != 0).astype(int) + np.outer(loop.B != 0, loop.C != 0) + np.eye(len(loop.A), dtype=int)
+    link = (
+        (loop.A != 0).astype(int)
+        + np.outer(loop.B != 0, loop.C != 0)
+        + np.eye(len(loop.A), dtype=int)
+    )
     reaches = np.linalg.matrix_power(link, len(link))
     needed = (reaches[:2] > 0).any(axis=0) | ((loop.C != 0) @ reaches > 0)
     A, B, C, N, D = loop

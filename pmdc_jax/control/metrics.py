@@ -30,7 +30,9 @@ class StepMetrics(NamedTuple):
     SteadyStateError: Float[Array, ""]
 
 
-def step_metrics(time: Samples, speed: Samples, final: Number, initial: Number = 0.0) -> StepMetrics:
+def step_metrics(
+    time: Samples, speed: Samples, final: Number, initial: Number = 0.0
+) -> StepMetrics:
     """Exact metrics of a step from `initial` to `final`, rad/s, between samples by interpolation.
 
     Crossings are interpolated linearly and peaks by a parabola, so that the error falls with the square of the

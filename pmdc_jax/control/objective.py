@@ -87,7 +87,7 @@ def _smooth_cost(task: Task, law: Law, motor: Motor, width: Number) -> Float[Arr
         + jnp.mean(error[:split])
         + jnp.mean(error[split:])
         + STEADY * _late_error(error, split)
-        + 0.01 * jnp.mean(jnp.abs(jnp.diff(response.voltage))) / task.hardware.voltage_limit
+        + jnp.mean(jnp.abs(jnp.diff(response.voltage))) / task.hardware.voltage_limit
     )
 
 
@@ -110,7 +110,7 @@ class Score(NamedTuple):
     overshoot: Float[Array, " motors"]
     recovery: Float[Array, " motors"]
     late_error: Float[Array, " motors"]
-    peak_current: Float[Array, " motors"]
+    effort: Float[Array, " motors"]
     sensitivity: Float[Array, ""]
 
 
@@ -128,8 +128,9 @@ def score(
         )
         after = load_metrics(response.time[split:], response.speed[split:], task.setpoint)
         late = _late_error(jnp.abs(response.speed / task.setpoint - 1), split)
-        peak = jnp.max(jnp.abs(response.current))
-        return found.SettlingTime, found.Overshoot, after.RecoveryTime, late, peak
+        swings = jnp.abs(jnp.diff(response.voltage[::substeps]))
+        effort = jnp.mean(swings) / task.hardware.voltage_limit
+        return found.SettlingTime, found.Overshoot, after.RecoveryTime, late, effort
 
     first = jax.tree.map(lambda leaf: leaf[0], motors)
     return Score(*jax.vmap(of)(motors), sensitivity_peak(linear_loop(first, law)))
@@ -140,7 +141,7 @@ def exact_cost(task: Task, found: Score) -> Float[Array, ""]:
     never = 10.0 * task.limit
     settling = jnp.nan_to_num(found.settling, nan=never)
     costs = settling / task.limit + 0.1 * jnp.nan_to_num(found.recovery, nan=never) / task.limit
-    costs = costs + STEADY * found.late_error
+    costs = costs + STEADY * found.late_error + found.effort
     costs = costs + 3 * overshoot_cost(found.overshoot, 0.97 * task.max_overshoot)
     cost = _mean_and_tail(costs)
     if task.max_sensitivity is None:

@@ -40,6 +40,8 @@ TUNED_ON, JUDGED_ON = 32, 256
 SUBSTEPS = 10  # instants a sample in what is reported
 NOMINAL_VOLTAGE = 24.0
 MAX_SENSITIVITY = 2.0
+# Noise of the speed that a loop is tuned with at least, over the set point: gains that never saw any would shake.
+TUNING_NOISE = 2e-4
 
 
 @frozen
@@ -186,7 +188,7 @@ def tune(
         measures_current=measures_current,
     )
     samples = _few_lengths(max(2.5 * fastest, fastest + 20 * _dead_time(motor, hardware)), hardware)
-    noise = speed_noise * np.random.default_rng(seed).standard_normal(2 * samples)
+    white = np.random.default_rng(seed).standard_normal(2 * samples)
     task = Task(
         hardware=hardware,
         setpoint=jnp.asarray(setpoint),
@@ -195,7 +197,7 @@ def tune(
         limit=jnp.asarray(fastest),
         max_overshoot=jnp.asarray(max(max_overshoot, 0.01)),
         max_sensitivity=None if max_sensitivity is None else jnp.asarray(max_sensitivity),
-        noise=jnp.asarray(noise),
+        noise=jnp.asarray(speed_noise * white),
         step_samples=samples,
     )
     uncertain = spread is not None or uncertainty is not None
@@ -220,7 +222,9 @@ def tune(
     )
     if progress:
         progress("tuning from many starts")
-    coordinates, _ = tuned(task, space, among, seed, starts)
+    shaken = max(speed_noise, TUNING_NOISE * abs(setpoint)) * white
+    noisy = eqx.tree_at(lambda t: t.noise, task, jnp.asarray(shaken))
+    coordinates, _ = tuned(noisy, space, among, seed, starts)
     found = space.controller(jnp.asarray(coordinates[0]))
     if progress:
         progress("judging the loop", fraction=0.8)

@@ -50,7 +50,7 @@ def run_figure(fit: RunFit, noise: Mapping[str, float | None], points: int) -> g
             # plotly's annotation of `row` knows only "all"
             figure.add_hline(y=level, line=DASHED, row=row)  # pyright: ignore[reportArgumentType]
     figure.update_xaxes(title_text="time [s]", row=len(panels), col=1)
-    _style(figure, height=90 + int(190 * sum(heights)))
+    style(figure, height=90 + int(190 * sum(heights)))
     figure.update_layout(hovermode="x unified")
     return figure
 
@@ -81,7 +81,7 @@ def search_figure(search: Search) -> go.Figure:
     figure.update_xaxes(title_text="generation", row=1, col=1)
     figure.update_xaxes(title_text="refined start", row=1, col=2)
     figure.update_xaxes(dtick=1 if len(search.refined) <= 10 else None, row=1, col=2)
-    _style(figure, height=380)
+    style(figure, height=380)
     return figure
 
 
@@ -105,7 +105,7 @@ def correlation_figure(correlation: np.ndarray, names: Sequence[str]) -> go.Figu
             hovertemplate="%{y} and %{x}: %{z:.3f}<extra></extra>",
         )
     )
-    _style(figure, height=60 + 52 * len(names))
+    style(figure, height=60 + 52 * len(names))
     figure.update_yaxes(autorange="reversed", showgrid=False, showline=False, ticks="")
     figure.update_xaxes(showgrid=False, showline=False, ticks="", side="top")
     figure.update_layout(margin={"t": 30, "l": 40, "b": 10}, modebar={"remove": BUTTONS})
@@ -215,7 +215,8 @@ def _positive(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
 
-def _style(figure: go.Figure, height: int) -> None:
+def style(figure: go.Figure, height: int) -> None:
+    """The look of every figure."""
     figure.update_layout(
         template=go.layout.Template(),  # plotly's own would add 7 kB to every figure
         height=height,
