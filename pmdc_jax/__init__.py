@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .identify.pipeline import identify
     from .motor import Motor
     from .motor_file import load_motor, load_uncertainty, save_motor
+    from .paper import paper
     from .recording import Recording, read_recording, write_recording
     from .simulate import simulate
 
@@ -35,6 +36,7 @@ _HOME = {
     "load_controller": "control.controller_file",
     "load_motor": "motor_file",
     "load_uncertainty": "motor_file",
+    "paper": "paper",
     "read_recording": "recording",
     "save_controller": "control.controller_file",
     "save_motor": "motor_file",
@@ -56,6 +58,7 @@ __all__ = [
     "load_controller",
     "load_motor",
     "load_uncertainty",
+    "paper",
     "read_recording",
     "save_controller",
     "save_motor",

@@ -284,6 +284,23 @@ def export(controller: ControllerFile, c: HeaderFile) -> None:
     export(load_controller(controller), c)
 
 
+@app.command(epilog="Example: pmdc paper --out paper_out")
+def paper(out: Folder = Path("paper_out")) -> None:
+    """Do the wheelchair-motor paper again.
+
+    Its tables and figures beside ours, printed, and as paper.html and paper.json in a folder.
+    """
+    from .paper import paper
+    from .report.paper import paper_tables
+    from .report.terminal import print_tables, progress
+
+    with progress() as on_progress:
+        result = paper(out, progress=on_progress)
+    print_tables(paper_tables(result))
+    for name in ("paper.html", "paper.json"):
+        typer.echo(out / name)
+
+
 @app.command(epilog="Example: pmdc demo --out tour")
 def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
     """Take the tour: identify the packaged sample.

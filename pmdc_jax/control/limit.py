@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..effects.base import State
 from ..motor import Drive, Motor
@@ -78,7 +78,7 @@ def _dash(
     current_limit: Number | None,
     initial: Number,
     load: Number,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """Flat out until instant `switch` or into the band, then full reverse until the speed turns.
 
     **Returns**: when the band is reached (NaN if it is not), and whether its far side is respected.

@@ -73,12 +73,15 @@ def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
 def _characteristic(matrix: Float[Array, "n n"]) -> Float[Array, " n+1"]:
     """Coefficients of det(x - matrix), highest power first, by Faddeev and LeVerrier."""
     size = matrix.shape[0]
-    product, coefficients = jnp.eye(size), [jnp.ones(())]
-    for k in range(1, size + 1):
+    eye = jnp.eye(size)
+
+    def next_coefficient(product, k):
         product = matrix @ product
-        coefficients.append(-jnp.trace(product) / k)
-        product = product + coefficients[-1] * jnp.eye(size)
-    return jnp.stack(coefficients)
+        coefficient = -jnp.trace(product) / k
+        return product + coefficient * eye, coefficient
+
+    _, coefficients = jax.lax.scan(next_coefficient, eye, jnp.arange(1.0, size + 1))
+    return jnp.concatenate([jnp.ones(1), coefficients])
 
 
 @frozen

@@ -274,6 +274,7 @@ def loop_figure(tuning: Tuning):
         trace = go.Scatter(
             x=time[: len(y)].astype(np.float32) if "x" not in options else options.pop("x"),
             y=np.asarray(y, np.float32),
+            mode="lines",
             name=name,
             line={"color": colour, "width": 1.6, **options.pop("line", {})},
             showlegend=shown,
