@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from .control.tuning import Tuning
     from .report.terminal import ReportProgress
 
-PRINTED = Motor(R=0.157378, L=0.0003137, Kb=0.0492, Kt=0.0501, J=0.000466, f=0.0002546)
+TABLE_1 = {"R": 0.157378, "L": 0.0003137, "Kb": 0.0492, "Kt": 0.0501, "J": 0.000466, "f": 0.0002546}
+PRINTED = Motor(*(np.asarray(TABLE_1[name]) for name in PARAMETERS))
 VOLTAGE, SETPOINT, LOWER = 24.0, 481.0, 240.5
 # the printed 0.08 s needs this much
 ENOUGH = 25.0
@@ -99,8 +100,14 @@ def paper(out: str | Path = "paper_out", progress: ReportProgress | None = None)
     tunings = {}
     for k, kind in enumerate(TABLE_2):
         say(f"tuning {kind}", 0.4 + 0.15 * k)
-        limits = {"setpoint": SETPOINT, "voltage_limit": ENOUGH, "sample_time": 1e-3}
-        tunings[kind] = tune(PRINTED, kind, **limits, max_overshoot=0.5)
+        tunings[kind] = tune(
+            PRINTED,
+            kind,
+            setpoint=SETPOINT,
+            voltage_limit=ENOUGH,
+            sample_time=1e-3,
+            max_overshoot=0.5,
+        )
     fastest = {
         volts: fastest_settling(PRINTED, SETPOINT, volts) or float("nan")
         for volts in (24.0, 25.0, 26.0, 28.0, 30.0, 36.0, 48.0)
@@ -168,13 +175,14 @@ def by_ours(seed: int = 0) -> Recovered:
 
 def load_errors(motor: Motor) -> tuple[np.ndarray, np.ndarray]:
     """Figs 5 and 6: error of the steady speed and current on 24 V against the load torques, %."""
-    truth, found = _steady(PRINTED), _steady(motor)
-    return tuple(100 * (b / a - 1) for a, b in zip(truth, found, strict=True))  # type: ignore[return-value]
+    (speed, current), (found_speed, found_current) = _steady(PRINTED), _steady(motor)
+    return 100 * (found_speed / speed - 1), 100 * (found_current / current - 1)
 
 
 def _steady(motor: Motor) -> tuple[np.ndarray, np.ndarray]:
-    speed = (motor.Kt * VOLTAGE - motor.R * LOADS) / (motor.R * motor.f + motor.Kt * motor.Kb)
-    return speed, (motor.f * speed + LOADS) / motor.Kt
+    R, Kb, Kt, f = (float(getattr(motor, name)) for name in ("R", "Kb", "Kt", "f"))
+    speed = (Kt * VOLTAGE - R * LOADS) / (R * f + Kt * Kb)
+    return speed, (f * speed + LOADS) / Kt
 
 
 def _both_steps(tuning: Tuning) -> Response:

@@ -30,9 +30,10 @@ from pmdc_jax.control.classical import ackermann, state_feedback, ultimate_gain,
 from pmdc_jax.control.continuous import continuous_loop
 from pmdc_jax.control.margins import linear_loop, loop_gain, margins, sensitivity_peak
 from pmdc_jax.control.metrics import smooth_overshoot, smooth_settling
-from pmdc_jax.control.spread import drawn_motors
+from pmdc_jax.control.spread import drawn_motors, even_spread
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.motor import PARAMETERS, Motor
+from pmdc_jax.motor_file import Uncertainty
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 MOTOR = Motor(**PAPER)
@@ -96,7 +97,7 @@ def test_the_fastest_settling_brakes_in_time():
     step, target, volts = 1e-6, 20.0, 400.0
     A, B = matrices(step)
     best = np.inf
-    for switch in range(100, 800, 2):
+    for switch in range(100, 800):
         x, speeds = np.zeros(2), []
         for k in range(1600):
             x = A @ x + B[:, 0] * (volts if k < switch else -volts)
@@ -418,7 +419,7 @@ def test_an_unstable_loop_is_said_to_be():
 
 def test_drawn_motors_have_the_covariance_they_were_drawn_from():
     names, root = ("R", "Kt", "J"), np.array([[0.1, 0, 0], [0.05, 0.02, 0], [0.0, 0.04, 0.03]])
-    drawn = drawn_motors(MOTOR, 20_000, 0, names, root @ root.T)
+    drawn = drawn_motors(MOTOR, Uncertainty(names, root @ root.T), 20_000, 0)
     logs = np.log([np.asarray(getattr(drawn, n)) / PAPER[n] for n in names])
     np.testing.assert_allclose(np.cov(logs), root @ root.T, atol=3e-4)
     np.testing.assert_allclose(logs.mean(1), 0, atol=1e-12)
@@ -426,6 +427,6 @@ def test_drawn_motors_have_the_covariance_they_were_drawn_from():
 
 
 def test_a_spread_moves_all_six_alike():
-    drawn = drawn_motors(MOTOR, 4000, 1, spread=0.1)
+    drawn = drawn_motors(MOTOR, even_spread(0.1), 4000, 1)
     for name in PARAMETERS:
         assert np.std(np.log(np.asarray(getattr(drawn, name)))) == pytest.approx(0.1, rel=0.05)

@@ -17,6 +17,8 @@ from .hardware import Hardware
 from .law import Law, Model
 from .margins import linear_loop, loop_gain
 
+Poles = Sequence[complex | float] | np.ndarray
+
 
 @double_precision
 def ultimate_gain(motor: Motor, hardware: Hardware | None) -> tuple[float, float]:
@@ -66,7 +68,7 @@ def ziegler_nichols(motor: Motor, hardware: Hardware | None, kind: str) -> PI | 
     return PID(0.6 * gain, 0.6 * gain / reset, 0.6 * gain * lead, lead / 10, 1.0, reset)
 
 
-def ackermann(A: np.ndarray, B: np.ndarray, poles: Sequence[complex]) -> np.ndarray:
+def ackermann(A: np.ndarray, B: np.ndarray, poles: Poles) -> np.ndarray:
     """The gain K that gives A - B K these eigenvalues: K = (0 ... 0 1) [B AB ...]^-1 p(A).
 
     **Arguments**: `A` (n, n); `B` (n,); `poles`, n of them, complex ones in pairs.
@@ -83,7 +85,7 @@ def ackermann(A: np.ndarray, B: np.ndarray, poles: Sequence[complex]) -> np.ndar
 
 @double_precision
 def state_feedback(
-    motor: Motor, poles: Sequence[complex], setpoint: float, sample_time: float | None = None
+    motor: Motor, poles: Poles, setpoint: float, sample_time: float | None = None
 ) -> StateFeedback | StateFeedbackIntegral:
     """State feedback that puts the poles where they are wanted; a third pole asks for integral action.
 

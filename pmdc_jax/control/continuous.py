@@ -57,10 +57,10 @@ def continuous_loop(
         asked, applied = voltages(state, memory)
         _, speed = motor.sensors(state.current, state.speed)
         moved = controller.rates(memory, reference, speed, applied - asked, 0.0)
-        return motor.derivative(state, applied, load), moved
+        return motor.derivative(state, jnp.asarray(applied), jnp.asarray(load, float)), moved
 
-    at, voltage = steady_state(motor, initial)
-    memory = controller.settled(initial, at.speed, at.current, voltage, 0.0)
+    at, held_by = steady_state(motor, initial)
+    memory = controller.settled(initial, at.speed, at.current, held_by, 0.0)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(rate),
         diffrax.Tsit5(),
@@ -74,4 +74,5 @@ def continuous_loop(
     )
     assert solution.ys is not None
     states, memories = solution.ys
-    return Response(times, states.current, states.speed, voltages(states, memories)[1])
+    voltage = jnp.asarray(voltages(states, memories)[1])
+    return Response(times, states.current, states.speed, voltage)

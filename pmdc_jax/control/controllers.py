@@ -6,7 +6,6 @@ from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..effects.base import Scalars
 
@@ -185,4 +184,3 @@ class StateFeedbackIntegral(AbstractController):
 CONTROLLERS: dict[str, type[AbstractController]] = {
     kind.name: kind for kind in (PI, PID, StateFeedback, StateFeedbackIntegral)
 }
-Gains = Float[Array, "*starts gains"]

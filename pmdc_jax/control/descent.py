@@ -101,7 +101,7 @@ def _descend(task, space, model, motors, start: Coordinates) -> Coordinates:
         best = jnp.where(better[:, None], x, best)
         lowest = jnp.where(better, costs, lowest)
         updates, state = optimiser.update(jnp.nan_to_num(gradient), state)
-        x = jnp.clip(optax.apply_updates(x, updates), lower, upper)
+        x = jnp.clip(jnp.asarray(optax.apply_updates(x, updates)), lower, upper)
         return (x, state, best, lowest), None
 
     first = (start, optimiser.init(start), start, jnp.full(start.shape[0], jnp.inf))

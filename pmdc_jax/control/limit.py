@@ -42,8 +42,9 @@ def fastest_settling(
     """
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
     duration = 10 * float(motor.L / motor.R + motor.J * motor.R / (motor.Kt * motor.Kb))
-    given = (setpoint, voltage_limit, current_limit, initial, load)
-    bounds = [None if x is None else jnp.asarray(x, float) for x in given]
+    bounds = jax.tree.map(
+        jnp.asarray, (setpoint, voltage_limit, current_limit, float(initial), float(load))
+    )
     for _ in range(12):
         reached = float(_dash(motor, jnp.asarray(duration), jnp.asarray(INSTANTS), *bounds)[0])
         if reached == reached:  # not NaN: once more, on instants as close as they can be

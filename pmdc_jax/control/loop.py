@@ -7,6 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..motor import Drive, Motor
@@ -32,10 +33,10 @@ class Course(NamedTuple):
 class Response(NamedTuple):
     """A simulated loop. At instant k: time s, current A, speed rad/s, and the voltage V held from then on."""
 
-    time: Float[Array, " instants"]
-    current: Float[Array, " instants"]
-    speed: Float[Array, " instants"]
-    voltage: Float[Array, " instants"]
+    time: Float[Array | np.ndarray, " instants"]
+    current: Float[Array | np.ndarray, " instants"]
+    speed: Float[Array | np.ndarray, " instants"]
+    voltage: Float[Array | np.ndarray, " instants"]
 
 
 def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Response:
@@ -58,7 +59,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
         current, speed = motor.sensors(state.current, state.speed)
         speed = _quantised(speed + noise, hardware.speed_step)
         memory, decided = law.step(memory, reference, speed, current)
-        applied = acting if hardware.delay else decided
+        applied = jnp.asarray(acting if hardware.delay else decided)
         instants = []
         for _ in range(substeps):
             instants.append((state.current, state.speed, applied))

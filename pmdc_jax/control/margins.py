@@ -17,20 +17,24 @@ from .law import Law, LawState, Model
 FREQUENCIES = 48
 
 
+Matrix = Float[Array | np.ndarray, "n n"]
+Vector = Float[Array | np.ndarray, " n"]
+
+
 class Loop(NamedTuple):
     """The loop cut open at the motor's terminals, per sample: z' = A z + B v + N n, and the voltage C z + D n that
     the law would apply; n is an error of the measured speed."""
 
-    A: Float[Array, "6 6"]
-    B: Float[Array, "6"]
-    C: Float[Array, "6"]
-    N: Float[Array, "6"]
-    D: Float[Array, ""]
+    A: Matrix
+    B: Vector
+    C: Vector
+    N: Vector
+    D: Float[Array | np.ndarray, ""]
 
     @property
-    def closed(self) -> Float[Array, "6 6"]:
+    def closed(self) -> Matrix:
         """The matrix of the closed loop."""
-        return self.A + jnp.outer(self.B, self.C)
+        return self.A + self.B[:, None] * self.C
 
 
 def linear_loop(motor: Motor, law: Law) -> Loop:
@@ -70,7 +74,7 @@ def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
     return jnp.max(jnp.abs(opened) / jnp.maximum(jnp.abs(closed), 1e-300))
 
 
-def _characteristic(matrix: Float[Array, "n n"]) -> Float[Array, " n+1"]:
+def _characteristic(matrix: Matrix) -> Float[Array, " n+1"]:
     """Coefficients of det(x - matrix), highest power first, by Faddeev and LeVerrier."""
     size = matrix.shape[0]
     eye = jnp.eye(size)
@@ -100,19 +104,19 @@ class Margins:
 
 def margins(motor: Motor, law: Law) -> Margins:
     """Stability and robustness of the linear range, and the amplification of white noise of the measured speed."""
-    loop = jax.tree.map(np.asarray, linear_loop(motor, law))
+    loop = Loop(*map(np.asarray, linear_loop(motor, law)))
     loop = _connected(loop)
     step = float(law.hardware.sample_time)
-    closed = loop.A + np.outer(loop.B, loop.C)
+    closed = np.asarray(loop.closed)
     if np.abs(np.linalg.eigvals(closed)).max() >= 1 - 1e-12:
         return Margins(False, None, None, None, None, None, None)
     angle = np.geomspace(1e-5, np.pi, 20_000)
     gain = loop_gain(loop, angle)
-    covariance = _stationary(closed, loop.N + loop.B * loop.D)
+    covariance = _stationary(closed, np.asarray(loop.N + loop.B * loop.D))
     phase, delay = _phase_margin(angle, gain, step)
     return Margins(
         stable=True,
-        gain_margin=_gain_margin(angle, gain),
+        gain_margin=_gain_margin(gain),
         phase_margin_deg=phase,
         delay_margin_s=delay,
         sensitivity_peak=float(np.max(1 / np.abs(1 + gain))),
@@ -142,11 +146,12 @@ def loop_gain(loop: Loop, angle: np.ndarray) -> np.ndarray:
     return -(C @ states)[:, 0]
 
 
-def _gain_margin(angle: np.ndarray, gain: np.ndarray) -> float | None:
+def _gain_margin(gain: np.ndarray) -> float | None:
     """The smallest factor above 1 that brings the loop gain to -1."""
-    crossing = np.flatnonzero((gain.imag[:-1] * gain.imag[1:] <= 0) & (gain.real[:-1] < 0))
-    share = gain.imag[crossing] / (gain.imag[crossing] - gain.imag[crossing + 1] + 1e-300)
-    real = gain.real[crossing] + share * (gain.real[crossing + 1] - gain.real[crossing])
+    x, y = np.real(gain), np.imag(gain)
+    crossing = np.flatnonzero((y[:-1] * y[1:] <= 0) & (x[:-1] < 0))
+    share = y[crossing] / (y[crossing] - y[crossing + 1] + 1e-300)
+    real = x[crossing] + share * (x[crossing + 1] - x[crossing])
     factors = -1 / real[(real > -1) & (real < 0)]
     return float(factors.min()) if factors.size else None
 

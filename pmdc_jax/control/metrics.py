@@ -6,12 +6,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .controllers import Number
 
 BAND = 0.02
-Samples = Float[Array, " instants"]
+Samples = Float[Array | np.ndarray, " instants"]
+One = Float[Array | np.ndarray, ""]
 
 
 class StepMetrics(NamedTuple):
@@ -21,13 +23,13 @@ class StepMetrics(NamedTuple):
     `Undershoot`, % of the step, never negative; `Peak`, rad/s, and `PeakTime`, s; `SteadyStateError`, rad/s.
     """
 
-    RiseTime: Float[Array, ""]
-    SettlingTime: Float[Array, ""]
-    Overshoot: Float[Array, ""]
-    Undershoot: Float[Array, ""]
-    Peak: Float[Array, ""]
-    PeakTime: Float[Array, ""]
-    SteadyStateError: Float[Array, ""]
+    RiseTime: One
+    SettlingTime: One
+    Overshoot: One
+    Undershoot: One
+    Peak: One
+    PeakTime: One
+    SteadyStateError: One
 
 
 def step_metrics(
@@ -60,9 +62,9 @@ class LoadMetrics(NamedTuple):
     """Of a load step: `Deviation`, rad/s, the largest; `RecoveryTime`, s, back into the 2 % band of the set point
     for good; `SteadyStateError`, rad/s."""
 
-    Deviation: Float[Array, ""]
-    RecoveryTime: Float[Array, ""]
-    SteadyStateError: Float[Array, ""]
+    Deviation: One
+    RecoveryTime: One
+    SteadyStateError: One
 
 
 def load_metrics(time: Samples, speed: Samples, reference: Number) -> LoadMetrics:
@@ -78,7 +80,7 @@ def load_metrics(time: Samples, speed: Samples, reference: Number) -> LoadMetric
 
 def smooth_settling(
     time: Samples, speed: Samples, final: Number, initial: Number, width: Number
-) -> Float[Array, ""]:
+) -> One:
     """Settling time with a derivative everywhere, s.
 
     The time during which the largest |error| still to come exceeds the band, with a logistic edge. Maximum and
@@ -97,15 +99,13 @@ def _largest(so_far: Number, value: Number) -> tuple[Number, Number]:
     return largest, largest
 
 
-def smooth_overshoot(
-    speed: Samples, final: Number, initial: Number, width: Number
-) -> Float[Array, ""]:
+def smooth_overshoot(speed: Samples, final: Number, initial: Number, width: Number) -> One:
     """Overshoot in %, maximum and corner at zero softened by `width`, in %; the limit is the exact one."""
     above = 100 * (speed - final) / (final - initial) / width
     return width * jax.nn.softplus(jax.nn.logsumexp(above))
 
 
-def _first_reached(time: Samples, share: Samples, level: float) -> Float[Array, ""]:
+def _first_reached(time: Samples, share: Samples, level: float) -> One:
     """When `share` first reaches `level`."""
     reached = share >= level
     k = jnp.argmax(reached)
@@ -115,7 +115,7 @@ def _first_reached(time: Samples, share: Samples, level: float) -> Float[Array, 
     return jnp.where(jnp.any(reached), jnp.where(k > 0, crossing, time[0]) - time[0], jnp.nan)
 
 
-def _last_inside(time: Samples, outside: Samples) -> Float[Array, ""]:
+def _last_inside(time: Samples, outside: Samples) -> One:
     """Time from the start until `outside` is negative for good."""
     count = outside.size
     out = outside > 0
@@ -127,7 +127,7 @@ def _last_inside(time: Samples, outside: Samples) -> Float[Array, ""]:
     return jnp.where(jnp.any(out), settled, 0.0)
 
 
-def _peak(time: Samples, values: Samples) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _peak(time: Samples, values: Samples) -> tuple[One, One]:
     """Time and height of the largest value, by the parabola through it and its neighbours."""
     k = jnp.argmax(values)
     inside = (k > 0) & (k < values.size - 1)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..motor import Motor
@@ -16,6 +17,7 @@ from .law import Law, Model
 from .loop import Course, closed_loop
 from .margins import linear_loop, sensitivity_peak
 from .metrics import (
+    One,
     load_metrics,
     smooth_overshoot,
     smooth_settling,
@@ -68,7 +70,7 @@ def smooth_cost(
     return cost + jax.nn.relu(peak / task.max_sensitivity - 1)
 
 
-def _smooth_cost(task: Task, law: Law, motor: Motor, width: Number) -> Float[Array, ""]:
+def _smooth_cost(task: Task, law: Law, motor: Motor, width: Number) -> One:
     response = closed_loop(motor, law, task.course())
     split = task.step_samples
     time, speed = response.time[:split], response.speed[:split]
@@ -103,15 +105,18 @@ def overshoot_cost(overshoot: Number, allowed: Number) -> Float[Array, ""]:
     return jnp.minimum(excess / allowed, 0.3) + 0.3 * excess
 
 
+Each = Float[Array | np.ndarray, " motors"]
+
+
 class Score(NamedTuple):
     """Exact figures of one controller on each of the motors."""
 
-    settling: Float[Array, " motors"]
-    overshoot: Float[Array, " motors"]
-    recovery: Float[Array, " motors"]
-    late_error: Float[Array, " motors"]
-    effort: Float[Array, " motors"]
-    sensitivity: Float[Array, ""]
+    settling: Each
+    overshoot: Each
+    recovery: Each
+    late_error: Each
+    effort: Each
+    sensitivity: One
 
 
 def score(

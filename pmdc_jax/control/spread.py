@@ -1,8 +1,6 @@
-"""Motors as they might be: drawn from the uncertainty of an identification, or from a given spread."""
+"""Motors as they might be: drawn from the uncertainty of an identification, or from an even spread."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -10,26 +8,19 @@ import numpy as np
 
 from ..effects import EFFECTS
 from ..motor import PARAMETERS, Motor
+from ..motor_file import Uncertainty
 
 
-def drawn_motors(
-    motor: Motor,
-    count: int,
-    seed: int,
-    names: Sequence[str] = (),
-    covariance: np.ndarray | None = None,
-    spread: float | None = None,
-) -> Motor:
-    """`count` motors about `motor`, stacked; drawn from a normal distribution of the logarithms.
+def even_spread(spread: float) -> Uncertainty:
+    """R, L, Kb, Kt, J and f alike and independent; `spread` is the standard deviation of each one's logarithm."""
+    return Uncertainty(tuple(PARAMETERS), spread**2 * np.eye(len(PARAMETERS)))
 
-    **Arguments**: `names` and `covariance` of the coordinates, as a motor file holds them (of logarithms, except
-    where an effect's table says linear); or `spread`, a standard deviation of the logarithm of each of R, L, Kb,
-    Kt, J and f, alike and independent.
-    """
+
+def drawn_motors(motor: Motor, uncertainty: Uncertainty, count: int, seed: int) -> Motor:
+    """`count` motors about `motor`, stacked; drawn from a normal distribution of the coordinates: logarithms, or
+    the parameters themselves where an effect's table says linear."""
     rng = np.random.default_rng(seed)
-    if spread is not None:
-        names, covariance = tuple(PARAMETERS), spread**2 * np.eye(len(PARAMETERS))
-    assert covariance is not None
+    names, covariance = uncertainty
     deviations = _normal(rng, np.asarray(covariance, float), count)
     stacked = jax.tree.map(lambda leaf: jnp.full(count, leaf, float), motor)
     moved = {name: deviations[:, k] for k, name in enumerate(names)}

@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+import attrs
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,7 +30,7 @@ from .margins import Margins, margins
 from .metrics import load_metrics, step_metrics
 from .objective import Score, Task, score
 from .requirements import check_positive, check_reachable, check_time, reach, spare_torque
-from .spread import drawn_motors
+from .spread import drawn_motors, even_spread
 from .steady import steady_state
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ class Candidate:
     name: str
     controller: AbstractController
     metrics: Mapping[str, float | None]
+    load: Mapping[str, float | None]
     robust: Robustness | None
     stable: bool
 
@@ -72,23 +74,56 @@ class Tuning:
 
     law: Law
     motor: Motor
-    setpoint: float
-    max_overshoot: float
-    max_settling: float | None
-    load_torque: float  # N m, the load step that the loop was tried with
-    metrics: Mapping[str, float | None]
-    load: Mapping[str, float | None]
-    peak_current: float
+    task: Task
+    max_overshoot: float  # %
+    max_settling: float | None  # s
     margins: Margins
-    fastest_possible_settling: float
-    robust: Robustness | None
-    candidates: tuple[Candidate, ...]
-    response: Response = field(repr=False)
-    load_from: float = 0.0  # s, when the load sets in
-    bundle: np.ndarray | None = field(repr=False, default=None)  # (motors, instants) rad/s
-    seed: int = 0
-    seconds: Mapping[str, float] = field(factory=dict)
+    candidates: tuple[Candidate, ...]  # ours first
+    response: Response = field(repr=False, converter=lambda r: Response(*map(np.asarray, r)))
+    bundle: np.ndarray | None = field(repr=False)  # (motors, samples) rad/s, of the drawn motors
+    seed: int
+    seconds: Mapping[str, float]
     messages: tuple[str, ...] = ()
+
+    @property
+    def metrics(self) -> Mapping[str, float | None]:
+        """Of the step, on the nominal motor."""
+        return self.candidates[0].metrics
+
+    @property
+    def load(self) -> Mapping[str, float | None]:
+        """Metrics of the load step, on the nominal motor."""
+        return self.candidates[0].load
+
+    @property
+    def robust(self) -> Robustness | None:
+        """Over the drawn motors, if the motor is uncertain."""
+        return self.candidates[0].robust
+
+    @property
+    def setpoint(self) -> float:
+        """In rad/s."""
+        return float(self.task.setpoint)
+
+    @property
+    def load_torque(self) -> float:
+        """The load step that the loop was tried with, N m."""
+        return float(self.task.load)
+
+    @property
+    def load_from(self) -> float:
+        """When the load sets in, s."""
+        return self.task.step_samples * float(self.hardware.sample_time)
+
+    @property
+    def fastest_possible_settling(self) -> float:
+        """Of any controller within the limits, s."""
+        return float(self.task.limit)
+
+    @property
+    def peak_current(self) -> float:
+        """The largest on the way, A."""
+        return float(np.abs(self.response.current).max())
 
     @property
     def controller(self) -> AbstractController:
@@ -150,13 +185,7 @@ def tune(
     **Raises**: `InputError` for a specification that no controller can meet, with the limit.
     """
     begin = time.perf_counter()
-    if controller not in CONTROLLERS:
-        raise InputError(
-            "--controller",
-            f"there is no controller {controller!r}",
-            f"Choose of {', '.join(CONTROLLERS)}",
-        )
-    _check(setpoint, load_torque, max_overshoot, delay, speed_noise, spread)
+    _check(controller, setpoint, load_torque, max_overshoot, delay, speed_noise, spread)
     check_positive(
         voltage_limit=voltage_limit,
         current_limit=current_limit,
@@ -168,92 +197,99 @@ def tune(
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
     messages: list[str] = []
     setpoint, voltage_limit = _ask(motor, setpoint, voltage_limit, messages)
-    check_reachable(motor, setpoint, voltage_limit, current_limit, 0.0)
-    if load_torque:
-        check_reachable(motor, setpoint, voltage_limit, current_limit, load_torque, "--load-torque")
-    fastest = fastest_settling(motor, setpoint, voltage_limit, current_limit)
-    fastest = check_time(max_settling, fastest, setpoint)
+    fastest = _possible(motor, setpoint, voltage_limit, current_limit, load_torque, max_settling)
     if sample_time is None:
         sample_time = min(1e-3, _round_number(fastest / 40))
         messages.append(f"no sample time given: {sample_time:g} s")
-    load = load_torque
-    if load is None:
-        load = spare_torque(motor, setpoint, voltage_limit, current_limit)
-    hardware = Hardware(
-        sample_time=jnp.asarray(sample_time),
-        voltage_limit=jnp.asarray(voltage_limit),
-        current_limit=None if current_limit is None else jnp.asarray(current_limit),
-        speed_step=None if speed_step is None else jnp.asarray(speed_step),
-        delay=delay,
-        measures_current=measures_current,
+    if load_torque is None:
+        load_torque = spare_torque(motor, setpoint, voltage_limit, current_limit)
+    hardware = _arrays(
+        Hardware(sample_time, voltage_limit, current_limit, speed_step, delay, measures_current)
     )
     samples = _few_lengths(max(2.5 * fastest, fastest + 20 * _dead_time(motor, hardware)), hardware)
-    white = np.random.default_rng(seed).standard_normal(2 * samples)
+    white = jnp.asarray(np.random.default_rng(seed).standard_normal(2 * samples))
     task = Task(
         hardware=hardware,
         setpoint=jnp.asarray(setpoint),
         initial=jnp.asarray(0.0),
-        load=jnp.asarray(load),
+        load=jnp.asarray(load_torque),
         limit=jnp.asarray(fastest),
         max_overshoot=jnp.asarray(max(max_overshoot, 0.01)),
         max_sensitivity=None if max_sensitivity is None else jnp.asarray(max_sensitivity),
-        noise=jnp.asarray(speed_noise * white),
+        noise=speed_noise * white,
         step_samples=samples,
     )
-    uncertain = spread is not None or uncertainty is not None
-
-    def drawn(count: int, seed: int) -> Motor:
-        known = {} if uncertainty is None else uncertainty._asdict()
-        given = {"spread": spread} if spread is not None else known
-        return drawn_motors(motor, count, seed, **given)
-
-    nominal = jax.tree.map(lambda leaf: leaf[None], motor)
-    among = nominal
-    if uncertain:
-        others = drawn(TUNED_ON, seed)
-        among = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), nominal, others)
-    space = GainSpace(
-        kind=controller,
-        stiffness=jnp.asarray(voltage_limit / abs(setpoint)),
-        duration=jnp.asarray(fastest),
-        sample_time=jnp.asarray(sample_time),
-        motor=motor,
-        setpoint=jnp.asarray(setpoint),
-    )
+    motors, judges = _motors(motor, uncertainty, spread, seed)
+    stiffness, duration = jnp.asarray(voltage_limit / abs(setpoint)), task.limit
+    space = GainSpace(controller, stiffness, duration, hardware.sample_time, motor, task.setpoint)
     if progress:
         progress("tuning from many starts")
     shaken = max(speed_noise, TUNING_NOISE * abs(setpoint)) * white
-    noisy = eqx.tree_at(lambda t: t.noise, task, jnp.asarray(shaken))
-    coordinates, _ = tuned(noisy, space, among, seed, starts)
-    found = space.controller(jnp.asarray(coordinates[0]))
+    noisy = eqx.tree_at(lambda t: t.noise, task, shaken)
+    coordinates, _ = tuned(noisy, space, motors, seed, starts)
     if progress:
         progress("judging the loop", fraction=0.8)
-    judges = drawn(JUDGED_ON, seed + 1) if uncertain else None
-    ours = _candidate("tuned", task, motor, found, judges)
-    others = tuple(_rivals(task, motor, controller, judges))
-    law = Law.of(found, hardware, motor)
-    response, step, after = _judged(task, motor, law)
+    law = Law.of(space.controller(jnp.asarray(coordinates[0])), hardware, motor)
     result = Tuning(
         law=law,
         motor=motor,
-        setpoint=setpoint,
+        task=task,
         max_overshoot=max_overshoot,
         max_settling=max_settling,
-        load_torque=load,
-        metrics=step,
-        load=after,
-        peak_current=float(jnp.max(jnp.abs(response.current))),
         margins=margins(motor, law),
-        fastest_possible_settling=fastest,
-        robust=ours.robust,
-        candidates=(ours, *others),
-        response=Response(*(np.asarray(x) for x in response)),
-        load_from=samples * sample_time,
-        bundle=_bundle(task, law, judges),
+        candidates=(
+            _candidate("tuned", task, motor, law.controller, judges),
+            *_rivals(task, motor, controller, judges),
+        ),
+        response=_simulated(task, motor, law),
+        bundle=None if judges is None else np.asarray(_speeds(task, judges, law)),
         seed=seed,
         seconds={"total": time.perf_counter() - begin},
     )
-    return _with_messages(result, messages)
+    return attrs.evolve(result, messages=(*messages, *_verdicts(result)))
+
+
+def judged(tuning: Tuning, spread: float, seed: int) -> Robustness | None:
+    """How a tuning does on motors it was not tuned for; see `tune` for `spread`."""
+    with jax.enable_x64(True):
+        _, judges = _motors(tuning.motor, None, spread, seed)
+        task, motor = tuning.task, tuning.motor
+        return _candidate("tuned", task, motor, tuning.controller, judges).robust
+
+
+def _possible(
+    motor: Motor,
+    setpoint: float,
+    voltage_limit: float,
+    current_limit: float | None,
+    load_torque: float | None,
+    max_settling: float | None,
+) -> float:
+    """The fastest settling there can be, s, once the specification is known to be within what is possible."""
+    check_reachable(motor, setpoint, voltage_limit, current_limit, 0.0)
+    if load_torque:
+        check_reachable(motor, setpoint, voltage_limit, current_limit, load_torque, "--load-torque")
+    fastest = fastest_settling(motor, setpoint, voltage_limit, current_limit)
+    return check_time(max_settling, fastest, setpoint)
+
+
+def _motors(
+    motor: Motor, uncertainty: Uncertainty | None, spread: float | None, seed: int
+) -> tuple[Motor, Motor | None]:
+    """Those to tune on, the nominal one first, and those that judge; stacked."""
+    nominal = jax.tree.map(lambda leaf: leaf[None], motor)
+    if spread is not None:
+        uncertainty = even_spread(spread)
+    if uncertainty is None:
+        return nominal, None
+    others = drawn_motors(motor, uncertainty, TUNED_ON, seed)
+    motors = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), nominal, others)
+    return motors, drawn_motors(motor, uncertainty, JUDGED_ON, seed + 1)
+
+
+def _arrays(hardware: Hardware) -> Hardware:
+    """Numbers as arrays, so that other numbers need not be compiled again."""
+    return jax.tree.map(lambda x: jnp.asarray(x, float), hardware)
 
 
 def _ask(
@@ -272,6 +308,7 @@ def _ask(
 
 
 def _check(
+    controller: str,
     setpoint: float | None,
     load_torque: float | None,
     max_overshoot: float,
@@ -280,6 +317,12 @@ def _check(
     spread: float | None,
 ) -> None:
     """Refuse what cannot be meant."""
+    if controller not in CONTROLLERS:
+        raise InputError(
+            "--controller",
+            f"there is no controller {controller!r}",
+            f"Choose of {', '.join(CONTROLLERS)}",
+        )
     if setpoint is not None and not (math.isfinite(setpoint) and setpoint != 0):
         raise InputError("--setpoint", f"{setpoint:g} is no speed to go to", "Give it in rad/s")
     if load_torque is not None and not math.isfinite(load_torque):
@@ -327,15 +370,6 @@ def _simulated(task: Task, motor: Motor, law: Law) -> Response:
     return closed_loop(motor, law, task.course(), SUBSTEPS)
 
 
-def _judged(task: Task, motor: Motor, law: Law):
-    """The whole response, and the exact metrics of the step and of the load."""
-    response = _simulated(task, motor, law)
-    split = task.step_samples * SUBSTEPS
-    first = (response.time[:split], response.speed[:split], task.setpoint, task.initial)
-    second = (response.time[split:], response.speed[split:], task.setpoint)
-    return response, _known(step_metrics(*first)), _known(load_metrics(*second))
-
-
 def _known(metrics) -> dict[str, float | None]:
     """Numbers by name, None for what never happens."""
     values = {name: float(value) for name, value in metrics._asdict().items()}
@@ -347,12 +381,16 @@ def _candidate(
 ) -> Candidate:
     controller = jax.tree.map(jnp.asarray, controller)
     law = Law.of(controller, task.hardware, motor)
-    metrics = _judged(task, motor, law)[1]
+    response = _simulated(task, motor, law)
+    split = task.step_samples * SUBSTEPS
+    step = (response.time[:split], response.speed[:split], task.setpoint, task.initial)
+    after = (response.time[split:], response.speed[split:], task.setpoint)
     robust = None
     if judges is not None:
         model = Model.of(motor, task.hardware.sample_time)
         robust = _robustness(_score(task, model, judges, controller))
-    return Candidate(name, controller, metrics, robust, margins(motor, law).stable)
+    found = _known(step_metrics(*step)), _known(load_metrics(*after))
+    return Candidate(name, controller, *found, robust, margins(motor, law).stable)
 
 
 def _rivals(task: Task, motor: Motor, kind: str, judges: Motor | None):
@@ -375,21 +413,14 @@ def _robustness(found: Score) -> Robustness:
     )
 
 
-def _bundle(task: Task, law: Law, judges: Motor | None) -> np.ndarray | None:
-    """Speeds of all drawn motors at every sample, (motors, samples)."""
-    if judges is None:
-        return None
-    return np.asarray(_speeds(task, judges, law))
-
-
 @eqx.filter_jit
 def _speeds(task: Task, motors: Motor, law: Law):
     return jax.vmap(lambda motor: closed_loop(motor, law, task.course()).speed)(motors)
 
 
-def _with_messages(result: Tuning, messages: list[str]) -> Tuning:
-    from attrs import evolve
-
+def _verdicts(result: Tuning) -> list[str]:
+    """What of the specification is not met, and what is to be minded."""
+    messages = []
     overshoot, settling = result.metrics["Overshoot"], result.metrics["SettlingTime"]
     if settling is None:
         messages.append("the loop does not settle: try another controller or a shorter sample time")
@@ -404,4 +435,4 @@ def _with_messages(result: Tuning, messages: list[str]) -> Tuning:
     peak = result.margins.sensitivity_peak
     if peak is not None and peak > 1.1 * MAX_SENSITIVITY:
         messages.append(f"the loop has thin margins: its sensitivity reaches {peak:.2f}")
-    return evolve(result, messages=tuple(messages))
+    return messages

@@ -232,5 +232,5 @@ def _terminal_table(title: str, headings: list[str], rows: list[list[str]]) -> T
     for k, heading in enumerate(headings):
         table.add_column(Text(heading), justify="left" if k == 0 else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))  # a cell such as [s] is not markup
     return table
