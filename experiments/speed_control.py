@@ -20,7 +20,7 @@ from pmdc_jax.control import fastest_settling, step_metrics
 from pmdc_jax.control.continuous import continuous_loop
 from pmdc_jax.control.spread import drawn_motors, even_spread
 from pmdc_jax.control.tuning import JUDGED_ON, Robustness, Tuning, judged, tune
-from pmdc_jax.paper import PRINTED, SETPOINT
+from pmdc_jax.wheelchair import PRINTED, SETPOINT
 
 KINDS = ("pi", "pid", "state-feedback")
 IDEAL = {"sample_time": 1e-4, "delay": 0, "max_overshoot": 0.06}

@@ -28,7 +28,7 @@ from .limit import fastest_settling
 from .loop import Response, closed_loop
 from .margins import Margins, margins
 from .metrics import load_metrics, step_metrics
-from .objective import Score, Task, score
+from .objective import LOWER, PARTS, Score, Task, score
 from .requirements import check_positive, check_reachable, check_time, reach, spare_torque
 from .spread import drawn_motors, even_spread
 from .steady import steady_state
@@ -64,6 +64,7 @@ class Candidate:
     controller: AbstractController
     metrics: Mapping[str, float | None]
     load: Mapping[str, float | None]
+    second: Mapping[str, float | None]  # of the step from the set point to half of it
     robust: Robustness | None
     stable: bool
 
@@ -207,11 +208,10 @@ def tune(
         Hardware(sample_time, voltage_limit, current_limit, speed_step, delay, measures_current)
     )
     samples = _few_lengths(max(2.5 * fastest, fastest + 20 * _dead_time(motor, hardware)), hardware)
-    white = jnp.asarray(np.random.default_rng(seed).standard_normal(2 * samples))
+    white = jnp.asarray(np.random.default_rng(seed).standard_normal(PARTS * samples))
     task = Task(
         hardware=hardware,
         setpoint=jnp.asarray(setpoint),
-        initial=jnp.asarray(0.0),
         load=jnp.asarray(load_torque),
         limit=jnp.asarray(fastest),
         max_overshoot=jnp.asarray(max(max_overshoot, 0.01)),
@@ -382,14 +382,16 @@ def _candidate(
     controller = jax.tree.map(jnp.asarray, controller)
     law = Law.of(controller, task.hardware, motor)
     response = _simulated(task, motor, law)
-    split = task.step_samples * SUBSTEPS
-    step = (response.time[:split], response.speed[:split], task.setpoint, task.initial)
-    after = (response.time[split:], response.speed[split:], task.setpoint)
+    step, loaded, second = task.parts(response, SUBSTEPS)
     robust = None
     if judges is not None:
         model = Model.of(motor, task.hardware.sample_time)
         robust = _robustness(_score(task, model, judges, controller))
-    found = _known(step_metrics(*step)), _known(load_metrics(*after))
+    found = (
+        _known(step_metrics(*step, task.setpoint)),
+        _known(load_metrics(*loaded, task.setpoint)),
+        _known(step_metrics(*second, LOWER * task.setpoint, task.setpoint)),
+    )
     return Candidate(name, controller, *found, robust, margins(motor, law).stable)
 
 

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..motor import PARAMETERS
-from ..paper import (
+from ..wheelchair import (
     ENOUGH,
     LOADS,
     LOWER,

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from ..control.controller_file import gains_of, law_content
 from ..control.metrics import BAND
+from ..control.objective import LOWER
 from ..control.tuning import Candidate, Robustness, Tuning
 from .notation import NARROW, UNKNOWN, percent, pretty_unit, significant
 
@@ -47,6 +48,7 @@ def tuning_json(tuning: Tuning) -> dict[str, Any]:
         "fastest_possible_settling_s": tuning.fastest_possible_settling,
         "robust": _robust_json(tuning.robust),
         "load": {"torque_Nm": tuning.load_torque, **tuning.load},
+        "second_step": {"to_rad_s": LOWER * tuning.setpoint, **tuning.candidates[0].second},
         "margins": {
             name: getattr(tuning.margins, name)
             for name in (
@@ -285,15 +287,17 @@ def loop_figure(tuning: Tuning):
     if tuning.bundle is not None:
         per_sample = time[:: max(1, len(time) // tuning.bundle.shape[1])]
         low, high = np.quantile(tuning.bundle, [0.05, 0.95], axis=0)
-        edge = {"width": 0}
-        line(1, low, "5 %", MEASURED, x=per_sample, line=edge)
+        none = {"width": 0}
+        line(1, low, "5 %", MEASURED, x=per_sample, line=none)
         fill = {"fill": "tonexty", "fillcolor": "rgba(163,176,192,0.35)"}
-        line(1, high, "90 % of the motors", MEASURED, True, x=per_sample, line=edge, **fill)
-    target = np.full(2, tuning.setpoint)
-    ends = np.array([0.0, time[-1]])
-    for level in (1 - BAND, 1 + BAND):
-        line(1, level * target, "2 % band", RESIDUAL, x=ends, line={"width": 0.8, "dash": "dot"})
-    line(1, target, "set point", INPUT, True, x=ends, line={"width": 1.0, "dash": "dash"})
+        line(1, high, "90 % of the motors", MEASURED, True, x=per_sample, line=none, **fill)
+    ends, down = np.array([0.0, time[-1]]), 2e3 * tuning.load_from
+    corners, target = np.array([0.0, down, down, time[-1]]), np.array([1.0, 1.0, LOWER, LOWER])
+    for edge in (-BAND, BAND):
+        band = tuning.setpoint * (target + edge * np.array([1.0, 1.0, LOWER, LOWER]))
+        line(1, band, "2 % band", RESIDUAL, x=corners, line={"width": 0.8, "dash": "dot"})
+    wanted = tuning.setpoint * target
+    line(1, wanted, "set point", INPUT, True, x=corners, line={"width": 1.0, "dash": "dash"})
     line(1, response.speed, "speed", SIMULATED, True)
     line(2, response.voltage, "voltage", SIMULATED, line={"shape": "hv"})
     line(3, response.current, "current", SIMULATED)
