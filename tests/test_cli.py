@@ -67,7 +67,9 @@ def refused(capsys, *arguments: str) -> str:
     return err
 
 
-@pytest.mark.parametrize("command", [(), ("identify",), ("simulate",), ("demo",)])
+@pytest.mark.parametrize(
+    "command", [(), ("identify",), ("simulate",), ("demo",), ("tune",), ("export",), ("paper",)]
+)
 def test_help_shows_an_example(capsys, command):
     assert cli.main([*command, "--help"]) == 0
     out, err = capsys.readouterr()

@@ -113,7 +113,7 @@ def _late(error: Samples) -> One:
     return jnp.mean(jnp.abs(error)[-(error.size // 4) :])
 
 
-def overshoot_cost(overshoot: Number, allowed: Number) -> Float[Array, ""]:
+def overshoot_cost(overshoot: Number, allowed: Number) -> Number:
     """Nothing within what is allowed; beyond, steeply what is missing in proportion, then in per cent."""
     excess = jax.nn.relu(overshoot - allowed)
     return jnp.minimum(excess / allowed, 0.3) + 0.3 * excess
