@@ -2,8 +2,8 @@
 
 1,024 PID loops of the paper's motor, 200 samples of 1 ms with a sample of delay, saturation and
 back-calculation, double precision. Ours beside the same law in numba (threads, and vectors where
-LLVM finds them), beside `control.forced_response`, which knows no limits and so is compared on gentle
-gains without any, and beside gym-electric-motor where that is installed.
+LLVM finds them), and beside `control.forced_response`, which knows no limits and so is compared on
+gentle gains without any.
 """
 
 import jax
