@@ -23,7 +23,7 @@ from pmdc_jax.simulate import Tape, free_run, uniform
 
 RUNS = ("prbs", "loaded")
 SETPOINT, VOLTS, SAMPLES = 200.0, 18.0, 200
-GAINS = PID(0.35, 6.0, 0.0006, 0.001, 1.0, 0.03)
+GAINS = PID(0.3, 25.0, 0.0003, 0.001, 1.0, 0.2)
 
 
 def motor_of(logarithms) -> Motor:

@@ -29,6 +29,7 @@ from pmdc_jax.control import (
 )
 from pmdc_jax.control.classical import ackermann, state_feedback, ultimate_gain, ziegler_nichols
 from pmdc_jax.control.continuous import continuous_loop
+from pmdc_jax.control.loop import steps_in_sample
 from pmdc_jax.control.margins import linear_loop, loop_gain, margins, sensitivity_peak
 from pmdc_jax.control.metrics import smooth_overshoot, smooth_settling
 from pmdc_jax.control.spread import drawn_motors, even_spread
@@ -341,6 +342,43 @@ def test_friction_that_sticks_and_a_warming_winding_close_the_loop_too():
     warm = PAPER["R"] * (1 + 0.01 * float(voltage - PAPER["Kb"] * SETPOINT) * current)
     assert float(voltage) == pytest.approx(PAPER["Kb"] * SETPOINT + warm * current, rel=1e-6)
     assert fastest_settling(motor, SETPOINT, 30.0) > fastest_settling(MOTOR, SETPOINT, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("speed_sensor_delay", {"delay_s": 0.0025}),
+        ("speed_sensor_lag", {"time_constant_s": 0.002}),
+        ("gear_backlash", {"gap_rad": 1e-3, "stiffness_Nm_rad": 30.0, "load_share": 0.1}),
+    ],
+)
+def test_a_loop_through_slow_sensors_and_loose_gears_comes_to_its_set_point(name, parameters):
+    values = {"damping_Nms_rad": 0.01} | parameters if "gap_rad" in parameters else parameters
+    effect = EFFECTS[name](**{field: jnp.asarray(value) for field, value in values.items()})
+    motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
+    gentle = PID(0.2, 8.0, 2e-4, 5e-4, 1.0, 0.02)
+    law = Law.of(gentle, Hardware(1e-3, 30.0, 100.0, None, 1), motor)
+    response = run(motor, law, course(400), steps_in_sample(motor, 1e-3))
+    assert float(response.speed[-1]) == pytest.approx(SETPOINT, abs=0.01)
+    assert float(response.voltage[-1]) == pytest.approx(
+        float(steady_state(motor, SETPOINT)[1]), abs=1e-3
+    )
+
+
+def test_a_late_speed_is_the_same_as_late_samples():
+    """A sensor late by two samples and a law at once, against the loop written out in numpy."""
+    effect = EFFECTS["speed_sensor_delay"](delay_s=jnp.asarray(2e-3))
+    motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
+    law = Law.of(PI(0.05, 1.0, 1.0, 0.02), Hardware(1e-3, 30.0), motor)
+    A, B = matrices(1e-3)
+    x, integral, speeds = np.zeros(2), 0.0, [0.0, 0.0, 0.0]
+    for _ in range(150):
+        speeds.append(x[1])
+        asked = 0.05 * (SETPOINT - speeds[-3]) + integral
+        applied = np.clip(asked, -30, 30)
+        integral += 1e-3 * ((SETPOINT - speeds[-3]) + (applied - asked) / 0.02)
+        x = A @ x + B[:, 0] * applied
+    np.testing.assert_allclose(run(motor, law, course(150)).speed, speeds[3:], atol=1e-6)
 
 
 # ------------------------------------------------------------------------------- rules and margins

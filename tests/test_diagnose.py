@@ -181,7 +181,10 @@ def test_response_is_the_change_of_the_simulation(x64, name):
 
 def recorded(motor: vb.BenchMotor, seed: int, noise: vb.Noise) -> list[Recording]:
     """Three short runs of the virtual bench, which shares no code with the package."""
-    rng, quantities = np.random.default_rng(seed), ("time_s", "voltage_V", "current_A", "speed_rad_s")
+    rng, quantities = (
+        np.random.default_rng(seed),
+        ("time_s", "voltage_V", "current_A", "speed_rad_s"),
+    )
     excitations = {
         "prbs": vb.prbs(rng, 2.0),
         "triangle": vb.slow_triangle(2.0),

@@ -32,7 +32,7 @@ def continuous_loop(
     """Simulate a motor under a controller in continuous time, from steady running at `initial`.
 
     Solved by Tsit5 with adaptive steps; differentiable in gains, motor and reference. For motors whose effects are
-    smooth.
+    smooth; a delay of the speed sensor is left out.
 
     **Arguments**: `times`, s, increasing from 0; `reference` and `initial`, rad/s; `voltage_limit`, V;
     `current_limit`, A, None for none; `load`, N m, from the start; `tolerance`, relative, and absolute in A,
@@ -40,7 +40,7 @@ def continuous_loop(
     """
 
     def voltages(state: State, memory: Memory) -> tuple[Number, Number]:
-        current, speed = motor.sensors(state.current, state.speed)
+        current, speed = motor.sensors(state)
         asked = controller.command(memory, reference, speed, current, 0.0)
         applied = asked
         if current_limit is not None:
@@ -55,7 +55,7 @@ def continuous_loop(
     def rate(t, y, args):
         state, memory = y
         asked, applied = voltages(state, memory)
-        _, speed = motor.sensors(state.current, state.speed)
+        _, speed = motor.sensors(state)
         moved = controller.rates(memory, reference, speed, applied - asked, 0.0)
         return motor.derivative(state, jnp.asarray(applied), jnp.asarray(load, float)), moved
 

@@ -16,6 +16,9 @@ from .controllers import Number
 from .law import Law
 from .steady import steady_state
 
+# Samples that a slow speed sensor can be late.
+REMEMBERED = 32
+
 
 class Course(NamedTuple):
     """What is asked of the loop, held from sample to sample.
@@ -51,12 +54,17 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
     drive, hardware = Drive(), law.hardware
     along = propagator(motor, jnp.asarray(hardware.sample_time / substeps), drive)
     at, voltage = steady_state(motor, course.initial)
-    start = (at, law.start(course.initial, at, voltage), voltage)
+    late = motor.speed_delay()
+    memory = law.start(course.initial, at, voltage)
+    start = (at, memory, voltage, jnp.full(REMEMBERED, motor.sensors(at)[1]))
 
     def sample(carry, now):
-        state, memory, acting = carry
+        state, memory, acting, past = carry
         reference, load, noise = now
-        current, speed = motor.sensors(state.current, state.speed)
+        current, speed = motor.sensors(state)
+        past = jnp.concatenate([speed[None], past[:-1]])
+        if late is not None:
+            speed = _earlier(past, late / hardware.sample_time)
         speed = _quantised(speed + noise, hardware.speed_step)
         memory, decided = law.step(memory, reference, speed, current)
         applied = jnp.asarray(acting if hardware.delay else decided)
@@ -64,7 +72,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
         for _ in range(substeps):
             instants.append((state.current, state.speed, applied))
             state = held_step(motor, along, drive, state, applied, load)
-        return (state, memory, decided), jax.tree.map(lambda *x: jnp.stack(x), *instants)
+        return (state, memory, decided, past), jax.tree.map(lambda *x: jnp.stack(x), *instants)
 
     _, (current, speed, voltage) = jax.lax.scan(
         sample, start, (course.reference, course.load, course.speed_noise)
@@ -75,6 +83,19 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
 
 
 closed_loop_jit = eqx.filter_jit(closed_loop)
+
+
+def steps_in_sample(motor: Motor, sample_time: float) -> int:
+    """Instants a sample that the motor's effects need to be followed well."""
+    longest = [e.longest_step for e in motor.effects if e.holds or not e.affine]
+    return max(1, round(sample_time / min(longest))) if longest else 1
+
+
+def _earlier(past: Float[Array, " remembered"], samples: Number) -> Float[Array, ""]:
+    """What was so many samples ago, latest first; interpolated linearly."""
+    place = jnp.clip(samples, 0.0, REMEMBERED - 1.001)
+    k = jnp.floor(place).astype(int)
+    return past[k] + (place - k) * (past[k + 1] - past[k])
 
 
 def _quantised(speed: Number, step: Number | None) -> Number:

@@ -54,6 +54,7 @@ class Task(eqx.Module):
     max_sensitivity: Number | None
     noise: Float[Array, " samples"]
     step_samples: int = eqx.field(static=True)
+    substeps: int = eqx.field(static=True, default=1)  # a sample, which the motor's effects need
 
     def course(self) -> Course:
         """Set point, load, half the set point."""
@@ -84,8 +85,8 @@ def smooth_cost(
 
 
 def _smooth_cost(task: Task, law: Law, motor: Motor, width: Number) -> One:
-    response = closed_loop(motor, law, task.course())
-    (time, speed), loaded, second = task.parts(response)
+    response = closed_loop(motor, law, task.course(), task.substeps)
+    (time, speed), loaded, second = task.parts(response, task.substeps)
     settling = smooth_settling(time, speed, task.setpoint, 0.0, width)
     overshoot = smooth_overshoot(speed, task.setpoint, 0.0, 0.3 * width * task.max_overshoot)
     recovery = smooth_settling(*loaded, task.setpoint, 0.0, width)
@@ -104,7 +105,8 @@ def _smooth_cost(task: Task, law: Law, motor: Motor, width: Number) -> One:
         + SECOND * second_settling / task.limit
         + SECOND * overshoot_cost(dip, 100 * BAND)
         + STEADY * sum(_late(error) for error in errors)
-        + jnp.mean(jnp.abs(jnp.diff(response.voltage))) / task.hardware.voltage_limit
+        + jnp.mean(jnp.abs(jnp.diff(response.voltage[:: task.substeps])))
+        / task.hardware.voltage_limit
     )
 
 
@@ -140,6 +142,7 @@ def score(
 ) -> Score:
     """The exact metrics of a controller on every motor, between samples too."""
     law = Law(controller, task.hardware, model)
+    substeps *= task.substeps
 
     def of(motor: Motor):
         response = closed_loop(motor, law, task.course(), substeps)

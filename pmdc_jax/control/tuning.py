@@ -25,7 +25,7 @@ from .gains import GainSpace
 from .hardware import Hardware
 from .law import Law, Model
 from .limit import fastest_settling
-from .loop import Response, closed_loop
+from .loop import REMEMBERED, Response, closed_loop, steps_in_sample
 from .margins import Margins, margins
 from .metrics import load_metrics, step_metrics
 from .objective import LOWER, PARTS, Score, Task, score
@@ -207,6 +207,7 @@ def tune(
     hardware = _arrays(
         Hardware(sample_time, voltage_limit, current_limit, speed_step, delay, measures_current)
     )
+    _check_sensor(motor, sample_time)
     samples = _few_lengths(max(2.5 * fastest, fastest + 20 * _dead_time(motor, hardware)), hardware)
     white = jnp.asarray(np.random.default_rng(seed).standard_normal(PARTS * samples))
     task = Task(
@@ -218,6 +219,7 @@ def tune(
         max_sensitivity=None if max_sensitivity is None else jnp.asarray(max_sensitivity),
         noise=speed_noise * white,
         step_samples=samples,
+        substeps=steps_in_sample(motor, sample_time),
     )
     motors, judges = _motors(motor, uncertainty, spread, seed)
     stiffness, duration = jnp.asarray(voltage_limit / abs(setpoint)), task.limit
@@ -338,6 +340,17 @@ def _check(
         raise InputError("--delay", f"{delay} samples are not supported", "Choose 0 or 1")
 
 
+def _check_sensor(motor: Motor, sample_time: float) -> None:
+    """Refuse a speed sensor that is later than the simulated loop can remember."""
+    late = motor.speed_delay()
+    if late is not None and float(late) > (REMEMBERED - 2) * sample_time:
+        raise InputError(
+            "--sample-time",
+            f"the speed sensor is {float(late):g} s late, more than {REMEMBERED - 2} samples",
+            "Choose a longer sample time",
+        )
+
+
 def _round_number(value: float) -> float:
     """The largest of 1, 2, 5 times a power of ten that is not above."""
     power = 10.0 ** math.floor(math.log10(value))
@@ -367,7 +380,7 @@ _score = eqx.filter_jit(score)
 
 @eqx.filter_jit
 def _simulated(task: Task, motor: Motor, law: Law) -> Response:
-    return closed_loop(motor, law, task.course(), SUBSTEPS)
+    return closed_loop(motor, law, task.course(), SUBSTEPS * task.substeps)
 
 
 def _known(metrics) -> dict[str, float | None]:
@@ -382,7 +395,7 @@ def _candidate(
     controller = jax.tree.map(jnp.asarray, controller)
     law = Law.of(controller, task.hardware, motor)
     response = _simulated(task, motor, law)
-    step, loaded, second = task.parts(response, SUBSTEPS)
+    step, loaded, second = task.parts(response, SUBSTEPS * task.substeps)
     robust = None
     if judges is not None:
         model = Model.of(motor, task.hardware.sample_time)
@@ -417,7 +430,10 @@ def _robustness(found: Score) -> Robustness:
 
 @eqx.filter_jit
 def _speeds(task: Task, motors: Motor, law: Law):
-    return jax.vmap(lambda motor: closed_loop(motor, law, task.course()).speed)(motors)
+    def speed(motor):
+        return closed_loop(motor, law, task.course(), task.substeps).speed[:: task.substeps]
+
+    return jax.vmap(speed)(motors)
 
 
 def _verdicts(result: Tuning) -> list[str]:
