@@ -1,7 +1,8 @@
 """All benchmarks, one table after another: `python -m benchmarks`, or `make bench`."""
 
-from benchmarks import identify_end_to_end, population, sensitivity
+from benchmarks import closed_loop, identify_end_to_end, population, sensitivity
 
 population.main()
 sensitivity.main()
+closed_loop.main()
 identify_end_to_end.main()

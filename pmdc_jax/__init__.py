@@ -8,6 +8,10 @@ import types
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .control.controller_file import load_controller, save_controller
+    from .control.export import export
+    from .control.limit import fastest_settling
+    from .control.tuning import Tuning, tune
     from .demo import demo
     from .diagnose.diagnosis import Diagnosis
     from .diagnose.pipeline import diagnose
@@ -15,7 +19,8 @@ if TYPE_CHECKING:
     from .identify.identification import Identification
     from .identify.pipeline import identify
     from .motor import Motor
-    from .motor_file import load_motor, save_motor
+    from .motor_file import load_motor, load_uncertainty, save_motor
+    from .paper import paper
     from .recording import Recording, read_recording, write_recording
     from .simulate import simulate
 
@@ -26,13 +31,21 @@ _HOME = {
     "InputError": "errors",
     "Motor": "motor",
     "Recording": "recording",
+    "Tuning": "control.tuning",
     "demo": "demo",
     "diagnose": "diagnose.pipeline",
+    "export": "control.export",
+    "fastest_settling": "control.limit",
     "identify": "identify.pipeline",
+    "load_controller": "control.controller_file",
     "load_motor": "motor_file",
+    "load_uncertainty": "motor_file",
+    "paper": "paper",
     "read_recording": "recording",
+    "save_controller": "control.controller_file",
     "save_motor": "motor_file",
     "simulate": "simulate",
+    "tune": "control.tuning",
     "write_recording": "recording",
 }
 
@@ -42,13 +55,21 @@ __all__ = [
     "InputError",
     "Motor",
     "Recording",
+    "Tuning",
     "demo",
     "diagnose",
+    "export",
+    "fastest_settling",
     "identify",
+    "load_controller",
     "load_motor",
+    "load_uncertainty",
+    "paper",
     "read_recording",
+    "save_controller",
     "save_motor",
     "simulate",
+    "tune",
     "write_recording",
 ]
 

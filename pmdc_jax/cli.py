@@ -28,7 +28,7 @@ DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
 app = typer.Typer(
     name="pmdc",
-    help="Identify and diagnose brushed permanent-magnet DC motors from recorded data.",
+    help="Identify, diagnose and control brushed permanent-magnet DC motors from recorded data.",
     epilog="Start with: pmdc demo",
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -96,6 +96,18 @@ Input = Annotated[
 Output = Annotated[
     Path, typer.Option("--out", metavar="RUN_OUT", help="Where it goes: .csv or .parquet.")
 ]
+Controller = Annotated[
+    str,
+    typer.Option(metavar="NAME", help="pi, pid, state-feedback or state-feedback-integral."),
+]
+SaveController = Annotated[
+    Path | None,
+    typer.Option(metavar="CONTROLLER.json", help="Write the controller, for pmdc export."),
+]
+ControllerFile = Annotated[
+    Path, typer.Argument(metavar="CONTROLLER.json", help="Written by pmdc tune --save.")
+]
+HeaderFile = Annotated[Path, typer.Option("--c", metavar="CONTROLLER.h", help="Where the C goes.")]
 Folder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")]
 
 
@@ -209,6 +221,136 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
     from .simulate import simulate
 
     write_recording(simulate(load_motor(motor), read_recording(input, columns)), out)
+
+
+@app.command(
+    epilog="Example: pmdc tune motor.json --controller pid --setpoint 481 --voltage-limit 30"
+)
+def tune(
+    motor: MotorFile,
+    controller: Controller,
+    setpoint: Annotated[float | None, typer.Option(metavar="RAD_S", help="Speed to go to.")] = None,
+    voltage_limit: Annotated[
+        float | None, typer.Option(metavar="V", help="Voltage there is, in either direction.")
+    ] = None,
+    current_limit: Annotated[
+        float | None, typer.Option(metavar="A", help="Current that is allowed, none if not given.")
+    ] = None,
+    sample_time: Annotated[
+        float | None, typer.Option(metavar="S", help="Of the controller. 1 ms, or less if needed.")
+    ] = None,
+    max_overshoot: Annotated[
+        float, typer.Option(metavar="PCT", help="Overshoot that is allowed, % of the step.")
+    ] = 1.0,
+    max_settling: Annotated[
+        float | None, typer.Option(metavar="S", help="Settling time that is asked for.")
+    ] = None,
+    load_torque: Annotated[
+        float | None, typer.Option(metavar="NM", help="Load step that has to be withstood.")
+    ] = None,
+    delay: Annotated[
+        int, typer.Option(metavar="SAMPLES", help="From measurement to voltage: 0 or 1.")
+    ] = 1,
+    speed_step: Annotated[
+        float | None, typer.Option(metavar="RAD_S", help="Quantum of the speed sensor.")
+    ] = None,
+    speed_noise: Annotated[
+        float, typer.Option(metavar="RAD_S", help="Noise of the speed sensor, rms.")
+    ] = 0.0,
+    current_sensor: Annotated[
+        bool, typer.Option(help="Whether the controller measures the current.")
+    ] = True,
+    spread: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PCT", help="Spread of each parameter; else as uncertain as the file says."
+        ),
+    ] = None,
+    save: SaveController = None,
+    json: Json = None,
+    report: Report = None,
+    seed: Seed = 0,
+) -> None:
+    """Find the gains of a speed controller.
+
+    They work on the sampled, late and limited loop, and over the uncertainty of the motor; beside
+    them stands the fastest settling that voltage and current allow.
+    """
+    from .report.files import check_outputs
+
+    check_outputs({"--save": save, "--json": json, "--report": report}, [motor])
+    from .control.tuning import tune
+    from .motor_file import load_motor, load_uncertainty
+    from .report.terminal import print_messages, print_tables, progress
+
+    subject, uncertainty = load_motor(motor), load_uncertainty(motor)
+    with progress() as on_progress:
+        tuning = tune(
+            subject,
+            controller,
+            setpoint=setpoint,
+            voltage_limit=voltage_limit,
+            current_limit=current_limit,
+            sample_time=sample_time,
+            max_overshoot=max_overshoot,
+            max_settling=max_settling,
+            load_torque=load_torque,
+            delay=delay,
+            speed_step=speed_step,
+            speed_noise=speed_noise,
+            measures_current=current_sensor,
+            uncertainty=uncertainty,
+            spread=None if spread is None else spread / 100,
+            seed=seed,
+            progress=on_progress,
+        )
+    from .report.tuning import tuning_json, tuning_tables, write_tuning_report
+
+    print_messages(tuning.messages)
+    if save:
+        from .control.controller_file import save_controller
+
+        save_controller(save, tuning.law)
+    if report:
+        write_tuning_report(tuning, report)
+    if json:
+        from .report.json import write_json
+
+        write_json(tuning_json(tuning), json)
+    if json != "-":
+        print_tables(tuning_tables(tuning))
+
+
+@app.command(epilog="Example: pmdc export controller.json --c controller.h")
+def export(controller: ControllerFile, c: HeaderFile) -> None:
+    """Write a controller as C.
+
+    Plain C99 in one header: the sampled law with its limits and anti-windup.
+    """
+    from .report.files import check_outputs
+
+    check_outputs({"--c": c}, [controller])
+    from .control.controller_file import load_controller
+    from .control.export import export
+
+    export(load_controller(controller), c)
+
+
+@app.command(epilog="Example: pmdc paper --out paper_out")
+def paper(out: Folder = Path("paper_out")) -> None:
+    """Do the wheelchair-motor paper again.
+
+    Its tables and figures beside ours, printed, and as paper.html and paper.json in a folder.
+    """
+    from .paper import paper
+    from .report.paper import paper_tables
+    from .report.terminal import print_tables, progress
+
+    with progress() as on_progress:
+        result = paper(out, progress=on_progress)
+    print_tables(paper_tables(result))
+    for name in ("paper.html", "paper.json"):
+        typer.echo(out / name)
 
 
 @app.command(epilog="Example: pmdc demo --out tour")

@@ -26,7 +26,7 @@ def demo(
 
     **Returns**: the diagnosis, whose `final` is the identification of the completed motor.
     """
-    folder = _folder(Path(out))
+    folder = result_folder(Path(out), "report.html")
     from .diagnose import diagnose
     from .motor_file import save_motor
     from .recording import read_recording
@@ -43,13 +43,14 @@ def demo(
     return diagnosis
 
 
-def _folder(path: Path) -> Path:
-    """Make the folder now: better to fail before the work than after it."""
+def result_folder(path: Path, first: str) -> Path:
+    """Make the folder now, and see whether a file `first` can be written there: better to fail before the work than
+    after it."""
     from .report.files import check_writable
 
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise InputError("--out", f"{path} is not a folder", "Name a new folder") from None
-    check_writable("--out", path / "report.html")
+    check_writable("--out", path / first)
     return path

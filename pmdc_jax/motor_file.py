@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -50,11 +50,48 @@ def save_motor(
     write_text(Path(path), json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
+class Uncertainty(NamedTuple):
+    """How sure a motor is: names of its coordinates, and their covariance."""
+
+    names: tuple[str, ...]
+    covariance: np.ndarray
+
+
+def load_uncertainty(path: str | Path) -> Uncertainty | None:
+    """The covariance that an identification left in a motor file, or None where there is none.
+
+    **Raises**: `InputError` where it is there but cannot be one.
+    """
+    where, content = str(path), _content(path)
+    given = content.get("covariance")
+    if given is None:
+        return None
+    try:
+        names = tuple(given["names"])
+        matrix = np.array(given["matrix"], float).reshape(len(names), len(names))
+    except (KeyError, TypeError, ValueError):
+        matrix, names = np.full((1, 1), np.nan), ()
+    known = {*PARAMETERS, *(f"{e}.{f}" for e, kind in EFFECTS.items() for f in kind.ranges)}
+    if not np.isfinite(matrix).all() or not known.issuperset(names):
+        raise InputError(
+            where,
+            '"covariance" is not a matrix with its names',
+            "Write it with pmdc identify --save",
+        )
+    return Uncertainty(names, matrix)
+
+
 def load_motor(path: str | Path) -> Motor:
     """Read a motor written by `save_motor`, or by hand: only "parameters" is needed.
 
     **Raises**: `InputError` where the file is missing, is not JSON, or lacks or misspells something.
     """
+    where, content = str(path), _content(path)
+    constants = _numbers(where, content["parameters"], PARAMETERS, "parameters")
+    return Motor(**constants, effects=_effects(where, content.get("effects", [])))
+
+
+def _content(path: str | Path) -> dict[str, Any]:
     where = str(path)
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -72,8 +109,7 @@ def load_motor(path: str | Path) -> Motor:
         ) from None
     if not isinstance(content, dict) or not isinstance(content.get("parameters"), dict):
         raise InputError(where, 'has no "parameters"', "Write one with pmdc identify --save")
-    constants = _numbers(where, content["parameters"], PARAMETERS, "parameters")
-    return Motor(**constants, effects=_effects(where, content.get("effects", [])))
+    return content
 
 
 def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:

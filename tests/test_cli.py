@@ -74,7 +74,10 @@ def refused(capsys, *arguments: str) -> str:
     return err
 
 
-@pytest.mark.parametrize("command", [(), ("identify",), ("diagnose",), ("simulate",), ("demo",)])
+@pytest.mark.parametrize(
+    "command",
+    [(), *((c,) for c in ["identify", "diagnose", "simulate", "demo", "tune", "export", "paper"])],
+)
 def test_help_shows_an_example(capsys, command):
     assert cli.main([*command, "--help"]) == 0
     out, err = capsys.readouterr()

@@ -24,6 +24,16 @@ BELOW = {
     "motor": {"effects"},
     "simulate": {"effects", "motor", "precision", "recording"},
     "check": {"alignment", "plausibility", "recording"},
+    "motor_file": {"effects", "errors", "motor", "report"},
+    "control": {
+        "effects",
+        "errors",
+        "motor",
+        "motor_file",
+        "precision",
+        "report",
+        "simulate",
+    },
     "identify": {"check", "effects", "errors", "motor", "precision", "recording", "simulate"},
 }
 

@@ -12,6 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+# Rounding hides whatever is smaller than this share.
+VISIBLE = 1e-9
+
 
 class Block(NamedTuple):
     """Columns that stand or fall together; with `own`, every run has its own coefficients."""
@@ -39,18 +42,21 @@ class Evidence(NamedTuple):
     parameters: int  # how many columns are the motor's
     rows: int
 
-    def regress(self, blocks: Sequence[Block] = ()) -> Regression:
-        """Least squares of the residual on the motor's parameters and some blocks."""
+    def regress(self, blocks: Sequence[Block] = (), visible: float = VISIBLE) -> Regression:
+        """Least squares of the residual on the motor's parameters and some blocks.
+
+        Directions in which the rows say less than `visible`, as a share of the most, stay where they are.
+        """
         shared = [*range(self.parameters), *(c for b in blocks if not b.own for c in b.columns)]
         own = [c for b in blocks if b.own for c in b.columns]
         kept = [*shared, -1]
         total, solved = np.zeros((len(kept), len(kept))), []
         for product in self.products:
             across = product[np.ix_(own, kept)]
-            inverse = _inverse(product[np.ix_(own, own)])
+            inverse = _inverse(product[np.ix_(own, own)], visible)
             total += product[np.ix_(kept, kept)] - across.T @ inverse @ across
             solved.append((inverse, across))
-        inverse = _inverse(total[:-1, :-1])
+        inverse = _inverse(total[:-1, :-1], visible)
         coefficients = inverse @ total[:-1, -1]
         squares = float(total[-1, -1] - total[:-1, -1] @ coefficients)
         errors = np.sqrt(np.maximum(np.diag(inverse), 0.0))
@@ -77,15 +83,17 @@ class Evidence(NamedTuple):
         return len(block.columns) * (len(self.products) if block.own else 1)
 
 
-def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+def _inverse(
+    matrix: Float[np.ndarray, "n n"], visible: float = VISIBLE
+) -> Float[np.ndarray, "n n"]:
     """Inverse on what the rows can see of it."""
     if not len(matrix):
         return matrix
     lengths = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     lengths = np.where(lengths > 0, lengths, 1.0)
     values, vectors = np.linalg.eigh(matrix / lengths[:, None] / lengths)
-    visible = values > 1e-9
-    inverse = np.where(visible, 1 / np.where(visible, values, 1.0), 0.0)
+    seen = values > visible
+    inverse = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
     return (vectors * inverse) @ vectors.T / lengths[:, None] / lengths
 
 

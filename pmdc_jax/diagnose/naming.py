@@ -13,7 +13,7 @@ from ..effects import EFFECTS
 from ..identify.refine import Refined, Unknowns, polish
 from .candidates import Candidate, Values
 from .evidence import Block, Evidence
-from .noise import whitener
+from .noise import plain, whitener
 from .screen import Library, Model, Screen, left_over, rows_of, screen
 
 # Chance that anything at all is called missing from a motor that lacks nothing
@@ -99,6 +99,9 @@ class Naming(NamedTuple):
     left: float  # chance of what is left if nothing more were missing
     explained: float  # how much of the squares the chosen set takes away
     unexplained: float  # and how much the clearest curve would still take
+    noise: (
+        float  # share of what the chosen one leaves that no curve takes away, as root mean square
+    )
     without: dict[str, float]  # by effect of the chosen: chance of the data without it
 
 
@@ -145,6 +148,7 @@ class Namer:
             left,
             alone - mine.squares,
             unexplained,
+            float(np.sqrt(self._least(current) if left < ALARM else 1.0)),
             self._without(current),
         )
 
@@ -177,6 +181,8 @@ class Namer:
         fit = found.evidence.regress([signal.block])
         runs = len(self.base.given.roles)
         values, angles = _values(signal.candidate, fit.coefficients[0], current.dry, runs)
+        if values is None:
+            return None
         model = self._fit(current, (*kept, name), {name: values}, fit.moved, angles)
         self.models[key] = model
         return model
@@ -238,6 +244,13 @@ class Namer:
             price = len(model.given.problem.parameters.names) * np.log(rows)
             fitted.append(Fitted(model, squares, squares + price))
         return sorted(fitted, key=lambda f: f.criterion)
+
+    def _least(self, chosen: Model) -> float:
+        """Share of the squares of a model's residuals, as they are, that no curve over a variable takes away."""
+        as_they_are = plain([residual for _, residual in rows_of(chosen)])
+        evidence = (found := screen(chosen, self.library, as_they_are)).evidence
+        shared = [block for block in found.of_curve if not block.own]
+        return evidence.regress(shared).squares / evidence.regress().squares
 
     def _without(self, chosen: Model) -> dict[str, float]:
         chances = {}

@@ -51,6 +51,16 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
     filters = {}
     for kind in dict.fromkeys(series.kind for series in residuals):
         filters[kind] = _autoregression([s for s in residuals if s.kind == kind])
+    return Whitener(filters, _scales(residuals, filters))
+
+
+def plain(residuals: Sequence[Series]) -> Whitener:
+    """No filter at all, only the scale of every run."""
+    filters = {s.kind: np.zeros((0, *2 * s.values.shape[1:2])) for s in residuals}
+    return Whitener(filters, _scales(residuals, filters))
+
+
+def _scales(residuals: Sequence[Series], filters) -> list[Float[np.ndarray, "outputs outputs"]]:
     scales = []
     for series in residuals:
         rest = _filtered(series, filters[series.kind])
@@ -58,7 +68,7 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
         floor = 1e-12 * np.trace(covariance) + 1e-300
         values, vectors = np.linalg.eigh(covariance)
         scales.append((vectors / np.sqrt(np.maximum(values, floor))) @ vectors.T)
-    return Whitener(filters, scales)
+    return scales
 
 
 def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order outputs outputs"]:

@@ -24,6 +24,7 @@ from .diagnosis import (
     Region,
     Verdict,
 )
+from .evidence import Block
 from .experiment import next_experiment
 from .naming import ALARM, Namer, Naming, log_chance
 from .screen import Model, Screen
@@ -71,8 +72,8 @@ def diagnose(
     base = judge(given, solved)
     chosen = solved._replace(polished=naming.chosen.polished)
     final = judge(naming.chosen.given, chosen) if naming.chosen.effects else base
-    gaps = _gaps(base, final)
     verdict = _verdict(naming)
+    gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
     seconds = {
         "identify": identified - began,
         "name": named - identified,
@@ -137,9 +138,16 @@ def _regions(found: Screen) -> tuple[Region, ...]:
             or curve.own
         ):
             continue
-        z = fit.coefficients[0] / np.where(fit.errors[0] > 0, fit.errors[0], np.inf)
+        z = np.array([_alone(found, column) for column in block.columns])
         regions += _stretches(curve.equation, curve.variable, curve.knots, z)
     return tuple(sorted(regions, key=lambda r: -abs(r.z))[:12])
+
+
+def _alone(found: Screen, column: int) -> float:
+    """A knot's own misfit over its standard error: side by side, knots would share what they explain."""
+    fit = found.evidence.regress([Block((column,))])
+    error = float(fit.errors[0][0])
+    return float(fit.coefficients[0][0]) / error if error > 0 else 0.0
 
 
 def _stretches(equation: str, variable: str, knots: np.ndarray, z: np.ndarray) -> list[Region]:
@@ -163,7 +171,8 @@ def _learned(found: Screen) -> tuple[LearnedCurve, ...]:
     base = found.evidence.regress().squares
     learned = []
     for curve, block in zip(found.curves, found.of_curve, strict=True):
-        fit = found.evidence.regress([block])
+        # what the motor's own parameters would do as well is no part of the curve
+        fit = found.evidence.regress([block], visible=1e-3)
         chance = log_chance(base - fit.squares, found.evidence.freedom(block))
         value, error = (
             np.mean(x, axis=0) if curve.own else x for x in (fit.coefficients[0], fit.errors[0])
@@ -204,9 +213,12 @@ def _detectable(found: Screen) -> tuple[Detectable, ...]:
     return tuple(smallest.values())
 
 
-def _gaps(base: Identification, final: Identification) -> dict[str, Gap]:
-    """Of every run the misfit before and after, over the noise as the final model's training runs show it."""
-    noise = {c: _rms_of_all(final, c) for c in ("current", "speed")}
+def _gaps(base: Identification, final: Identification, share: float) -> dict[str, Gap]:
+    """Of every run the misfit before and after, over the noise.
+
+    The noise is the `share` of what the final model leaves of the training runs that no curve takes away.
+    """
+    noise = {c: share * _rms_of_all(final, c) for c in ("current", "speed")}
 
     def misfit(found: Identification, run: str) -> float:
         ratios = [

@@ -62,7 +62,7 @@ def sensed(motor: Motor, tape: Tape, path: Path) -> Outputs:
     """By how much the sensors of `motor` report something else than the path."""
     current, speed = motor.sensors(_states(motor, tape, path))
     if (delay := motor.speed_delay()) is not None:
-        speed = _delayed(speed, delay, tape)
+        speed = _delayed(jnp.asarray(speed), delay, tape)
     return jnp.stack([current - path.current, speed - path.speed], 1)
 
 

@@ -243,7 +243,7 @@ def _series(tape: Tape, run: int, signal: np.ndarray) -> Series:
     outputs = tuple(int(c) for c in np.flatnonzero(weight.any(0)))
     first = np.flatnonzero(mine)[0]
     kind = (float(np.asarray(tape.sample_time)[np.asarray(tape.grid)[first]]), outputs)
-    return Series(values[:, list(outputs)], weight[:, list(outputs)].all(1), kind)
+    return Series(values[:, list(outputs)], np.asarray(weight[:, list(outputs)].all(1)), kind)
 
 
 def _scales(base: Model) -> Scales:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -30,7 +30,19 @@ class ReportProgress(Protocol):
 
 def print_identification(identification: Identification) -> None:
     """Summary, parameters and fits on standard output."""
-    console_for(stderr=False).print(identification_tables(identification))
+    print_tables(identification_tables(identification))
+
+
+def print_tables(tables: RenderableType) -> None:
+    """Tables and sentences on standard output."""
+    console_for(stderr=False).print(tables)
+
+
+def print_messages(messages: Iterable[str]) -> None:
+    """Remarks on standard error."""
+    console = console_for(stderr=True)
+    for message in messages:
+        console.print(Text(f"note: {message}"), soft_wrap=True)
 
 
 def print_findings(identification: Identification) -> None:
@@ -42,8 +54,7 @@ def print_findings(identification: Identification) -> None:
         where = f", {finding.where}" if finding.where else ""
         line.append(f"{place}: {finding.what}{where}. {finding.mend or ''}", "default")
         console.print(line, soft_wrap=True)
-    for message in identification.messages:
-        console.print(Text(f"note: {message}"), soft_wrap=True)
+    print_messages(identification.messages)
 
 
 def identification_tables(identification: Identification) -> RenderableType:

@@ -177,7 +177,8 @@ def _guess(motor: Motor, own: Own, tape: Tape, begins: Starts) -> Starts:
     known = (tape.weight[:, :, 0] > 0).T
     current, speed = jnp.where(known, tape.measured[:, :, 0].T, begins[:, :2].T)
     length = jnp.asarray(tape.sample_time)[tape.grid]
-    turned = jnp.cumsum((tape.measured[:, 1] * tape.weight[:, 1]).sum(-1) * length)
+    by_speed = tape.measured[:, 1] * tape.weight[:, 1] * length[:, None]
+    turned = jnp.cumsum(jnp.where(jnp.isnan(tape.turn), by_speed, tape.turn).sum(-1))
     before = jnp.append(0.0, turned)
     first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
     angle = own.angle[tape.run] + before[:-1] - before[first]

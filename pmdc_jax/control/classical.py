@@ -1,0 +1,118 @@
+"""Rules from the textbooks: Ziegler-Nichols and pole placement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import InputError
+from ..motor import Motor
+from ..precision import double_precision
+from .controllers import PI, PID, StateFeedback, StateFeedbackIntegral
+from .gains import reference_gain
+from .hardware import Hardware
+from .law import Law, Model
+from .margins import linear_loop, loop_gain
+
+Poles = Sequence[complex | float] | np.ndarray
+
+
+@double_precision
+def ultimate_gain(motor: Motor, hardware: Hardware | None) -> tuple[float, float]:
+    """Gain (V s/rad) of the proportional loop that just keeps oscillating, and the period of that (s).
+
+    **Arguments**: `hardware`, whose sampling and delay make the oscillation possible; None is the ideal loop.
+
+    **Raises**: `InputError` for the ideal loop: a motor of two poles turns the phase by 180 degrees only at infinite
+    frequency, so no gain makes it oscillate.
+    """
+    if hardware is None:
+        raise InputError(
+            "Ziegler-Nichols",
+            "the ideal motor has two poles, so its phase never reaches -180 degrees and no gain makes"
+            " the loop oscillate",
+            "Give the sample time and the delay of the real loop",
+        )
+    motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
+    law = Law.of(PI(1.0, 0.0, 1.0, 1.0), hardware, motor)
+    loop = linear_loop(motor, law)
+    angle = np.geomspace(1e-5, np.pi, 200_000)
+    gain = loop_gain(loop, angle)
+    phase = np.unwrap(np.angle(gain))
+    # a sampled loop that is never late crosses at half the sampling frequency at the latest
+    k = min(int(np.argmax(phase <= -np.pi)) or len(angle) - 1, len(angle) - 1)
+    period = 2 * np.pi / angle[k] * float(hardware.sample_time)
+    return float(1 / np.abs(gain[k])), period
+
+
+def ziegler_nichols(motor: Motor, hardware: Hardware | None, kind: str) -> PI | PID:
+    """PI or PID gains by the sustained-oscillation rule, on the sampled loop.
+
+    PI: Kp = 0.45 Ku, Ti = Tu / 1.2. PID: Kp = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8, filter Td / 10. The integral tracks
+    the limited voltage within Ti.
+
+    **Raises**: `InputError` where the loop never oscillates, and for state feedback, for which there is no rule.
+
+    **Source**: Ziegler, Nichols, Transactions of the ASME 64 (1942).
+    """
+    if kind not in ("pi", "pid"):
+        raise InputError("Ziegler-Nichols", f"there is no rule for {kind}", "Choose pi or pid")
+    gain, period = ultimate_gain(motor, hardware)
+    if kind == "pi":
+        reset = period / 1.2
+        return PI(0.45 * gain, 0.45 * gain / reset, 1.0, reset)
+    reset, lead = period / 2, period / 8
+    return PID(0.6 * gain, 0.6 * gain / reset, 0.6 * gain * lead, lead / 10, 1.0, reset)
+
+
+def ackermann(A: np.ndarray, B: np.ndarray, poles: Poles) -> np.ndarray:
+    """The gain K that gives A - B K these eigenvalues: K = (0 ... 0 1) [B AB ...]^-1 p(A).
+
+    **Arguments**: `A` (n, n); `B` (n,); `poles`, n of them, complex ones in pairs.
+
+    **Source**: Ackermann, at - Automatisierungstechnik 20 (1972).
+    """
+    size = len(A)
+    reachable = np.stack([np.linalg.matrix_power(A, k) @ B for k in range(size)], axis=1)
+    wanted = np.zeros_like(A)
+    for coefficient in np.poly(np.asarray(poles)):
+        wanted = wanted @ A + np.real(coefficient) * np.eye(size)
+    return np.linalg.solve(reachable.T, np.eye(size)[-1]) @ wanted
+
+
+@double_precision
+def state_feedback(
+    motor: Motor, poles: Poles, setpoint: float, sample_time: float | None = None
+) -> StateFeedback | StateFeedbackIntegral:
+    """State feedback that puts the poles where they are wanted; a third pole asks for integral action.
+
+    **Arguments**: `poles`, rad/s, two or three, complex ones in pairs; `setpoint`, rad/s, held exactly without load;
+    `sample_time`, s, for which exp(pole sample_time) are the poles of the sampled loop; None for continuous time.
+    """
+    motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
+    if sample_time is None:
+        A, B = (np.asarray(x) for x in motor.state_space())
+        period, wanted = 1.0, np.asarray(poles)
+    else:
+        model = Model.of(motor, sample_time)
+        A = np.array([[model.ii, model.iw], [model.wi, model.ww]], float)
+        B = np.array([[model.iv, 0.0], [model.wv, 0.0]], float)
+        period, wanted = sample_time, np.exp(np.asarray(poles) * sample_time)
+    A, B = np.asarray(A), np.asarray(B)[:, 0]
+    if len(wanted) == 3:  # the integral of the error is a third state
+        corner = 0.0 if sample_time is None else 1.0
+        A = np.block([[A, np.zeros((2, 1))], [np.array([[0.0, -period, corner]])]])
+        B = np.append(B, 0.0)
+    K = ackermann(A, B, wanted)
+    shared = {
+        "reference_gain": float(reference_gain(motor, setpoint, K[0], K[1])),
+        "current_gain": float(K[0]),
+        "speed_gain": float(K[1]),
+    }
+    if len(wanted) == 2:
+        return StateFeedback(**shared)
+    slowest = float(1 / np.min(np.abs(np.real(np.asarray(poles)))))
+    return StateFeedbackIntegral(**shared, integral=float(-K[2]), tracking_time=slowest)

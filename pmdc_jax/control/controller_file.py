@@ -1,0 +1,108 @@
+"""Sampled control laws as JSON files: gains, limits, and the model they rely on."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from .controllers import CONTROLLERS, AbstractController, Number
+from .hardware import Hardware
+from .law import Law, Model
+
+FORMAT = "pmdc controller 1"
+MEND = "Write it with pmdc tune --save"
+
+
+def gains_of(controller: AbstractController) -> dict[str, float]:
+    """The gains by name, SI."""
+    return {one.name: float(getattr(controller, one.name)) for one in fields(controller)}
+
+
+def law_content(law: Law) -> dict[str, Any]:
+    """A law as plain dictionaries and numbers."""
+    hardware = law.hardware
+    return {
+        "format": FORMAT,
+        "type": law.controller.name,
+        "gains": gains_of(law.controller),
+        "sample_time_s": float(hardware.sample_time),
+        "delay_samples": hardware.delay,
+        "limits": {
+            "voltage_V": float(hardware.voltage_limit),
+            "current_A": _number_or_none(hardware.current_limit),
+        },
+        "speed_step_rad_s": _number_or_none(hardware.speed_step),
+        "measures_current": hardware.measures_current,
+        "model": {name: float(value) for name, value in law.model._asdict().items()},
+    }
+
+
+def save_controller(path: str | Path, law: Law) -> None:
+    """Write a law as JSON, atomically, for `load_controller` and `pmdc export`."""
+    from ..report.files import write_text
+
+    write_text(path, json.dumps(law_content(law), indent=2, allow_nan=False) + "\n")
+
+
+def load_controller(path: str | Path) -> Law:
+    """Read a law written by `save_controller`.
+
+    **Raises**: `InputError` where the file is missing, is not JSON, or lacks or misspells something.
+    """
+    where = str(path)
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(where, f"cannot be read ({error.strerror})", MEND) from None
+    except ValueError as error:
+        raise InputError(where, f"is not JSON ({error})", MEND) from None
+    if not isinstance(content, dict) or content.get("type") not in CONTROLLERS:
+        raise InputError(where, "is not a controller: its type is unknown", MEND)
+    limits = content.get("limits")
+    limits = limits if isinstance(limits, dict) else {}
+    kind = CONTROLLERS[content["type"]]
+    delay = content.get("delay_samples", 0)
+    if delay not in (0, 1):
+        raise InputError(where, f"delay_samples is {delay!r}, neither 0 nor 1", MEND)
+    return Law(
+        kind(**_numbers(where, content.get("gains"), [one.name for one in fields(kind)])),
+        Hardware(
+            sample_time=_positive(where, "sample_time_s", content.get("sample_time_s")),
+            voltage_limit=_positive(where, "voltage_V", limits.get("voltage_V")),
+            current_limit=_optional(where, "current_A", limits.get("current_A")),
+            speed_step=_optional(where, "speed_step_rad_s", content.get("speed_step_rad_s")),
+            delay=int(delay),
+            measures_current=bool(content.get("measures_current", True)),
+        ),
+        Model(**_numbers(where, content.get("model"), Model._fields)),
+    )
+
+
+def _numbers(where: str, given: Any, names) -> dict[str, float]:
+    given = given if isinstance(given, dict) else {}
+    return {name: _number(where, name, given.get(name)) for name in names}
+
+
+def _number(where: str, name: str, value: Any) -> float:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (number and math.isfinite(value)):
+        raise InputError(where, f"{name} is {value!r}, not a number", MEND)
+    return float(value)
+
+
+def _positive(where: str, name: str, value: Any) -> float:
+    if _number(where, name, value) <= 0:
+        raise InputError(where, f"{name} is {value!r}, not positive", MEND)
+    return float(value)
+
+
+def _optional(where: str, name: str, value: Any) -> float | None:
+    return None if value is None else _positive(where, name, value)
+
+
+def _number_or_none(value: Number | None) -> float | None:
+    return None if value is None else float(value)

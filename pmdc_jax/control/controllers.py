@@ -1,0 +1,186 @@
+"""Speed controllers: what voltage each asks for, and how its memory moves, in continuous time and sampled."""
+
+from __future__ import annotations
+
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..effects.base import Scalars
+
+Number = Scalars | float
+
+
+class Memory(NamedTuple):
+    """What a controller remembers: its integral in V, and the speed behind its derivative filter in rad/s."""
+
+    integral: Number
+    filtered: Number
+
+
+class AbstractController(eqx.Module):
+    """A speed controller.
+
+    One definition serves both worlds: in continuous time d(memory)/dt = rates(..., step=0), sampled
+    memory += step * rates(..., step), where the derivative filter comes out as backward Euler.
+    """
+
+    name: ClassVar[str]
+    # the state it feeds back is then the estimate at the moment the voltage takes effect
+    feeds_back_current: ClassVar[bool] = False
+    integrates: ClassVar[bool] = True
+
+    def command(
+        self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
+    ) -> Number:
+        """Voltage asked for, V, before any limit.
+
+        **Arguments**: `reference` and `speed`, rad/s; `current`, A; `step`, the sample time in s, 0 in
+        continuous time.
+        """
+        raise NotImplementedError
+
+    def rates(
+        self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
+    ) -> Memory:
+        """Rates of the memory, per second; `excess` is the voltage really applied less the one asked for."""
+        raise NotImplementedError
+
+    def settled(
+        self, reference: Number, speed: Number, current: Number, voltage: Number, step: Number
+    ) -> Memory:
+        """The memory in equilibrium: the command is `voltage` and stays there."""
+        memory = Memory(jnp.zeros_like(jnp.asarray(speed, float)), speed)
+        if not self.integrates:
+            return memory
+        short = voltage - self.command(memory, reference, speed, current, step)
+        return memory._replace(integral=short)
+
+
+def _integral_rate(
+    integral: Number, tracking_time: Number, error: Number, excess: Number, step: Number
+) -> Number:
+    """The integral, pulled back in `tracking_time` while the voltage is limited.
+
+    **Source**: Astrom, Hagglund, "Advanced PID Control" (2006), section 3.5, back-calculation.
+    """
+    return integral * error + excess / jnp.maximum(tracking_time, step)
+
+
+class PI(AbstractController):
+    """PI controller with set-point weight and back-calculation.
+
+    u = Kp (b r - w) + I,  dI/dt = Ki (r - w) + (v - u) / Tt
+
+    **Fields**: `proportional` Kp, V s/rad; `integral` Ki, V/rad; `setpoint_weight` b; `tracking_time` Tt, s,
+    in which the integral follows the limited voltage v; at least one sample.
+    """
+
+    name: ClassVar = "pi"
+
+    proportional: Number
+    integral: Number
+    setpoint_weight: Number
+    tracking_time: Number
+
+    def command(self, memory, reference, speed, current, step):
+        del current, step
+        return self.proportional * (self.setpoint_weight * reference - speed) + memory.integral
+
+    def rates(self, memory, reference, speed, excess, step):
+        integral = _integral_rate(
+            self.integral, self.tracking_time, reference - speed, excess, step
+        )
+        return Memory(integral, jnp.zeros_like(memory.filtered))
+
+
+class PID(AbstractController):
+    """PID controller; the derivative is of the measured speed alone, through a first-order filter.
+
+    u = Kp (b r - w) + I - Kd (w - z) / Tf,  dz/dt = (w - z) / Tf,  dI/dt = Ki (r - w) + (v - u) / Tt
+
+    **Fields**: as `PI`; `derivative` Kd, V s^2/rad; `filter_time` Tf, s.
+    """
+
+    name: ClassVar = "pid"
+
+    proportional: Number
+    integral: Number
+    derivative: Number
+    filter_time: Number
+    setpoint_weight: Number
+    tracking_time: Number
+
+    def command(self, memory, reference, speed, current, step):
+        del current
+        slope = (speed - memory.filtered) / (self.filter_time + step)
+        wanted = self.proportional * (self.setpoint_weight * reference - speed)
+        return wanted + memory.integral - self.derivative * slope
+
+    def rates(self, memory, reference, speed, excess, step):
+        integral = _integral_rate(
+            self.integral, self.tracking_time, reference - speed, excess, step
+        )
+        return Memory(integral, (speed - memory.filtered) / (self.filter_time + step))
+
+
+class StateFeedback(AbstractController):
+    """State feedback, without integral action: a load leaves a steady error.
+
+    u = Kr r - K1 i - K2 w
+
+    **Fields**: `reference_gain` Kr, V s/rad; `current_gain` K1, V/A; `speed_gain` K2, V s/rad.
+    """
+
+    name: ClassVar = "state-feedback"
+    feeds_back_current: ClassVar = True
+    integrates: ClassVar = False
+
+    reference_gain: Number
+    current_gain: Number
+    speed_gain: Number
+
+    def command(self, memory, reference, speed, current, step):
+        del memory, step
+        state = self.current_gain * current + self.speed_gain * speed
+        return self.reference_gain * reference - state
+
+    def rates(self, memory, reference, speed, excess, step):
+        del reference, speed, excess, step
+        zero = jnp.zeros_like(memory.integral)
+        return Memory(zero, zero)
+
+
+class StateFeedbackIntegral(AbstractController):
+    """State feedback with integral action and back-calculation.
+
+    u = Kr r - K1 i - K2 w + I,  dI/dt = Ki (r - w) + (v - u) / Tt
+
+    **Fields**: as `StateFeedback`; `integral` Ki, V/rad; `tracking_time` Tt, s.
+    """
+
+    name: ClassVar = "state-feedback-integral"
+    feeds_back_current: ClassVar = True
+
+    reference_gain: Number
+    current_gain: Number
+    speed_gain: Number
+    integral: Number
+    tracking_time: Number
+
+    def command(self, memory, reference, speed, current, step):
+        del step
+        state = self.current_gain * current + self.speed_gain * speed
+        return self.reference_gain * reference - state + memory.integral
+
+    def rates(self, memory, reference, speed, excess, step):
+        integral = _integral_rate(
+            self.integral, self.tracking_time, reference - speed, excess, step
+        )
+        return Memory(integral, jnp.zeros_like(memory.filtered))
+
+
+CONTROLLERS: dict[str, type[AbstractController]] = {
+    kind.name: kind for kind in (PI, PID, StateFeedback, StateFeedbackIntegral)
+}

@@ -1,0 +1,167 @@
+"""A sampled law as plain C99, in one header."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from string import Template
+
+from .controller_file import gains_of
+from .law import Law
+
+# What each controller asks for, and how fast its memory moves, as in controllers.py.
+COMMANDS = {
+    "pi": "PROPORTIONAL * (SETPOINT_WEIGHT * reference - speed) + state->integral",
+    "pid": (
+        "PROPORTIONAL * (SETPOINT_WEIGHT * reference - speed) + state->integral"
+        " - DERIVATIVE * slope"
+    ),
+    "state-feedback": "REFERENCE_GAIN * reference - (CURRENT_GAIN * current + SPEED_GAIN * ahead)",
+    "state-feedback-integral": (
+        "REFERENCE_GAIN * reference - (CURRENT_GAIN * current + SPEED_GAIN * ahead)"
+        " + state->integral"
+    ),
+}
+HEADER = Template("""\
+/* A $type speed controller for a brushed permanent-magnet DC motor.
+ *
+ * Written by pmdc_jax. C99; no memory is allocated and nothing is called. Every $sample_time s:
+ *
+ *     voltage = pmdc_step(&state, reference, speed, current);
+ *
+ * reference and speed in rad/s, current in A${ignored}; the voltage, in V, is within the limits and is
+ * to be applied $moment.
+ * Before the first step, with the motor at rest, call pmdc_start(&state).
+ *
+ * Double precision; #define PMDC_REAL float before including this file for single.
+ */
+#ifndef PMDC_CONTROLLER_H
+#define PMDC_CONTROLLER_H
+
+#ifndef PMDC_REAL
+#define PMDC_REAL double
+#endif
+
+typedef PMDC_REAL pmdc_real;
+
+$constants
+
+typedef struct {
+    pmdc_real integral; /* V */
+    pmdc_real filtered; /* rad/s, the speed behind the derivative filter */
+    pmdc_real current;  /* A, as estimated */
+    pmdc_real voltage;  /* V, decided last */
+} pmdc_state;
+
+static inline pmdc_real pmdc_clip(pmdc_real value, pmdc_real lowest, pmdc_real highest)
+{
+    return value < lowest ? lowest : value > highest ? highest : value;
+}
+
+static inline void pmdc_start(pmdc_state *state)
+{
+    state->integral = 0;
+    state->filtered = 0;
+    state->current = 0;
+    state->voltage = 0;
+}
+
+static inline pmdc_real pmdc_step(pmdc_state *state, pmdc_real reference, pmdc_real speed,
+                                  pmdc_real current)
+{
+$body
+}
+
+#endif
+""")
+
+
+def export(law: Law, c: str | Path) -> None:
+    """Write a law as one C99 header, atomically: the same arithmetic, limits and anti-windup included.
+
+    **Arguments**: `law`, from `tune(...).law` or `load_controller`; `c`, the file to write.
+    """
+    from ..report.files import write_text
+
+    write_text(c, c_header(law))
+
+
+def c_header(law: Law) -> str:
+    """The text of the header."""
+    hardware = law.hardware
+    return HEADER.substitute(
+        type=law.controller.name.upper() if len(law.controller.name) < 4 else law.controller.name,
+        sample_time=f"{float(hardware.sample_time):g}",
+        ignored="" if hardware.measures_current else " (ignored: it is estimated)",
+        moment="from the next sample on" if hardware.delay else "at once",
+        constants="\n".join(
+            f"#define PMDC_{name.upper()} ((pmdc_real){value!r})"
+            for name, value in _constants(law).items()
+        ),
+        body="\n".join(f"    {line}" for line in _body(law)),
+    )
+
+
+def _constants(law: Law) -> dict[str, float]:
+    hardware = law.hardware
+    constants = gains_of(law.controller)
+    constants |= {
+        "sample_time": float(hardware.sample_time),
+        "voltage_limit": float(hardware.voltage_limit),
+    }
+    if hardware.current_limit is not None:
+        constants["current_limit"] = float(hardware.current_limit)
+    return constants | {f"model_{name}": float(v) for name, v in law.model._asdict().items()}
+
+
+def _body(law: Law) -> list[str]:
+    """The statements of one step, in the order of `Law.step`."""
+    hardware, controller = law.hardware, law.controller
+    names = sorted(gains_of(controller), key=len, reverse=True)
+    command = COMMANDS[controller.name]
+    for name in names:
+        command = command.replace(name.upper(), f"PMDC_{name.upper()}")
+    lines = []
+    if not hardware.measures_current:
+        lines += ["(void)current;", "current = state->current;"]
+    lines += ["const pmdc_real here = current;", "pmdc_real ahead = speed;"]
+    if hardware.delay:
+        lines += [
+            "/* the voltage decided last acts until this one does */",
+            "ahead = PMDC_MODEL_WI * here + PMDC_MODEL_WW * speed"
+            " + PMDC_MODEL_WV * state->voltage;",
+            "current = PMDC_MODEL_II * here + PMDC_MODEL_IW * speed"
+            " + PMDC_MODEL_IV * state->voltage;",
+        ]
+    if controller.name == "pid":
+        lines += [
+            "const pmdc_real slope = (speed - state->filtered)"
+            " / (PMDC_FILTER_TIME + PMDC_SAMPLE_TIME);"
+        ]
+    lines += [f"const pmdc_real asked = {command};", "pmdc_real applied = asked;"]
+    if hardware.current_limit is not None:
+        lines += [
+            "/* the voltage that ends the sample at the current limit */",
+            "const pmdc_real drift = PMDC_MODEL_II * current + PMDC_MODEL_IW * ahead;",
+            "applied = pmdc_clip(applied, (-PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_IV,",
+            "                    (PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_IV);",
+        ]
+    lines += ["applied = pmdc_clip(applied, -PMDC_VOLTAGE_LIMIT, PMDC_VOLTAGE_LIMIT);"]
+    if controller.integrates:
+        lines += [
+            "/* the integral follows the voltage really applied */",
+            "const pmdc_real tracking = PMDC_TRACKING_TIME > PMDC_SAMPLE_TIME"
+            " ? PMDC_TRACKING_TIME : PMDC_SAMPLE_TIME;",
+            "state->integral += PMDC_SAMPLE_TIME * (PMDC_INTEGRAL * (reference - speed)",
+            "                                       + (applied - asked) / tracking);",
+        ]
+    if controller.name == "pid":
+        lines += ["state->filtered += PMDC_SAMPLE_TIME * slope;"]
+    acting = "state->voltage" if hardware.delay else "applied"
+    lines += [
+        "state->current = PMDC_MODEL_II * here + PMDC_MODEL_IW * speed"
+        f" + PMDC_MODEL_IV * {acting};",
+        "(void)ahead;",
+        "state->voltage = applied;",
+        "return applied;",
+    ]
+    return lines

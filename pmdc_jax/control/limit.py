@@ -1,0 +1,121 @@
+"""The fastest settling that voltage and current allow, whatever the controller."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..effects.base import State
+from ..motor import Drive, Motor
+from ..precision import double_precision
+from ..simulate.solver import held_step, propagator
+from .controllers import Number
+from .metrics import BAND
+from .steady import steady_state
+
+INSTANTS = 20_000
+
+
+@double_precision
+def fastest_settling(
+    motor: Motor,
+    setpoint: float,
+    voltage_limit: float,
+    current_limit: float | None = None,
+    initial: float = 0.0,
+    load: float = 0.0,
+) -> float | None:
+    """The shortest time in which any controller can bring the speed into the 2 % band and keep it there, s.
+
+    Flat out towards the set point, by the limit of voltage or of current, whichever binds. If the current that is
+    then flowing would carry the speed out of the band at its far side, full reverse from the one moment at which
+    the speed just stays inside. Bang-bang with one switch is optimal for a motor of two states.
+
+    **Arguments**: `setpoint` and `initial`, rad/s; `voltage_limit`, V, and `current_limit`, A, in either
+    direction; `load`, N m, present from the start.
+
+    **Returns**: the time, or None where the band is out of reach. Within 1e-4 of it.
+
+    **Source**: Pontryagin et al., "The Mathematical Theory of Optimal Processes" (1962), section 5.
+    """
+    motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
+    duration = 10 * float(motor.L / motor.R + motor.J * motor.R / (motor.Kt * motor.Kb))
+    bounds = jax.tree.map(
+        jnp.asarray, (setpoint, voltage_limit, current_limit, float(initial), float(load))
+    )
+    for _ in range(12):
+        reached = float(_dash(motor, jnp.asarray(duration), jnp.asarray(INSTANTS), *bounds)[0])
+        if reached == reached:  # not NaN: once more, on instants as close as they can be
+            return _with_one_switch(motor, 1.2 * reached, *bounds)
+        duration *= 2
+    return None
+
+
+def _with_one_switch(motor: Motor, duration: float, *bounds) -> float:
+    """Settling time with the latest switch to full reverse that keeps the speed in the band."""
+    settled, stays = _dash(motor, jnp.asarray(duration), jnp.asarray(INSTANTS), *bounds)
+    early, late = 0, INSTANTS
+    while not stays and late - early > 1:
+        switch = (early + late) // 2
+        trial, trial_stays = _dash(motor, jnp.asarray(1.5 * duration), jnp.asarray(switch), *bounds)
+        if not trial_stays:
+            late = switch
+            continue
+        early = switch
+        if float(trial) == float(trial):
+            settled = trial
+    return float(settled)
+
+
+@eqx.filter_jit
+def _dash(
+    motor: Motor,
+    duration: Float[Array, ""],
+    switch: Int[Array, ""],
+    setpoint: Number,
+    voltage_limit: Number,
+    current_limit: Number | None,
+    initial: Number,
+    load: Number,
+) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Flat out until instant `switch` or into the band, then full reverse until the speed turns.
+
+    **Returns**: when the band is reached (NaN if it is not), and whether its far side is respected.
+    """
+    drive, step = Drive(), duration / INSTANTS
+    along = propagator(motor, jnp.asarray(step), drive)
+    ahead = jnp.sign(setpoint - initial)
+    band = BAND * jnp.abs(setpoint - initial)
+    load = jnp.asarray(load, float)
+
+    def limited(state: State, voltage):
+        """The next state at this voltage, or at the one that ends the step at the current limit."""
+        flat_out = held_step(motor, along, drive, state, voltage, load)
+        if current_limit is None:
+            return flat_out
+        idle = held_step(motor, along, drive, state, jnp.zeros_like(voltage), load)
+        gain = flat_out.current - idle.current
+        most = jnp.sign(voltage) * current_limit
+        share = (most - idle.current) / jnp.where(gain == 0, 1.0, gain)
+        applied = voltage * jnp.clip(share, -1.0, 1.0)
+        return held_step(motor, along, drive, state, applied, load)
+
+    def instant(carry, k):
+        state, braking, turned = carry
+        short = ahead * (setpoint - state.speed) - band
+        braking = braking | (k >= switch) | (short <= 0)
+        new = limited(state, jnp.where(braking, -ahead, ahead) * voltage_limit)
+        turned = turned | (braking & (ahead * (new.speed - state.speed) <= 0))
+        # what comes after the turn does not count
+        state = jax.tree.map(lambda now, then: jnp.where(turned, now, then), state, new)
+        return (state, braking, turned), state.speed
+
+    at, _ = steady_state(motor, jnp.asarray(initial, float))
+    start = (at, jnp.asarray(False), jnp.asarray(False))
+    _, speed = jax.lax.scan(instant, start, jnp.arange(INSTANTS))
+    short = ahead * (setpoint - jnp.concatenate([at.speed[None], speed])) - band
+    k = jnp.argmax(short <= 0)
+    crossing = step * (k - 1 + short[k - 1] / (short[k - 1] - short[k]))
+    return jnp.where(jnp.any(short <= 0), crossing, jnp.nan), jnp.min(short) >= -2 * band

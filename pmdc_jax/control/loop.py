@@ -1,0 +1,105 @@
+"""The sampled closed loop: one exact step of the motor a sample, or several to see between the samples."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..motor import Drive, Motor
+from ..simulate.solver import held_step, propagator
+from .controllers import Number
+from .law import Law
+from .steady import steady_state
+
+# Samples that a slow speed sensor can be late.
+REMEMBERED = 32
+
+
+class Course(NamedTuple):
+    """What is asked of the loop, held from sample to sample.
+
+    `reference`, rad/s; `load`, N m, opposes positive motion; `speed_noise`, rad/s, added to the measured speed;
+    `initial`, rad/s, the speed at which the motor has long been held, without load.
+    """
+
+    reference: Float[Array, " samples"]
+    load: Float[Array, " samples"]
+    speed_noise: Float[Array, " samples"]
+    initial: Number = 0.0
+
+
+class Response(NamedTuple):
+    """A simulated loop. At instant k: time s, current A, speed rad/s, and the voltage V held from then on."""
+
+    time: Float[Array | np.ndarray, " instants"]
+    current: Float[Array | np.ndarray, " instants"]
+    speed: Float[Array | np.ndarray, " instants"]
+    voltage: Float[Array | np.ndarray, " instants"]
+
+
+def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Response:
+    """Simulate a motor under a sampled law.
+
+    **Arguments**: `motor`, of scalars, effects and all; `law`; `course`, one value a sample; `substeps`, instants
+    a sample in the response: the speed between samples is exact at every one of them.
+
+    **Returns**: `Response` with samples x substeps instants. Differentiable in gains, motor and course; under
+    `jax.vmap` over any of them.
+    """
+    drive, hardware = Drive(), law.hardware
+    along = propagator(motor, jnp.asarray(hardware.sample_time / substeps), drive)
+    at, voltage = steady_state(motor, course.initial)
+    late = motor.speed_delay()
+    memory = law.start(course.initial, at, voltage)
+    start = (at, memory, voltage, jnp.full(REMEMBERED, motor.sensors(at)[1]))
+
+    def sample(carry, now):
+        state, memory, acting, past = carry
+        reference, load, noise = now
+        current, speed = motor.sensors(state)
+        past = jnp.concatenate([speed[None], past[:-1]])
+        if late is not None:
+            speed = _earlier(past, late / hardware.sample_time)
+        speed = _quantised(speed + noise, hardware.speed_step)
+        memory, decided = law.step(memory, reference, speed, current)
+        applied = jnp.asarray(acting if hardware.delay else decided)
+        instants = []
+        for _ in range(substeps):
+            instants.append((state.current, state.speed, applied))
+            state = held_step(motor, along, drive, state, applied, load)
+        return (state, memory, decided, past), jax.tree.map(lambda *x: jnp.stack(x), *instants)
+
+    _, (current, speed, voltage) = jax.lax.scan(
+        sample, start, (course.reference, course.load, course.speed_noise)
+    )
+    instants = jnp.arange(current.size)
+    time = instants * (hardware.sample_time / substeps)
+    return Response(time, current.ravel(), speed.ravel(), voltage.ravel())
+
+
+closed_loop_jit = eqx.filter_jit(closed_loop)
+
+
+def steps_in_sample(motor: Motor, sample_time: float) -> int:
+    """Instants a sample that the motor's effects need to be followed well."""
+    longest = [e.longest_step for e in motor.effects if e.holds or not e.affine]
+    return max(1, round(sample_time / min(longest))) if longest else 1
+
+
+def _earlier(past: Float[Array, " remembered"], samples: Number) -> Float[Array, ""]:
+    """What was so many samples ago, latest first; interpolated linearly."""
+    place = jnp.clip(samples, 0.0, REMEMBERED - 1.001)
+    k = jnp.floor(place).astype(int)
+    return past[k] + (place - k) * (past[k + 1] - past[k])
+
+
+def _quantised(speed: Number, step: Number | None) -> Number:
+    """Rounded to the sensor's quantum; the derivative looks through the rounding."""
+    if step is None:
+        return speed
+    return speed + jax.lax.stop_gradient(jnp.round(speed / step) * step - speed)

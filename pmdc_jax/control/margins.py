@@ -1,0 +1,179 @@
+"""How far a sampled loop is from instability, and what it makes of noise: its linear range, analysed exactly."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from attrs import frozen
+from jaxtyping import Array, Float
+
+from ..effects.base import State
+from ..motor import Motor
+from .law import Law, LawState, Model
+
+FREQUENCIES = 48
+
+
+Matrix = Float[Array | np.ndarray, "n n"]
+Vector = Float[Array | np.ndarray, " n"]
+
+
+class Loop(NamedTuple):
+    """The loop cut open at the motor's terminals, per sample: z' = A z + B v + N n, and the voltage C z + D n that
+    the law would apply; n is an error of the measured speed."""
+
+    A: Matrix
+    B: Vector
+    C: Vector
+    N: Vector
+    D: Float[Array | np.ndarray, ""]
+
+    @property
+    def closed(self) -> Matrix:
+        """The matrix of the closed loop."""
+        return self.A + self.B[:, None] * self.C
+
+
+def linear_loop(motor: Motor, law: Law) -> Loop:
+    """The loop at rest. A law is linear until its limits bind, so the derivatives there are the whole truth; of
+    the motor its linear part is taken."""
+    model = Model.of(motor, law.hardware.sample_time)
+    zero = State(jnp.zeros(()), jnp.zeros(()), {})
+    start = law.start(0.0, zero, jnp.zeros(()))
+    leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, start))
+
+    def sample(inputs):
+        current, speed, *memory, voltage, error = inputs
+        state: LawState = jax.tree.unflatten(tree, memory)
+        after, decided = law.step(state, 0.0, speed + error, current)
+        acting = state.voltage if law.hardware.delay else decided
+        motion = model.next(current, speed, voltage)
+        return jnp.stack([*motion, *jax.tree.leaves(after), acting])
+
+    size = 2 + len(leaves)
+    jacobian = jax.jacfwd(sample)(jnp.zeros(size + 2))
+    A, B, N = jacobian[:size, :size], jacobian[:size, size], jacobian[:size, size + 1]
+    return Loop(A, B, jacobian[size, :size], N, jacobian[size, size + 1])
+
+
+def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
+    """Largest |S| = |1 / (1 + loop gain)| over frequency: 1 / distance from the critical point.
+
+    S(z) = det(z - A) / det(z - A_closed), evaluated in z - 1, which keeps its digits where samples are dense.
+    """
+    eye = jnp.eye(loop.A.shape[0])
+    angle = jnp.asarray(np.geomspace(1e-3, np.pi, FREQUENCIES))
+    shift = jnp.exp(1j * angle) - 1
+    opened, closed = (
+        jnp.polyval(_characteristic(matrix - eye).astype(shift.dtype), shift)
+        for matrix in (loop.A, loop.closed)
+    )
+    return jnp.max(jnp.abs(opened) / jnp.maximum(jnp.abs(closed), 1e-300))
+
+
+def _characteristic(matrix: Matrix) -> Float[Array, " n+1"]:
+    """Coefficients of det(x - matrix), highest power first, by Faddeev and LeVerrier."""
+    size = matrix.shape[0]
+    eye = jnp.eye(size)
+
+    def next_coefficient(product, k):
+        product = matrix @ product
+        coefficient = -jnp.trace(product) / k
+        return product + coefficient * eye, coefficient
+
+    _, coefficients = jax.lax.scan(next_coefficient, eye, jnp.arange(1.0, size + 1))
+    return jnp.concatenate([jnp.ones(1), coefficients])
+
+
+@frozen
+class Margins:
+    """Of a loop. None where there is no limit: a gain margin where no gain makes it unstable, a delay margin where
+    the loop gain never reaches one."""
+
+    stable: bool
+    gain_margin: float | None  # as a factor, > 1
+    phase_margin_deg: float | None
+    delay_margin_s: float | None
+    sensitivity_peak: float | None
+    voltage_per_noise: float | None  # rms V for 1 rad/s rms of white speed noise
+    speed_per_noise: float | None  # rms rad/s likewise
+
+
+def margins(motor: Motor, law: Law) -> Margins:
+    """Stability and robustness of the linear range, and the amplification of white noise of the measured speed."""
+    loop = Loop(*map(np.asarray, linear_loop(motor, law)))
+    loop = _connected(loop)
+    step = float(law.hardware.sample_time)
+    closed = np.asarray(loop.closed)
+    if np.abs(np.linalg.eigvals(closed)).max() >= 1 - 1e-12:
+        return Margins(False, None, None, None, None, None, None)
+    angle = np.geomspace(1e-5, np.pi, 20_000)
+    gain = loop_gain(loop, angle)
+    covariance = _stationary(closed, np.asarray(loop.N + loop.B * loop.D))
+    phase, delay = _phase_margin(angle, gain, step)
+    return Margins(
+        stable=True,
+        gain_margin=_gain_margin(gain),
+        phase_margin_deg=phase,
+        delay_margin_s=delay,
+        sensitivity_peak=float(np.max(1 / np.abs(1 + gain))),
+        voltage_per_noise=float(np.sqrt(loop.C @ covariance @ loop.C + loop.D**2)),
+        speed_per_noise=float(np.sqrt(covariance[1, 1])),
+    )
+
+
+def _connected(loop: Loop) -> Loop:
+    """Without the states of the law that no voltage depends on, such as the memory of a filter it has not got."""
+    link = (
+        (loop.A != 0).astype(int)
+        + np.outer(loop.B != 0, loop.C != 0)
+        + np.eye(len(loop.A), dtype=int)
+    )
+    reaches = np.linalg.matrix_power(link, len(link))
+    needed = (reaches[:2] > 0).any(axis=0) | ((loop.C != 0) @ reaches > 0)
+    A, B, C, N, D = loop
+    return Loop(A[np.ix_(needed, needed)], B[needed], C[needed], N[needed], D)
+
+
+def loop_gain(loop: Loop, angle: np.ndarray) -> np.ndarray:
+    """-C (e^j angle - A)^-1 B, the loop gain under negative feedback; `angle` in radians a sample."""
+    A, B, C = (np.asarray(x) for x in loop[:3])
+    resolvent = np.exp(1j * angle)[:, None, None] * np.eye(len(A)) - A
+    states = np.linalg.solve(resolvent, np.broadcast_to(B[:, None], (len(angle), len(A), 1)))
+    return -(C @ states)[:, 0]
+
+
+def _gain_margin(gain: np.ndarray) -> float | None:
+    """The smallest factor above 1 that brings the loop gain to -1."""
+    x, y = np.real(gain), np.imag(gain)
+    crossing = np.flatnonzero((y[:-1] * y[1:] <= 0) & (x[:-1] < 0))
+    share = y[crossing] / (y[crossing] - y[crossing + 1] + 1e-300)
+    real = x[crossing] + share * (x[crossing + 1] - x[crossing])
+    factors = -1 / real[(real > -1) & (real < 0)]
+    return float(factors.min()) if factors.size else None
+
+
+def _phase_margin(
+    angle: np.ndarray, gain: np.ndarray, step: float
+) -> tuple[float | None, float | None]:
+    """The smallest phase (degrees) and the smallest delay (s) that bring the loop gain to -1."""
+    size = np.log(np.abs(gain))
+    crossing = np.flatnonzero(size[:-1] * size[1:] <= 0)
+    if not crossing.size:
+        return None, None
+    share = size[crossing] / (size[crossing] - size[crossing + 1])
+    at = angle[crossing] + share * (angle[crossing + 1] - angle[crossing])
+    turned = gain[crossing] + share * (gain[crossing + 1] - gain[crossing])
+    phase = np.mod(np.angle(-turned), 2 * np.pi)  # lag that is left until -1
+    lead = np.minimum(phase, 2 * np.pi - phase)
+    return float(np.degrees(lead.min())), float((phase / at).min() * step)
+
+
+def _stationary(closed: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Covariance of the states under white noise of variance 1."""
+    from scipy.linalg import solve_discrete_lyapunov
+
+    return solve_discrete_lyapunov(closed, np.outer(noise, noise))

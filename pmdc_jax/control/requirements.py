@@ -1,0 +1,92 @@
+"""What a specification needs of motor, voltage and current; what is beyond them is refused, with the number."""
+
+from __future__ import annotations
+
+import math
+
+from ..errors import InputError
+from ..motor import Motor
+from .steady import steady_state
+
+
+def reach(motor: Motor, voltage_limit: float, load: float = 0.0) -> float:
+    """The speed that a voltage keeps up against a load, rad/s; of the linear part of the motor."""
+    R, Kb, Kt, f = (float(getattr(motor, name)) for name in ("R", "Kb", "Kt", "f"))
+    return (Kt * voltage_limit - R * load) / (R * f + Kt * Kb)
+
+
+def check_reachable(
+    motor: Motor,
+    setpoint: float,
+    voltage_limit: float,
+    current_limit: float | None,
+    load: float,
+    named: str = "--setpoint",
+) -> None:
+    """Raise an `InputError` where the set point cannot be held against the load within the limits."""
+    state, voltage = steady_state(motor, setpoint, load)
+    current, voltage = abs(float(state.current)), abs(float(voltage))
+    against = f" against {load:g} N m" if load else ""
+    if voltage > voltage_limit:
+        most = _fastest(motor, setpoint, voltage_limit, load)
+        raise InputError(
+            named,
+            f"{setpoint:g} rad/s{against} is beyond what {voltage_limit:g} V reaches ({most:.1f})",
+            f"It takes {voltage:.2f} V to hold it and more to get there in time",
+        )
+    if current_limit is not None and current > current_limit:
+        raise InputError(
+            named,
+            f"holding {setpoint:g} rad/s{against} takes {current:.2f} A,"
+            f" beyond the limit of {current_limit:g} A",
+            "Raise --current-limit, or lower set point or load",
+        )
+
+
+def _fastest(motor: Motor, setpoint: float, voltage_limit: float, load: float) -> float:
+    """The highest speed that the voltage holds, effects and all, by halving."""
+    if not motor.effects:
+        return max(0.0, reach(motor, voltage_limit, load))
+    low, high = 0.0, abs(setpoint)
+    for _ in range(20):
+        middle = (low + high) / 2
+        held = abs(float(steady_state(motor, math.copysign(middle, setpoint), load)[1]))
+        low, high = (middle, high) if held <= voltage_limit else (low, middle)
+    return low
+
+
+def check_time(max_settling: float | None, fastest: float | None, setpoint: float) -> float:
+    """The fastest settling, if there is one and the specification leaves time for it."""
+    if fastest is None:
+        raise InputError(
+            "--setpoint",
+            f"{setpoint:g} rad/s is never reached within the limits",
+            "Raise --voltage-limit or --current-limit",
+        )
+    if max_settling is not None and max_settling < fastest:
+        raise InputError(
+            "--max-settling",
+            f"{max_settling:g} s is less than any controller needs within the limits"
+            f" ({fastest:.4f} s)",
+            "Allow more time, more voltage or more current",
+        )
+    return fastest
+
+
+def check_positive(**values: float | None) -> None:
+    """Refuse what must be a positive, finite number and is not; names as of Python arguments."""
+    for name, value in values.items():
+        if value is not None and not (math.isfinite(value) and value > 0):
+            option = "--" + name.replace("_", "-")
+            raise InputError(option, f"{value:g} is not a positive number", "Give it in SI units")
+
+
+def spare_torque(
+    motor: Motor, setpoint: float, voltage_limit: float, current_limit: float | None
+) -> float:
+    """Half the torque that can still be held at the set point, N m: a load to try a loop with."""
+    state, voltage = steady_state(motor, setpoint)
+    spare = (voltage_limit - abs(float(voltage))) / float(motor.R)
+    if current_limit is not None:
+        spare = min(spare, current_limit - abs(float(state.current)))
+    return math.copysign(0.5 * max(0.0, spare) * float(motor.Kt), setpoint)

@@ -1,0 +1,42 @@
+"""Steady running: what a speed needs, and what the limits allow."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from ..effects.base import State
+from ..motor import Motor
+from .controllers import Number
+
+
+def steady_state(motor: Motor, speed: Number, load: Number = 0.0) -> tuple[State, Number]:
+    """The state in which a speed is held against a load, and the voltage that it takes.
+
+    Linear motor: i = (f w + T) / Kt, v = R i + Kb w. With effects by Newton's method from there, states that
+    effects add included, so that a winding is as warm as it gets.
+
+    **Arguments**: `speed`, rad/s; `load`, N m, opposes positive motion.
+    """
+    speed = jnp.asarray(speed, float)
+    current = (motor.f * speed + load) / motor.Kt
+    voltage = motor.R * current + motor.Kb * speed
+    if not motor.effects:
+        return State(current, speed, {}), voltage
+
+    def unpacked(unknown):
+        current, voltage, *extra = unknown
+        return State(current, speed, dict(zip(motor.states, extra, strict=True))), voltage
+
+    def rates(unknown):
+        state, voltage = unpacked(unknown)
+        moving = (jnp.sign(state.current), jnp.sign(speed))
+        rate = motor.derivative(state, voltage, jnp.asarray(load, float), None, moving)
+        return jnp.stack([rate.current, rate.speed, *(rate.extra[name] for name in motor.states)])
+
+    def newton(_, unknown):
+        # a state that never rests, such as an angle, has no say: hence the pseudo-inverse
+        return unknown - jnp.linalg.pinv(jax.jacfwd(rates)(unknown)) @ rates(unknown)
+
+    start = jnp.stack([current, voltage, *(jnp.zeros(()) for _ in motor.states)])
+    return unpacked(jax.lax.fori_loop(0, 20, newton, start))

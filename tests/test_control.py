@@ -1,0 +1,479 @@
+"""Closed loops, their metrics and their limit, against closed forms, scipy and python-control."""
+
+from __future__ import annotations
+
+import control as ct
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+from benchmarks import virtual_bench as vb
+from pmdc_jax import InputError
+from pmdc_jax.control import (
+    PI,
+    PID,
+    Course,
+    Hardware,
+    Law,
+    StateFeedback,
+    StateFeedbackIntegral,
+    closed_loop,
+    fastest_settling,
+    load_metrics,
+    steady_state,
+    step_metrics,
+)
+from pmdc_jax.control.classical import ackermann, state_feedback, ultimate_gain, ziegler_nichols
+from pmdc_jax.control.continuous import continuous_loop
+from pmdc_jax.control.loop import steps_in_sample
+from pmdc_jax.control.margins import linear_loop, loop_gain, margins, sensitivity_peak
+from pmdc_jax.control.metrics import smooth_overshoot, smooth_settling
+from pmdc_jax.control.spread import drawn_motors, even_spread
+from pmdc_jax.effects import EFFECTS
+from pmdc_jax.motor import PARAMETERS, Motor
+from pmdc_jax.motor_file import Uncertainty
+
+PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
+MOTOR = Motor(**PAPER)
+SETPOINT = 481.0
+LAWS = {
+    "pi": PI(0.3, 20.0, 1.2, 0.01),
+    "pid": PID(0.45, 20.0, 0.0007, 0.0002, 1.3, 0.017),
+    "state-feedback": StateFeedback(1.5, 0.13, 1.4),
+    "state-feedback-integral": StateFeedbackIntegral(1.5, 0.13, 1.45, 100.0, 0.009),
+}
+SAMPLED = Hardware(1e-3, 30.0, None, 0.1, 1)
+
+run = eqx.filter_jit(closed_loop)
+
+
+@pytest.fixture(autouse=True)
+def _double(x64):
+    """All of this file in double precision."""
+
+
+def course(samples: int, load: float = 0.0, load_from: int = 0, initial: float = 0.0) -> Course:
+    loads = jnp.where(jnp.arange(samples) < load_from, 0.0, load)
+    return Course(jnp.full(samples, SETPOINT), loads, jnp.zeros(samples), initial)
+
+
+def matrices(step: float) -> tuple[np.ndarray, np.ndarray]:
+    """The exact step of the paper's motor by scipy."""
+    R, L, Kb, Kt, J, f = PAPER.values()
+    whole = np.zeros((4, 4))
+    whole[:2] = [[-R / L, -Kb / L, 1 / L, 0.0], [Kt / J, -f / J, 0.0, -1 / J]]
+    moved = expm(whole * step)
+    return moved[:2, :2], moved[:2, 2:]
+
+
+# ------------------------------------------------------------------------------------------ limit
+
+
+@pytest.mark.parametrize(
+    ("volts", "amperes", "seconds"),
+    [
+        (24, None, 0.1114),
+        (25, None, 0.0799),
+        (26, None, 0.0666),
+        (28, None, 0.0523),
+        (30, None, 0.0441),
+        (36, None, 0.0311),
+        (48, None, 0.0206),
+        (24, 50, 0.1405),
+        (30, 50, 0.0903),
+        (48, 50, 0.0900),
+    ],
+)
+def test_the_fastest_settling_is_the_known_one(volts, amperes, seconds):
+    found = fastest_settling(MOTOR, SETPOINT, float(volts), amperes and float(amperes))
+    assert found == pytest.approx(seconds, abs=5.5e-5)  # they are given to four decimals
+
+
+def test_the_fastest_settling_brakes_in_time():
+    """At 400 V the current that gets there fastest would shoot through the band of a small step. The one switch whose
+    turning point just touches the far edge, by scipy from the motor's eigenvalues."""
+    target, volts = 20.0, 400.0
+    R, L, Kb, Kt, J, f = PAPER.values()
+    A, B = np.array([[-R / L, -Kb / L], [Kt / J, -f / J]]), np.array([1 / L, 0.0])
+    values, vectors = np.linalg.eig(A)
+
+    def speeds(x, volts, times):
+        rest = np.linalg.solve(A, -B * volts)
+        modes = np.linalg.solve(vectors, x - rest)
+        return rest[1] + (vectors[1] * modes * np.exp(np.outer(times, values))).sum(1)
+
+    def after(switch):
+        moved, _ = matrices(switch)
+        rest = np.linalg.solve(A, -B * volts)
+        return rest + moved @ -rest
+
+    times = np.linspace(0, 1e-3, 100_001)
+    switch = brentq(
+        lambda t: speeds(after(t), -volts, times).max() - 1.02 * target, 1e-4, 8e-4, xtol=1e-12
+    )
+    braking = speeds(after(switch), -volts, times)
+    best = switch + np.interp(0.98 * target, braking[: braking.argmax()], times[: braking.argmax()])
+    found = fastest_settling(MOTOR, target, volts)
+    assert found == pytest.approx(best, rel=3e-4)  # twice the distance of its instants
+    flat_out = brentq(lambda t: speeds(np.zeros(2), volts, [t])[0] - 0.98 * target, 1e-4, 8e-4)
+    assert best > flat_out * 1.01
+
+
+def test_what_is_out_of_reach_has_no_fastest_settling():
+    assert fastest_settling(MOTOR, 600.0, 24.0) is None
+
+
+def test_braking_has_a_limit_too():
+    down = fastest_settling(MOTOR, 240.5, 30.0, None, 481.0)
+    up = fastest_settling(MOTOR, 481.0, 30.0, None, 240.5)
+    assert 0 < down < up
+
+
+# ---------------------------------------------------------------------------------------- metrics
+
+
+@pytest.mark.parametrize("damping", [0.2, 0.5, 0.8])
+def test_metrics_of_a_second_order_response_are_the_closed_form(damping):
+    natural, final, initial = 50.0, 481.0, 100.0
+    time = np.linspace(0, 1.0, 200_001)
+    damped = natural * np.sqrt(1 - damping**2)
+    decay, lag = damping * natural, np.arccos(damping)
+    share = 1 - np.exp(-decay * time) * np.sin(damped * time + lag) / np.sin(lag)
+    found = step_metrics(jnp.asarray(time), initial + share * (final - initial), final, initial)
+    assert float(found.Overshoot) == pytest.approx(100 * np.exp(-np.pi * decay / damped), rel=1e-6)
+    assert float(found.PeakTime) == pytest.approx(np.pi / damped, rel=1e-6)
+
+    def root(level, low, high):
+        def off(t):
+            return 1 - np.exp(-decay * t) * np.sin(damped * t + lag) / np.sin(lag) - level
+
+        return brentq(off, low, high, xtol=1e-15)
+
+    rise = root(0.9, 0, np.pi / damped) - root(0.1, 0, np.pi / damped)
+    assert float(found.RiseTime) == pytest.approx(rise, rel=1e-6)
+    # the last extreme outside the band, and the crossing after it
+    half = np.pi / damped
+    extreme = max(k for k in range(20) if np.exp(-decay * k * half) > 0.02)
+    level = 1.02 if extreme % 2 else 0.98
+    settling = root(level, extreme * half, (extreme + 1) * half)
+    assert float(found.SettlingTime) == pytest.approx(settling, rel=1e-6)
+
+
+def test_metrics_agree_with_python_control():
+    time = np.linspace(0, 0.4, 4001)
+    _, speed = ct.step_response(ct.tf([3.0, 900.0], [1.0, 25.0, 900.0]), time)
+    theirs = ct.step_info(speed, time, SettlingTimeThreshold=0.02)
+    ours = step_metrics(jnp.asarray(time), jnp.asarray(speed), float(speed[-1]))
+    for name in ("RiseTime", "SettlingTime", "PeakTime"):  # theirs are times of samples
+        assert float(getattr(ours, name)) == pytest.approx(theirs[name], abs=1.5e-4)
+    for name in ("Overshoot", "Peak"):
+        assert float(getattr(ours, name)) == pytest.approx(theirs[name], rel=1e-3)
+
+
+def test_a_response_that_does_not_settle_has_no_settling_time():
+    time = jnp.linspace(0, 1, 1001)
+    found = step_metrics(time, jnp.sin(40 * time), 1.0)
+    assert np.isnan(found.SettlingTime)
+    assert np.isnan(load_metrics(time, 0.5 * time, 1.0).RecoveryTime)
+
+
+def test_a_dip_is_an_undershoot_and_not_an_overshoot():
+    time = jnp.linspace(0, 1, 2001)
+    found = step_metrics(time, 1 - jnp.exp(-9 * time) * (1 + 20 * time), 1.0)
+    assert float(found.Undershoot) > 10
+    assert float(found.Overshoot) == 0
+
+
+def test_smooth_metrics_become_the_exact_ones():
+    response = run(MOTOR, Law.of(LAWS["pid"], SAMPLED, MOTOR), course(128), 50)
+    time, speed = response.time, response.speed
+    exact = step_metrics(time, speed, SETPOINT)
+    errors = [
+        float(jnp.abs(smooth_settling(time, speed, SETPOINT, 0.0, width) - exact.SettlingTime))
+        for width in (0.3, 0.03, 0.003)
+    ]
+    assert errors[2] < errors[1] < errors[0]
+    assert errors[2] < 2 * float(time[1])
+    overshoot = smooth_overshoot(speed, SETPOINT, 0.0, 1e-4)
+    assert float(overshoot) == pytest.approx(float(exact.Overshoot), abs=2e-3)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_gradients_agree_with_finite_differences_in_saturation(name):
+    hardware = Hardware(1e-3, 30.0, 120.0, None, 1)
+    law = Law.of(LAWS[name], hardware, MOTOR)
+    leaves, tree = jax.tree.flatten(law.controller)
+
+    @jax.jit
+    def cost(logarithms):
+        gains = [leaf * jnp.exp(x) for leaf, x in zip(leaves, logarithms, strict=True)]
+        changed = eqx.tree_at(lambda one: one.controller, law, jax.tree.unflatten(tree, gains))
+        response = closed_loop(MOTOR, changed, course(96))
+        settling = smooth_settling(response.time, response.speed, SETPOINT, 0.0, 0.3)
+        return settling / 0.05 + smooth_overshoot(response.speed, SETPOINT, 0.0, 0.3)
+
+    at = jnp.zeros(len(leaves))
+    assert float(jnp.max(run(MOTOR, law, course(96)).voltage)) == 30.0
+    gradient = jax.grad(cost)(at)
+    step = 1e-6
+    for k in range(len(leaves)):
+        difference = (cost(at.at[k].set(step)) - cost(at.at[k].set(-step))) / (2 * step)
+        assert float(gradient[k]) == pytest.approx(float(difference), rel=1e-4, abs=1e-7)
+
+
+# ------------------------------------------------------------------------------------------- loop
+
+
+def test_the_sampled_loop_is_that_of_an_independent_one():
+    """PI by hand in numpy: quantised speed, a sample of delay, saturation, back-calculation, a load."""
+    samples, step, volts, quantum, load = 150, 1e-3, 30.0, 0.1, 0.5
+    kp, ki, weight, tracking = 0.3, 20.0, 1.2, 0.01
+    A, B = matrices(step)
+    x, integral, pending, speeds = np.zeros(2), 0.0, 0.0, []
+    for k in range(samples):
+        speeds.append(x[1])
+        measured = np.round(x[1] / quantum) * quantum
+        asked = kp * (weight * SETPOINT - measured) + integral
+        applied = np.clip(asked, -volts, volts)
+        integral += step * (ki * (SETPOINT - measured) + (applied - asked) / tracking)
+        x = A @ x + B @ [pending, load if k >= 100 else 0.0]
+        pending = applied
+    law = Law.of(LAWS["pi"], SAMPLED, MOTOR)
+    found = run(MOTOR, law, course(samples, load, 100))
+    np.testing.assert_allclose(found.speed, speeds, rtol=0, atol=1e-7)
+
+
+def test_what_lies_between_samples_changes_nothing_at_them():
+    law = Law.of(LAWS["pid"], SAMPLED, MOTOR)
+    coarse, fine = (run(MOTOR, law, course(80, 0.3, 40), n) for n in (1, 10))
+    np.testing.assert_allclose(fine.speed[::10], coarse.speed, atol=1e-8)
+    np.testing.assert_allclose(fine.time[::10], coarse.time, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_sampled_loop_becomes_the_continuous_one(name):
+    times = jnp.linspace(0, 0.06, 601)
+    ideal = continuous_loop(MOTOR, LAWS[name], times, SETPOINT, 30.0)
+    errors = []
+    for step in (2e-4, 2e-5):
+        law = Law.of(LAWS[name], Hardware(step, 30.0), MOTOR)
+        sampled = run(MOTOR, law, course(round(0.06 / step)))
+        errors.append(np.abs(np.interp(times[:-1], sampled.time, sampled.speed) - ideal.speed[:-1]))
+    assert errors[1].max() < 0.15 * errors[0].max()  # of first order in the sample time
+    assert errors[1].max() < 0.2
+
+
+@pytest.mark.parametrize("name", ["pi", "pid", "state-feedback-integral"])
+def test_integral_action_leaves_no_error_under_load(name):
+    law = Law.of(LAWS[name], Hardware(1e-3, 30.0, None, None, 1), MOTOR)
+    response = run(MOTOR, law, course(600, 0.5, 150))
+    found = load_metrics(response.time[150:], response.speed[150:], SETPOINT)
+    assert abs(float(found.SteadyStateError)) < 1e-3
+    assert float(found.RecoveryTime) < 0.05
+
+
+def test_plain_state_feedback_keeps_the_error_that_its_gain_leaves():
+    hardware = Hardware(1e-3, 30.0, None, None, 1)
+    law = Law.of(state_feedback(MOTOR, [-300.0, -300.0], SETPOINT, 1e-3), hardware, MOTOR)
+    response = run(MOTOR, law, course(600, 0.5, 150))
+    K = law.controller
+    A, B = matrices(1e-3)
+    gain = np.array([float(K.current_gain), float(K.speed_gain)])
+    # unknowns i, w, v: the motor rests against the load; what is fed back was predicted without it
+    balance = np.zeros((3, 3))
+    balance[:2, :2], balance[:2, 2] = np.eye(2) - A, -B[:, 0]
+    balance[2, :2], balance[2, 2] = gain @ A, 1 + gain @ B[:, 0]
+    wanted = [*(B[:, 1] * 0.5), float(K.reference_gain) * SETPOINT]
+    speed = np.linalg.solve(balance, wanted)[1]
+    assert SETPOINT - speed > 1
+    assert float(response.speed[-1]) == pytest.approx(speed, abs=1e-6)
+
+
+def test_a_held_motor_stays_where_it_is():
+    for controller in LAWS.values():
+        law = Law.of(controller, Hardware(1e-3, 30.0, 100.0, None, 1), MOTOR)
+        steady = Course(jnp.full(30, 300.0), jnp.zeros(30), jnp.zeros(30), 300.0)
+        if controller.integrates:
+            np.testing.assert_allclose(run(MOTOR, law, steady).speed, 300.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("delay", [0, 1])
+def test_the_current_stays_within_its_limit(delay, measured):
+    hardware = Hardware(1e-3, 30.0, 60.0, 0.1, delay, measured)
+    response = run(MOTOR, Law.of(LAWS["pid"], hardware, MOTOR), course(150), 10)
+    assert float(jnp.max(jnp.abs(response.current))) < 60.0 * 1.005
+    assert float(jnp.max(response.current)) > 59.0
+
+
+def test_the_observer_finds_the_current_whatever_the_load():
+    """State feedback from estimated current is that from measured current, a load step later as well."""
+    seen, estimated = (
+        run(
+            MOTOR,
+            Law.of(LAWS["state-feedback-integral"], Hardware(1e-3, 30.0, None, None, 1, m), MOTOR),
+            course(400, 0.5, 150),
+        )
+        for m in (True, False)
+    )
+    np.testing.assert_allclose(estimated.speed[-50:], seen.speed[-50:], atol=0.02)
+    assert float(jnp.abs(estimated.speed - seen.speed).max()) < 2.0
+
+
+def test_friction_that_sticks_and_a_warming_winding_close_the_loop_too():
+    def scalar(value):
+        return jnp.asarray(float(value))
+
+    effects = (
+        EFFECTS["coulomb_friction"](torque_Nm=scalar(0.1)),
+        EFFECTS["resistance_heating"](rise_per_W=scalar(0.01), time_constant_s=scalar(20.0)),
+    )
+    motor = Motor(**{n: scalar(x) for n, x in PAPER.items()}, effects=effects)
+    law = Law.of(LAWS["pid"], Hardware(1e-3, 30.0, 100.0, None, 1), motor)
+    response = run(motor, law, course(300))
+    assert float(response.speed[-1]) == pytest.approx(SETPOINT, abs=0.05)
+    state, voltage = steady_state(motor, SETPOINT)
+    current = (0.1 + PAPER["f"] * SETPOINT) / PAPER["Kt"]
+    assert float(state.current) == pytest.approx(current, rel=1e-9)
+    warm = PAPER["R"] * (1 + 0.01 * float(voltage - PAPER["Kb"] * SETPOINT) * current)
+    assert float(voltage) == pytest.approx(PAPER["Kb"] * SETPOINT + warm * current, rel=1e-6)
+    assert fastest_settling(motor, SETPOINT, 30.0) > fastest_settling(MOTOR, SETPOINT, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("speed_sensor_delay", {"delay_s": 0.0025}),
+        ("speed_sensor_lag", {"time_constant_s": 0.002}),
+        ("gear_backlash", {"gap_rad": 1e-3, "stiffness_Nm_rad": 30.0, "load_share": 0.1}),
+    ],
+)
+def test_a_loop_through_slow_sensors_and_loose_gears_comes_to_its_set_point(name, parameters):
+    values = {"damping_Nms_rad": 0.01} | parameters if "gap_rad" in parameters else parameters
+    effect = EFFECTS[name](**{field: jnp.asarray(value) for field, value in values.items()})
+    motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
+    gentle = PID(0.2, 8.0, 2e-4, 5e-4, 1.0, 0.02)
+    law = Law.of(gentle, Hardware(1e-3, 30.0, 100.0, None, 1), motor)
+    response = run(motor, law, course(400), steps_in_sample(motor, 1e-3))
+    assert float(response.speed[-1]) == pytest.approx(SETPOINT, abs=0.01)
+    assert float(response.voltage[-1]) == pytest.approx(
+        float(steady_state(motor, SETPOINT)[1]), abs=1e-3
+    )
+
+
+def test_a_late_speed_is_the_same_as_late_samples():
+    """A sensor late by two samples and a law at once, against the loop written out in numpy."""
+    effect = EFFECTS["speed_sensor_delay"](delay_s=jnp.asarray(2e-3))
+    motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
+    law = Law.of(PI(0.05, 1.0, 1.0, 0.02), Hardware(1e-3, 30.0), motor)
+    A, B = matrices(1e-3)
+    x, integral, speeds = np.zeros(2), 0.0, [0.0, 0.0, 0.0]
+    for _ in range(150):
+        speeds.append(x[1])
+        asked = 0.05 * (SETPOINT - speeds[-3]) + integral
+        applied = np.clip(asked, -30, 30)
+        integral += 1e-3 * ((SETPOINT - speeds[-3]) + (applied - asked) / 0.02)
+        x = A @ x + B[:, 0] * applied
+    np.testing.assert_allclose(run(motor, law, course(150)).speed, speeds[3:], atol=1e-6)
+
+
+# ------------------------------------------------------------------------------- rules and margins
+
+
+def test_ackermann_puts_the_poles_where_they_are_wanted():
+    rng = np.random.default_rng(3)
+    A, B = rng.standard_normal((4, 4)), rng.standard_normal(4)
+    poles = np.array([-1.0, -2.0, -3 + 1j, -3 - 1j])
+    K = ackermann(A, B, poles)
+    found = np.linalg.eigvals(A - np.outer(B, K))
+    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(poles), atol=1e-8)
+
+
+@pytest.mark.parametrize("poles", [[-200.0, -300.0], [-150 + 80j, -150 - 80j, -100.0]])
+def test_sampled_state_feedback_has_the_sampled_poles(poles):
+    controller = state_feedback(MOTOR, poles, SETPOINT, 1e-3)
+    law = Law.of(controller, Hardware(1e-3, 30.0), MOTOR)
+    found = np.linalg.eigvals(np.asarray(linear_loop(MOTOR, law).closed))
+    for pole in poles:
+        assert np.abs(found - np.exp(pole * 1e-3)).min() < 1e-7
+
+
+def test_the_ideal_motor_never_oscillates_and_the_rule_says_why():
+    with pytest.raises(InputError, match="two poles") as refusal:
+        ziegler_nichols(MOTOR, None, "pid")
+    assert "sample time" in refusal.value.mend
+    with pytest.raises(InputError, match="no rule"):
+        ziegler_nichols(MOTOR, SAMPLED, "state-feedback")
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_at_the_ultimate_gain_a_pole_lies_on_the_unit_circle(delay):
+    hardware = Hardware(1e-3, 30.0, None, None, delay)
+    gain, period = ultimate_gain(MOTOR, hardware)
+    law = Law.of(PI(gain, 0.0, 1.0, 1.0), hardware, MOTOR)
+    poles = np.linalg.eigvals(np.asarray(linear_loop(MOTOR, law).closed))
+    turning = poles[np.abs(np.angle(poles)) > 1e-3]
+    nearest = turning[np.argmin(np.abs(np.abs(turning) - 1))]
+    assert abs(nearest) == pytest.approx(1.0, abs=1e-4)
+    assert 2 * np.pi / np.abs(np.angle(nearest)) * 1e-3 == pytest.approx(period, rel=1e-3)
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_margins_are_those_of_python_control(delay):
+    step = 1e-3
+    controller = PI(0.3, 20.0, 1.0, 0.01)
+    law = Law.of(controller, Hardware(step, 30.0, None, None, delay), MOTOR)
+    A, B = matrices(step)
+    motor = ct.ss2tf(ct.ss(A, B[:, :1], [[0, 1]], 0, step))
+    integral = ct.tf([step * 20.0], [1, -1], step)
+    late = ct.tf([1], [1, 0], step) if delay else 1
+    gain, phase, _, _, crossing, _ = ct.stability_margins((0.3 + integral) * motor * late)
+    found = margins(MOTOR, law)
+    assert found.stable
+    assert found.gain_margin == pytest.approx(gain, rel=1e-3)
+    assert found.phase_margin_deg == pytest.approx(phase, rel=1e-3)
+    assert found.delay_margin_s == pytest.approx(np.radians(phase) / crossing, rel=1e-3)
+
+
+def test_the_sensitivity_peak_is_that_of_the_loop_gain():
+    for controller in LAWS.values():
+        loop = linear_loop(MOTOR, Law.of(controller, SAMPLED, MOTOR))
+        angle = np.geomspace(1e-3, np.pi, 48)
+        direct = np.max(1 / np.abs(1 + loop_gain(loop, angle)))
+        assert float(sensitivity_peak(loop)) == pytest.approx(direct, rel=1e-8)
+
+
+def test_noise_amplification_is_that_of_a_noisy_simulation():
+    law = Law.of(LAWS["pid"], Hardware(1e-3, 1000.0, None, None, 1), MOTOR)
+    noise = jnp.asarray(np.random.default_rng(0).standard_normal(40_000))
+    still = Course(jnp.full(40_000, 300.0), jnp.zeros(40_000), noise, 300.0)
+    response, found = run(MOTOR, law, still), margins(MOTOR, law)
+    assert float(jnp.std(response.voltage)) == pytest.approx(found.voltage_per_noise, rel=0.03)
+    assert float(jnp.std(response.speed)) == pytest.approx(found.speed_per_noise, rel=0.05)
+
+
+def test_an_unstable_loop_is_said_to_be():
+    gain, _ = ultimate_gain(MOTOR, SAMPLED)
+    assert not margins(MOTOR, Law.of(PI(1.1 * gain, 0.0, 1.0, 1.0), SAMPLED, MOTOR)).stable
+
+
+# ----------------------------------------------------------------------------------- drawn motors
+
+
+def test_drawn_motors_have_the_covariance_they_were_drawn_from():
+    names, root = ("R", "Kt", "J"), np.array([[0.1, 0, 0], [0.05, 0.02, 0], [0.0, 0.04, 0.03]])
+    drawn = drawn_motors(MOTOR, Uncertainty(names, root @ root.T), 20_000, 0)
+    logs = np.log([np.asarray(getattr(drawn, n)) / PAPER[n] for n in names])
+    np.testing.assert_allclose(np.cov(logs), root @ root.T, atol=3e-4)
+    np.testing.assert_allclose(logs.mean(1), 0, atol=1e-12)
+    assert np.ptp(np.asarray(drawn.L)) == 0
+
+
+def test_a_spread_moves_all_six_alike():
+    drawn = drawn_motors(MOTOR, even_spread(0.1), 4000, 1)
+    for name in PARAMETERS:
+        assert np.std(np.log(np.asarray(getattr(drawn, name)))) == pytest.approx(0.1, rel=0.05)

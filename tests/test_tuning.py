@@ -1,0 +1,195 @@
+"""Tuning: what it promises, what it refuses, and how it is told."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from attrs import evolve
+
+from benchmarks import virtual_bench as vb
+from pmdc_jax import InputError, cli, load_controller, load_uncertainty, save_motor, tune
+from pmdc_jax.control.tuning import Tuning
+from pmdc_jax.motor import PARAMETERS, Motor
+from pmdc_jax.report.tuning import summary, tuning_json, write_tuning_report
+
+PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
+MOTOR = Motor(**{name: np.asarray(value) for name, value in PAPER.items()})
+
+
+@cache
+def example() -> Tuning:
+    """PID for every 1 ms, a sample late, on motors with a spread of 5 %."""
+    limits = {"voltage_limit": 30.0, "current_limit": 150.0}
+    return tune(MOTOR, "pid", setpoint=481.0, **limits, speed_step=0.1, spread=0.05, starts=16)
+
+
+def test_the_tuned_loop_comes_close_to_the_limit():
+    found = example()
+    assert found.metrics["SettlingTime"] < 1.25 * found.fastest_possible_settling
+    assert found.metrics["Overshoot"] <= 1.0
+    assert found.meets_specification
+    assert found.margins.stable
+    assert found.margins.sensitivity_peak < 2.1
+    assert found.peak_current < 150 * 1.01
+    assert abs(found.load["SteadyStateError"]) < 0.1
+    second = found.candidates[0].second
+    assert second["Overshoot"] < 3
+    assert second["SettlingTime"] < found.fastest_possible_settling
+
+
+def test_most_of_the_drawn_motors_do_as_well():
+    ours, textbook = example().candidates
+    assert ours.robust.samples == 256
+    assert ours.robust.Overshoot_p95 <= 1.0
+    assert ours.robust.Overshoot_p95 < textbook.robust.Overshoot_p95
+    assert ours.robust.SettlingTime_p95 < textbook.robust.SettlingTime_p95
+
+
+def test_the_json_is_the_contracts(tmp_path):
+    content = tuning_json(example())
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    assert content["controller"]["type"] == "pid"
+    assert content["controller"]["sample_time_s"] == 1e-3
+    assert content["controller"]["gains"]["proportional"] > 0
+    assert content["limits"] == {"voltage_V": 30.0, "current_A": 150.0}
+    assert set(content["metrics"]) == {
+        "RiseTime",
+        "SettlingTime",
+        "Overshoot",
+        "Undershoot",
+        "Peak",
+        "PeakTime",
+        "SteadyStateError",
+    }
+    assert 0.04 < content["fastest_possible_settling_s"] < 0.05
+    assert set(content["robust"]) == {"samples", "Overshoot_p95", "SettlingTime_p95"}
+
+
+def test_the_report_tells_the_same(tmp_path):
+    found, path = example(), tmp_path / "report.html"
+    write_tuning_report(found, path)
+    page = path.read_text(encoding="utf-8")
+    assert "http" not in page.split("<script>")[0].replace("http-equiv", "")
+    assert page.count('class="plot"') == 2
+    text = " ".join(summary(found))
+    assert "times the fastest that 30 V and 150 A allow" in text
+    assert "256 motors" in text
+
+
+def test_a_loop_that_misses_is_said_to_miss():
+    found = example()
+    missed = evolve(found, max_overshoot=-1.0, max_settling=1e-3)
+    assert not missed.meets_specification
+    slow = {**found.metrics, "SettlingTime": None}
+    never = evolve(found, candidates=(evolve(found.candidates[0], metrics=slow),))
+    assert "does not settle" in summary(never)[0]
+    assert not never.meets_specification
+
+
+IMPOSSIBLE = {
+    "voltage": (
+        {"setpoint": 481.0, "voltage_limit": 24.0},
+        "481 rad/s is beyond what 24 V reaches (480.0)",
+    ),
+    "load": (
+        {"setpoint": 481.0, "voltage_limit": 25.0, "load_torque": 1.0},
+        "481 rad/s against 1 N m is beyond what 25 V reaches",
+    ),
+    "current": (
+        {"setpoint": 481.0, "voltage_limit": 30.0, "current_limit": 2.0},
+        "holding 481 rad/s takes 2.44 A, beyond the limit of 2 A",
+    ),
+    "time": (
+        {"setpoint": 481.0, "voltage_limit": 30.0, "max_settling": 0.04},
+        "0.04 s is less than any controller needs within the limits (0.0441 s)",
+    ),
+    "no speed": ({"setpoint": 0.0}, "0 is no speed to go to"),
+    "negative voltage": ({"voltage_limit": -3.0}, "-3 is not a positive number"),
+    "delay": ({"delay": 2}, "2 samples are not supported"),
+    "overshoot": ({"max_overshoot": math.nan}, "nan is not a number from 0 up"),
+    "sampling": (
+        {"setpoint": 481.0, "voltage_limit": 30.0, "sample_time": 1e-6},
+        "1e-06 s makes",
+    ),
+    "controller": ({"controller": "fuzzy"}, "there is no controller 'fuzzy'"),
+}
+
+
+@pytest.mark.parametrize(("options", "says"), IMPOSSIBLE.values(), ids=IMPOSSIBLE.keys())
+def test_what_cannot_be_is_refused_with_the_number(options, says):
+    with pytest.raises(InputError) as refusal:
+        tune(MOTOR, **options)
+    assert says in str(refusal.value)
+    assert refusal.value.mend
+
+
+@pytest.fixture
+def motor_file(tmp_path, monkeypatch):
+    save_motor(tmp_path / "motor.json", MOTOR)
+    monkeypatch.chdir(tmp_path)
+    for variable in ("FORCE_COLOR", "TTY_COMPATIBLE"):  # rich takes these for a terminal
+        monkeypatch.delenv(variable, raising=False)
+    return tmp_path
+
+
+def test_the_command_refuses_in_one_line(motor_file, capsys):
+    arguments = "tune motor.json --controller pid --setpoint 481 --voltage-limit 24"
+    assert cli.main(arguments.split()) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert "481 rad/s is beyond what 24 V reaches (480.0)" in err
+
+
+def test_the_command_writes_what_it_is_asked_for(motor_file, capsys, monkeypatch):
+    asked = {}
+
+    def fake(motor, controller, **options):
+        asked.update(options, controller=controller, R=float(motor.R))
+        return example()
+
+    monkeypatch.setattr(importlib.import_module("pmdc_jax.control.tuning"), "tune", fake)
+    arguments = (
+        "tune motor.json --controller pid --setpoint 481 --voltage-limit 30 --current-limit 60"
+        " --sample-time 1e-3 --max-overshoot 0.5 --max-settling 0.2 --load-torque 0.3 --spread 10"
+        " --no-current-sensor --save controller.json --json out.json --report report.html --seed 3"
+    )
+    assert cli.main(arguments.split()) == 0
+    assert asked["R"] == PAPER["R"]
+    assert asked["spread"] == pytest.approx(0.1)
+    assert not asked["measures_current"]
+    assert (asked["load_torque"], asked["max_settling"], asked["seed"]) == (0.3, 0.2, 3)
+    out, _ = capsys.readouterr()
+    assert "PID controller" in out
+    assert "fastest possible" in out
+    assert json.loads((motor_file / "out.json").read_text()) == tuning_json(example())
+    assert (motor_file / "report.html").stat().st_size > 1e6
+    assert load_controller(motor_file / "controller.json").hardware.delay == 1
+    assert cli.main(["export", "controller.json", "--c", "controller.h"]) == 0
+    assert "pmdc_step" in (motor_file / "controller.h").read_text()
+
+
+def test_json_alone_goes_to_standard_output(motor_file, capsys, monkeypatch):
+    tuning = importlib.import_module("pmdc_jax.control.tuning")
+    monkeypatch.setattr(tuning, "tune", lambda *_, **__: example())
+    assert cli.main(["tune", "motor.json", "--controller", "pid", "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out) == tuning_json(example())
+
+
+def test_the_uncertainty_of_a_motor_file_is_read(motor_file):
+    assert load_uncertainty("motor.json") is None
+    content = json.loads((motor_file / "motor.json").read_text())
+    content["covariance"] = {"names": ["R", "J"], "matrix": [[1e-4, 0.0], [0.0, 4e-4]]}
+    (motor_file / "motor.json").write_text(json.dumps(content))
+    names, covariance = load_uncertainty("motor.json")
+    assert names == ("R", "J")
+    assert covariance.tolist() == [[1e-4, 0.0], [0.0, 4e-4]]
+    for broken in ({"names": ["R"]}, {"names": ["Z"], "matrix": [[1.0]]}, 3, {"names": 1}):
+        content["covariance"] = broken
+        (motor_file / "motor.json").write_text(json.dumps(content))
+        with pytest.raises(InputError, match="covariance"):
+            load_uncertainty("motor.json")
