@@ -292,7 +292,7 @@ def problem_of(runs: list[Recording], bounds=None) -> Problem:
 def start_at(problem: Problem, factor: float = 1.0) -> Unknowns:
     """The paper's motor, or some factor off, and each run as it begins in its record."""
     coordinates = np.log([factor * getattr(PAPER, n) for n in PARAMETERS])
-    local = np.concatenate([problem.tape.initial, np.zeros((2, 1))], 1)
+    local = np.concatenate([problem.tape.initial, np.zeros((2, 2))], 1)
     return Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
 
 
