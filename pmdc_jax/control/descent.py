@@ -22,6 +22,7 @@ RATE = 0.06  # of the logarithms of the gains, falling to nothing
 WIDTHS = 0.5, 0.05  # of the smooth metrics, at the beginning and at the end
 
 Coordinates = Float[Array, "starts gains"]
+Costs = Float[Array, " starts"]
 
 
 def tuned(
@@ -47,18 +48,17 @@ def tuned(
     model = Model.of(space.motor, task.hardware.sample_time)
     nominal = jax.tree.map(lambda leaf: leaf[:1], motors)
     costs = _screen(task, space, model, nominal, jnp.asarray(drawn))
-    first = jnp.asarray(drawn[np.argsort(np.asarray(costs), kind="stable")[:starts]])
-    found = _sorted(task, space, model, nominal, _descend(task, space, model, nominal, first))
+    coordinates = _best(jnp.asarray(drawn), costs, starts)
+    coordinates, costs = _descend(task, space, model, nominal, coordinates)
     if motors.R.shape[0] > 1:
-        few = jnp.asarray(found[0][:FINALISTS])
-        found = _sorted(task, space, model, motors, _descend(task, space, model, motors, few))
-    return found
+        finalists = _best(coordinates, costs, FINALISTS)
+        coordinates, _ = _descend(task, space, model, motors, finalists)
+    costs = _rank(task, space, model, motors, coordinates)
+    return np.asarray(_best(coordinates, costs, starts)), np.sort(np.asarray(costs))
 
 
-def _sorted(task, space, model, motors, coordinates: Coordinates) -> tuple[np.ndarray, np.ndarray]:
-    costs = np.asarray(_rank(task, space, model, motors, coordinates))
-    order = np.argsort(costs, kind="stable")
-    return np.asarray(coordinates)[order], costs[order]
+def _best(coordinates: Coordinates, costs: Costs, count: int) -> Float[Array, "best gains"]:
+    return coordinates[jnp.argsort(costs)[:count]]
 
 
 def _costs(task, space, model, motors, coordinates, width):
@@ -82,7 +82,7 @@ def _rank(task, space, model, motors, coordinates) -> Float[Array, " starts"]:
 
 
 @eqx.filter_jit
-def _descend(task, space, model, motors, start: Coordinates) -> Coordinates:
+def _descend(task, space, model, motors, start: Coordinates) -> tuple[Coordinates, Costs]:
     """All starts at once: the sum of their costs has each one's own gradient."""
     lower, upper = (jnp.asarray(bound) for bound in space.bounds())
     schedule = optax.cosine_decay_schedule(RATE, ITERATIONS)
@@ -105,5 +105,5 @@ def _descend(task, space, model, motors, start: Coordinates) -> Coordinates:
         return (x, state, best, lowest), None
 
     first = (start, optimiser.init(start), start, jnp.full(start.shape[0], jnp.inf))
-    (_, _, best, _), _ = jax.lax.scan(iteration, first, jnp.arange(ITERATIONS))
-    return best
+    (_, _, best, lowest), _ = jax.lax.scan(iteration, first, jnp.arange(ITERATIONS))
+    return best, lowest

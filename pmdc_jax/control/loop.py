@@ -68,11 +68,14 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
         speed = _quantised(speed + noise, hardware.speed_step)
         memory, decided = law.step(memory, reference, speed, current)
         applied = jnp.asarray(acting if hardware.delay else decided)
-        instants = []
-        for _ in range(substeps):
-            instants.append((state.current, state.speed, applied))
-            state = held_step(motor, along, drive, state, applied, load)
-        return (state, memory, decided, past), jax.tree.map(lambda *x: jnp.stack(x), *instants)
+
+        def between(state, _):
+            seen = (state.current, state.speed, applied)
+            return held_step(motor, along, drive, state, applied, load), seen
+
+        # a loop and not written out: effects make long steps, and a sample may have dozens
+        state, instants = jax.lax.scan(between, state, length=substeps, unroll=substeps == 1)
+        return (state, memory, decided, past), instants
 
     _, (current, speed, voltage) = jax.lax.scan(
         sample, start, (course.reference, course.load, course.speed_noise)
