@@ -1,6 +1,7 @@
 # Everything is set up once, in .venv: Python 3.11, make and a way to PyPI are all it takes.
 #   make demo     diagnose the packaged sample; results and a report go to demo_out/
 #   make test     style, types, tests
+#   make test-all the slow tests too; twenty minutes and more
 #   make lint     style and types alone
 #   make bench    speed, beside other ways of doing the same
 #   make clean    remove what the others made
@@ -8,7 +9,7 @@
 PYTHON ?= $(shell command -v python3.11 || echo python3)
 BIN := .venv/bin
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test test-all lint bench clean
 
 demo: .venv/ready
 	@$(BIN)/pmdc demo --out demo_out
@@ -16,6 +17,9 @@ demo: .venv/ready
 # a file's tests stay in one process, where they share what JAX has compiled
 test: lint
 	@$(BIN)/pytest -n 2 --dist loadfile
+
+test-all: lint
+	@$(BIN)/pytest -n 2 --dist loadfile -m ''
 
 lint: .venv/ready
 	@$(BIN)/ruff check .

@@ -154,6 +154,7 @@ SMOOTH = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SMOOTH)
 def test_response_is_the_change_of_the_simulation(x64, name):
     """First-order columns against two full simulations, one with a very small effect."""
@@ -202,7 +203,9 @@ NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
 SHAKEN = vb.Noise(current_A=0.1, speed_rad_s=0.5, torque_Nm=0.01, torque_correlation_s=0.02)
 
 
-@pytest.mark.parametrize("noise", [NOISE, SHAKEN], ids=["white", "coloured"])
+@pytest.mark.parametrize(
+    "noise", [NOISE, pytest.param(SHAKEN, marks=pytest.mark.slow)], ids=["white", "coloured"]
+)
 def test_hidden_friction_is_named_and_closes_the_gap(noise):
     truth = vb.BenchMotor(**PAPER, coulomb_Nm=0.08)
     *training, held_out = recorded(truth, 4, noise)
@@ -221,6 +224,7 @@ def test_hidden_friction_is_named_and_closes_the_gap(noise):
     assert found.base.parameters["f"].value > found.final.parameters["f"].value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [NOISE, SHAKEN], ids=["white", "coloured"])
 def test_nothing_is_found_where_nothing_is_missing(noise):
     found = diagnose(recorded(vb.BenchMotor(**PAPER), 5, noise))

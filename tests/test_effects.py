@@ -252,6 +252,11 @@ CASES = {
 }
 LINEAR = Motor(**{n: np.asarray(x) for n, x in PAPER.items()})
 every_effect = pytest.mark.parametrize("name", EFFECTS)
+# one that sticks, one of the winding, one with a state: the others compile for minutes
+QUICK = {"coulomb_friction", "brush_voltage_drop", "resistance_heating"}
+each_simulated = pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in EFFECTS]
+)
 
 
 def with_effect(name: str, values: Values | None = None, **changes: float) -> Motor:
@@ -402,7 +407,7 @@ def test_every_effect_has_a_case():
     assert set(CASES) == set(EFFECTS)
 
 
-@every_effect
+@each_simulated
 def test_agrees_with_an_independent_integrator(x64, name):
     expected = [reference(name, run) for run in RUNS]
     plain = relative_errors(simulated(LINEAR, RUNS), expected)
@@ -422,7 +427,7 @@ def test_slow_sampling_is_as_exact(x64, name):
     assert found[0] < CASES[name].tolerance, found
 
 
-@every_effect
+@each_simulated
 def test_converges_to_the_independent_integrator(x64, name):
     """Samples four times as short: better than first order, over the time that both cover."""
     if EFFECTS[name].affine:
@@ -444,7 +449,7 @@ def zero(name: str) -> dict[str, float]:
     return {**CASES[name].values, **dict.fromkeys(CASES[name].amplitude.split(), 0.0)}
 
 
-@every_effect
+@each_simulated
 def test_without_amplitude_it_is_the_linear_motor(x64, name):
     linear = simulated(LINEAR, RUNS)
     if not CASES[name].amplitude:
@@ -465,7 +470,7 @@ def apart(local: np.ndarray) -> tuple[np.ndarray, ...]:
     return local[:, :2], local[:, 2], local[:, 3]
 
 
-@every_effect
+@each_simulated
 def test_sensitivities_are_central_differences(x64, name):
     """By every parameter of motor and effect, and each run's own start and load offset."""
     bounds = {n: (x / 2, x * 2) for n, x in PAPER.items()}
@@ -500,7 +505,7 @@ def test_sensitivities_are_central_differences(x64, name):
         )
 
 
-@every_effect
+@each_simulated
 def test_the_search_sees_what_the_free_run_sees(x64, name):
     """Sums of squared errors of a population are those of its members; the search rounds delays to samples."""
     motor = with_effect(name, CASES[name].values | ({"delay_s": 3e-3} if "delay" in name else {}))
@@ -541,7 +546,7 @@ def test_finite_all_over_its_ranges(x64, name):
 # ----------------------------------------------------------------------------------- physics
 
 
-@every_effect
+@each_simulated
 @pytest.mark.parametrize("step", [1e-3, 2e-2])
 def test_stored_energy_only_falls_when_nothing_drives(x64, name, step):
     """Shorted and unloaded, a motor with Kt = Kb loses energy at every sample, however long that is."""

@@ -15,6 +15,7 @@ from ..identify.identification import Identification, Role
 from ..identify.pipeline import judge, prepare, solve
 from ..precision import double_precision
 from ..recording import Recording
+from .candidates import UNTRIED
 from .diagnosis import (
     Detectable,
     Diagnosis,
@@ -105,7 +106,8 @@ def _verdict(naming: Naming) -> Verdict:
         return "not_in_library"
     if not naming.chosen.effects:
         return "not_in_library"
-    return "ambiguous" if naming.rivals else "named"
+    untried = UNTRIED.keys() & set(naming.chosen.effects)
+    return "ambiguous" if naming.rivals or untried else "named"
 
 
 def _nearly_closed(naming: Naming) -> bool:
@@ -121,7 +123,7 @@ def _effects(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:
             EFFECTS[name].equation,
             {f: final.parameters[f"{name}.{f}"] for f in EFFECTS[name].ranges},
             naming.without[name],
-            rivals,
+            (*rivals, UNTRIED[name]) if name in UNTRIED else rivals,
         )
         for name in naming.chosen.effects
     )

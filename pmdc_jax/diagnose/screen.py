@@ -131,6 +131,8 @@ class Library:
         kicked, seen, blocks, count = [], [], [], 0
         for name in EFFECTS:
             shapes = [c for c in self.candidates if c.effect == name]
+            if not shapes:
+                continue
             if shapes[0].whole:
                 parts = [self._response(c, tape) for c in shapes]
                 kick, direct = jnp.zeros((*parts[0].shape, len(parts))), jnp.stack(parts, -1)
