@@ -521,6 +521,7 @@ EXPLICIT = pytest.mark.xfail(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
