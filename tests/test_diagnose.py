@@ -203,9 +203,8 @@ NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
 SHAKEN = vb.Noise(current_A=0.1, speed_rad_s=0.5, torque_Nm=0.01, torque_correlation_s=0.02)
 
 
-@pytest.mark.parametrize(
-    "noise", [NOISE, pytest.param(SHAKEN, marks=pytest.mark.slow)], ids=["white", "coloured"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [NOISE, SHAKEN], ids=["white", "coloured"])
 def test_hidden_friction_is_named_and_closes_the_gap(noise):
     truth = vb.BenchMotor(**PAPER, coulomb_Nm=0.08)
     *training, held_out = recorded(truth, 4, noise)

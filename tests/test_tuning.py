@@ -28,6 +28,7 @@ def example() -> Tuning:
     return tune(MOTOR, "pid", setpoint=481.0, **limits, speed_step=0.1, spread=0.05, starts=16)
 
 
+@pytest.mark.slow
 def test_the_tuned_loop_comes_close_to_the_limit():
     found = example()
     assert found.metrics["SettlingTime"] < 1.25 * found.fastest_possible_settling
@@ -42,6 +43,7 @@ def test_the_tuned_loop_comes_close_to_the_limit():
     assert second["SettlingTime"] < found.fastest_possible_settling
 
 
+@pytest.mark.slow
 def test_most_of_the_drawn_motors_do_as_well():
     ours, textbook = example().candidates
     assert ours.robust.samples == 256
@@ -50,6 +52,7 @@ def test_most_of_the_drawn_motors_do_as_well():
     assert ours.robust.SettlingTime_p95 < textbook.robust.SettlingTime_p95
 
 
+@pytest.mark.slow
 def test_the_json_is_the_contracts(tmp_path):
     content = tuning_json(example())
     assert json.loads(json.dumps(content, allow_nan=False)) == content
@@ -70,6 +73,7 @@ def test_the_json_is_the_contracts(tmp_path):
     assert set(content["robust"]) == {"samples", "Overshoot_p95", "SettlingTime_p95"}
 
 
+@pytest.mark.slow
 def test_the_report_tells_the_same(tmp_path):
     found, path = example(), tmp_path / "report.html"
     write_tuning_report(found, path)
@@ -81,6 +85,7 @@ def test_the_report_tells_the_same(tmp_path):
     assert "256 motors" in text
 
 
+@pytest.mark.slow
 def test_a_loop_that_misses_is_said_to_miss():
     found = example()
     missed = evolve(found, max_overshoot=-1.0, max_settling=1e-3)
@@ -145,6 +150,7 @@ def test_the_command_refuses_in_one_line(motor_file, capsys):
     assert "481 rad/s is beyond what 24 V reaches (480.0)" in err
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_it_is_asked_for(motor_file, capsys, monkeypatch):
     asked = {}
 
@@ -173,6 +179,7 @@ def test_the_command_writes_what_it_is_asked_for(motor_file, capsys, monkeypatch
     assert "pmdc_step" in (motor_file / "controller.h").read_text()
 
 
+@pytest.mark.slow
 def test_json_alone_goes_to_standard_output(motor_file, capsys, monkeypatch):
     tuning = importlib.import_module("pmdc_jax.control.tuning")
     monkeypatch.setattr(tuning, "tune", lambda *_, **__: example())
