@@ -12,9 +12,9 @@ from scipy import special, stats
 from ..effects import EFFECTS
 from ..identify.refine import Refined, Unknowns, polish
 from .candidates import Candidate, Values
-from .evidence import Block, Evidence
-from .noise import plain, whitener
-from .screen import Library, Model, Screen, left_over, rows_of, screen
+from .evidence import Block
+from .noise import whitener
+from .screen import Library, Model, Screen, beyond_curves, left_over, rows_of, screen
 
 # Chance that anything at all is called missing from a motor that lacks nothing
 ALARM = 0.01
@@ -26,7 +26,6 @@ COMPARABLE = 0.6
 CONTAINS = {
     "stribeck_friction": {"coulomb_friction"},
     "asymmetric_friction": {"coulomb_friction", "constant_load"},
-    "gear_backlash": {"shaft_compliance"},
 }
 # Rivals whose criterion is nearer than this are not told apart
 MARGIN = 8.0
@@ -50,7 +49,7 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
         if candidate is not None and not found.possible(candidate, fit.coefficients[0]):
             return None
         gain = max(base - fit.squares, 0.0)
-        return Signal(gain, _log_chance(gain, found.evidence, block), candidate, block)
+        return Signal(gain, log_chance(gain, found.evidence.freedom(block)), candidate, block)
 
     def ranked(pairs) -> list[Signal]:
         every = [s for pair in pairs if (s := signal(*pair)) is not None]
@@ -58,10 +57,6 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
 
     of_candidates = ranked(zip(found.candidates, found.of_candidate, strict=True))
     return of_candidates, ranked((None, block) for block in found.of_curve)
-
-
-def _log_chance(gain: float, evidence: Evidence, block: Block) -> float:
-    return log_chance(gain, evidence.freedom(block))
 
 
 def log_chance(gain: float, freedom: int) -> float:
@@ -72,12 +67,21 @@ def log_chance(gain: float, freedom: int) -> float:
     return float(-gain / 2 + (half - 1) * np.log(gain / 2) - special.gammaln(half))
 
 
-def chance_of_nothing(found: Screen) -> float:
-    """Chance of evidence as strong as the strongest if nothing were missing: Bonferroni over all blocks."""
-    of_candidates, of_curves = signals(found)
-    count = len(found.candidates) + len(found.curves)
+def chance_of_nothing(
+    of_candidates: Sequence[Signal], of_curves: Sequence[Signal], count: int
+) -> float:
+    """Chance of evidence as strong as the strongest if nothing were missing: Bonferroni over `count` blocks."""
     smallest = min(s.log_p for s in (*of_candidates, *of_curves))
     return float(min(1.0, np.exp(smallest + np.log(count))))
+
+
+class Seen(NamedTuple):
+    """The evidence against a model, read once."""
+
+    screen: Screen
+    of_candidates: list[Signal]
+    of_curves: list[Signal]
+    left: float  # chance of it if nothing more were missing
 
 
 class Fitted(NamedTuple):
@@ -115,11 +119,10 @@ class Namer:
 
     def name(self) -> Naming:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
-        current, first = self.base, screen(self.base, self.library)
-        found, nothing = first, chance_of_nothing(first)
-        left = nothing
-        while left < ALARM and len(current.effects) < MOST:
-            tried = [self.refit(current, s, found) for s in self._shortlist(current, found)]
+        current, first = self.base, self._see(self.base)
+        found = first
+        while found.left < ALARM and len(current.effects) < MOST:
+            tried = [self.refit(current, s, found.screen) for s in self._shortlist(current, found)]
             tried = [m for m in tried if m is not None]
             if not tried:
                 break
@@ -127,8 +130,7 @@ class Namer:
             if best.model is current:
                 break
             current = self._spared(best.model)
-            found = screen(current, self.library)
-            left = chance_of_nothing(found)
+            found = self._see(current)
         ranked = self.compare(list(self.models.values()))
         price = {frozenset(f.model.effects): f for f in ranked}
         mine = price[frozenset(current.effects)]
@@ -138,35 +140,40 @@ class Namer:
             if f.criterion < mine.criterion + MARGIN and self._is_rival(f.model, current)
         ]
         alone = price[frozenset()].squares
-        unexplained = max(s.gain for found_of in signals(found) for s in found_of)
         return Naming(
-            current,
-            rivals,
-            first,
-            found,
-            nothing,
-            left,
-            alone - mine.squares,
-            unexplained,
-            float(np.sqrt(self._least(current) if left < ALARM else 1.0)),
-            self._without(current),
+            chosen=current,
+            rivals=rivals,
+            first=first.screen,
+            last=found.screen,
+            nothing=first.left,
+            left=found.left,
+            explained=alone - mine.squares,
+            unexplained=max(s.gain for s in (*found.of_candidates, *found.of_curves)),
+            noise=np.sqrt(beyond_curves(current, self.library)) if found.left < ALARM else 1.0,
+            without=self._without(current),
         )
+
+    def _see(self, model: Model) -> Seen:
+        found = screen(model, self.library)
+        of_candidates, of_curves = signals(found)
+        count = len(found.candidates) + len(found.curves)
+        left = chance_of_nothing(of_candidates, of_curves, count)
+        return Seen(found, of_candidates, of_curves, left)
 
     def _is_rival(self, model: Model, chosen: Model) -> bool:
         """Not the same, not a part of it, not the same with something on top."""
         a, b = set(model.effects), set(chosen.effects)
         return bool(a) and not (a <= b or b <= a or _same_class(a, b) or _contains(a, b))
 
-    def _shortlist(self, current: Model, found: Screen) -> list[Signal]:
+    def _shortlist(self, current: Model, found: Seen) -> list[Signal]:
         """The most significant shape of each of the best few effects that are not there yet."""
         best: dict[str, Signal] = {}
-        for s in signals(found)[0]:
+        for s in found.of_candidates:
             assert s.candidate is not None
             if s.candidate.effect not in current.effects:
                 best.setdefault(s.candidate.effect, s)
-        ranked = [
-            s for s in best.values() if s.log_p + np.log(len(found.candidates)) < np.log(ALARM)
-        ]
+        clear = np.log(ALARM / len(found.screen.candidates))
+        ranked = [s for s in best.values() if s.log_p < clear]
         return [s for s in ranked if s.log_p < COMPARABLE * ranked[0].log_p][:SHORTLIST]
 
     def refit(self, current: Model, signal: Signal, found: Screen) -> Model | None:
@@ -193,7 +200,7 @@ class Namer:
         effects: tuple[str, ...],
         values: dict[str, Values],
         moved: np.ndarray,
-        angles: np.ndarray | None,
+        angles: np.ndarray,
     ) -> Model:
         given = self.base.given.with_effects([EFFECTS[e] for e in effects])
         parameters = given.problem.parameters
@@ -214,8 +221,7 @@ class Namer:
                 coordinates.append(np.log(max(value, 1e-300)) if log else value)
         inside = np.clip(coordinates, parameters.lower, parameters.upper)
         local = np.array(current.polished.refined.unknowns.local)
-        if angles is not None:
-            local[:, 3] += angles
+        local[:, 3] += angles
         start = Unknowns(jnp.asarray(inside), jnp.asarray(local))
         return Model(effects, given, polish(given.problem, Refined(start, np.inf, (), False)))
 
@@ -230,7 +236,7 @@ class Namer:
 
     def _drop(self, model: Model, rest: tuple[str, ...]) -> Model:
         nothing = np.zeros(len(model.given.problem.parameters.names))
-        smaller = self._fit(model, rest, {}, nothing, None)
+        smaller = self._fit(model, rest, {}, nothing, np.zeros(len(model.given.roles)))
         self.models[frozenset(rest)] = smaller
         return smaller
 
@@ -244,13 +250,6 @@ class Namer:
             price = len(model.given.problem.parameters.names) * np.log(rows)
             fitted.append(Fitted(model, squares, squares + price))
         return sorted(fitted, key=lambda f: f.criterion)
-
-    def _least(self, chosen: Model) -> float:
-        """Share of the squares of a model's residuals, as they are, that no curve over a variable takes away."""
-        as_they_are = plain([residual for _, residual in rows_of(chosen)])
-        evidence = (found := screen(chosen, self.library, as_they_are)).evidence
-        shared = [block for block in found.of_curve if not block.own]
-        return evidence.regress(shared).squares / evidence.regress().squares
 
     def _without(self, chosen: Model) -> dict[str, float]:
         chances = {}
@@ -271,9 +270,8 @@ def _values(candidate: Candidate, coefficients: np.ndarray, dry: float, runs: in
     sizes = np.hypot(*coefficients.T)
     phases = np.arctan2(coefficients[:, 1], coefficients[:, 0])
     values = candidate.build(coefficients[0], dry)
-    assert values is not None
-    amplitude = next(iter(values))
-    values = {**values, amplitude: float(np.median(sizes))}
+    assert values is not None and candidate.amplitude is not None
+    values = {**values, candidate.amplitude: float(np.median(sizes))}
     angles[: len(phases)] = (phases - phases[0]) / values["periods"]
     return values, angles
 

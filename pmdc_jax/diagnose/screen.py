@@ -17,7 +17,7 @@ from ..motor import Motor
 from ..simulate import Tape, free_run
 from .candidates import Candidate, Scales, Values, candidates
 from .evidence import Block, Evidence, products
-from .noise import Series, Whitener, whitener
+from .noise import Series, Whitener, plain, whitener
 from .response import Path, kicks, path_of, pushes, respond, sensed
 
 
@@ -68,25 +68,45 @@ class Screen(NamedTuple):
 KNOTS, KNOTS_IN_TIME = 9, 7
 
 
-def screen(model: Model, library: Library, whiten: Whitener | None = None) -> Screen:
-    """Gather the evidence against a model.
-
-    `whiten` is the filter of its noise, by default that of its own residuals.
-    """
-    tape = model.given.problem.tape
-    path = path_of(model.polished.evaluation.seen, tape, "speed" in _held_by(model))
+def screen(model: Model, library: Library) -> Screen:
+    """Gather the evidence against a model, white by the filter of its own residuals."""
+    tape, path = model.given.problem.tape, _path(model)
     shown, of_candidate = library.columns(tape, path)
     curved, curves, of_curve = _curves(library, tape, path, shown.shape[-1])
-    columns = np.asarray(jnp.concatenate([shown, curved], -1)).transpose(2, 1, 0, 3)
-    columns = columns * np.asarray(tape.weight)[..., None]
     fitted = rows_of(model)
-    whiten = whiten or whitener([residual for _, residual in fitted])
-    X = [whiten(k, _series(tape, run, columns)) for k, run in enumerate(_training(model))]
-    count = model.given.problem.free.shape[0]
-    offset = [Block(tuple(c + count for c in b.columns), b.own) for b in (*of_candidate, *of_curve)]
+    whiten = whitener([residual for _, residual in fitted])
+    X = _white(model, jnp.concatenate([shown, curved], -1), whiten)
     evidence = _products(model, fitted, whiten, X)
-    split = len(of_candidate)
-    return Screen(evidence, library.candidates, offset[:split], curves, offset[split:], model.dry)
+    of_candidate, of_curve = (_behind(model, blocks) for blocks in (of_candidate, of_curve))
+    return Screen(evidence, library.candidates, of_candidate, curves, of_curve, model.dry)
+
+
+def beyond_curves(model: Model, library: Library) -> float:
+    """Share of the squares of a model's residuals, as they are, that no curve over a variable takes away."""
+    fitted = rows_of(model)
+    as_they_are = plain([residual for _, residual in fitted])
+    curved, _, of_curve = _curves(library, model.given.problem.tape, _path(model), 0)
+    evidence = _products(model, fitted, as_they_are, _white(model, curved, as_they_are))
+    shared = [block for block in _behind(model, of_curve) if not block.own]
+    return evidence.regress(shared).squares / evidence.regress().squares
+
+
+def _path(model: Model) -> Path:
+    tape = model.given.problem.tape
+    return path_of(model.polished.evaluation.seen, tape, "speed" in _held_by(model))
+
+
+def _white(model: Model, columns: jax.Array, whiten: Whitener) -> list[np.ndarray]:
+    """Responses (samples, 2, blocks, columns) as white rows of every training run."""
+    tape = model.given.problem.tape
+    there = np.asarray(columns).transpose(2, 1, 0, 3) * np.asarray(tape.weight)[..., None]
+    return [whiten(k, _series(tape, run, there)) for k, run in enumerate(_training(model))]
+
+
+def _behind(model: Model, blocks: Sequence[Block]) -> list[Block]:
+    """The blocks' columns, counted on behind the motor's own parameters."""
+    count = model.given.problem.free.shape[0]
+    return [Block(tuple(c + count for c in block.columns), block.own) for block in blocks]
 
 
 def left_over(model: Model, whiten: Whitener) -> tuple[float, int]:
