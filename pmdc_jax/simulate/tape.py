@@ -87,6 +87,8 @@ class Tape(eqx.Module):
             tape["run"][part], tape["grid"][part] = index, grids.index(run.grid)
             tape["begins"][first] = True
             first += run.blocks
+        # what is filled up begins anew in every block, so that nobody waits for it to be joined
+        tape["begins"][first:], tape["turn"][first:] = True, 0.0
         kinds = np.array([drive for _, drive in grids])
         return cls(
             **tape,
