@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Matrix = Float[Array, "n n *batch"]
+Matrix = Float[Array, "n n *#batch"]
 
 # Taylor order and halvings: exact to rounding for |A h| up to 0.25 * 2**HALVINGS
 ORDER = 10

@@ -79,9 +79,8 @@ def free_run(
     begins = _begins(motor, own, tape)
     states = begins.shape[1]
     still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
-    starts, last = _join(prepared, still, states, tape, own, begins)
-    shift = _stitch(last, tape, starts, begins) - starts
-    seen = last.seen + jnp.einsum("sncb,bn->scb", last.d_seen[:, -states:], shift)
+    joined, starts, last = _join(prepared, still, tape, own, begins)
+    seen = last.seen + jnp.einsum("sncb,bn->scb", last.d_seen[:, -states:], joined - starts)
     return _reported(motor, tape, seen.transpose(2, 1, 0))
 
 
@@ -121,14 +120,10 @@ def sensitivities(
     columns = count + 1 + states
     d_prepared = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_prepared)
 
-    if motor.effects:
-        starts, passed = _join(prepared, d_prepared, columns, tape, own, begins)
-    else:
-        # the derivatives by the parameters must be those at the joined starts
-        still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
-        guess, last = _join(prepared, still, states, tape, own, begins)
-        starts = _stitch(last, tape, guess, begins)
-        passed = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
+    # joined with few columns, for that takes several passes; the derivatives are then those at the joined starts
+    still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
+    starts, *_ = _join(prepared, still, tape, own, begins)
+    passed = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
     joined, d_starts = _stitch_tangents(passed, tape, starts, begins, d_begins, count)
 
     by_start = passed.d_seen[:, -states:]
@@ -187,16 +182,17 @@ def _guess(motor: Motor, own: Own, tape: Tape, begins: Starts) -> Starts:
     return jnp.where(jnp.asarray(tape.begins)[:, None], begins, guess)
 
 
-def _join(
-    prepared, d_prepared, columns: int, tape: Tape, own: Own, begins: Starts
-) -> tuple[Starts, Pass]:
-    """Starts at which every block begins nearly where the one before it ended, and the pass from them."""
+def _join(prepared, still, tape: Tape, own: Own, begins: Starts) -> tuple[Starts, Starts, Pass]:
+    """Starts at which every block begins where the one before it ended; those of the last pass, and that pass.
+
+    `still` are the derivatives of the prepared motor by the starts: none.
+    """
     motor = prepared[0]
     guess = _guess(motor, own, tape, begins)
-    # a linear motor is joined exactly by the correction of its one pass, and its derivatives by the next; any
-    # other block is exact once the one before it is, so this ends however hard the motor
+    # a linear motor is joined exactly by the correction of its one pass; any other block is exact once the one
+    # before it is, so this ends however hard the motor
     exact = motor.affine and not motor.sticks
-    passes = 1 + (columns > begins.shape[1]) if exact else len(guess) + 1
+    passes = 1 if exact else len(guess) + 1
 
     def unjoined(carry):
         *_, gap, passed = carry
@@ -204,26 +200,27 @@ def _join(
 
     def again(carry):
         _, starts, _, _, passed = carry
-        run = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
+        run = _pass(prepared, still, begins.shape[1], tape, starts, own.load_offset)
         size = jnp.max(jnp.abs(jnp.concatenate([starts, run.end])), axis=0) + 1e-6
         joined = _stitch(run, tape, starts, begins, None if exact else (size, _recurrence(motor)))
-        # what the last pass started from is kept: its derivatives belong to it
         return starts, joined, run, jnp.max(jnp.abs(joined - starts) / size), passed + 1
 
     shapes = jax.eval_shape(again, (guess, guess, None, 0.0, 0))[2]
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     carry = (guess, guess, nothing, jnp.asarray(jnp.inf), jnp.asarray(0))
-    starts, _, run, *_ = jax.lax.while_loop(unjoined, again, carry)
-    return starts, run
+    starts, joined, run, *_ = jax.lax.while_loop(unjoined, again, carry)
+    return joined, starts, run
 
 
 def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_offset) -> Pass:
     """Run every block from its start, with tangents. The last columns are the starts themselves."""
     motor, grids = prepared
     d_motor, d_grids = d_prepared
-    along, drive = pick_grid(grids, tape, tape.grid)
+    # where all blocks share one grid they share its matrices: copies of each would be read at every step
+    grid = tape.grid if tape.sample_time.shape[0] > 1 else jnp.zeros(1, int)
+    along, drive = pick_grid(grids, tape, grid)
     along = _blocks_last(along, 0)
-    d_along = _blocks_last(jax.tree.map(lambda leaf: leaf[:, tape.grid], d_grids), 1)
+    d_along = _blocks_last(jax.tree.map(lambda leaf: leaf[:, grid], d_grids), 1)
     states, steps = starts.shape[1], steps_in_sample(motor, tape)
     offset = load_offset[tape.run]
     d_load = jnp.zeros(columns)

@@ -21,7 +21,7 @@ from .exponential import Matrix, phi_functions, product
 if TYPE_CHECKING:
     from .tape import Tape
 
-Held = Float[Array, "*batch"]
+Held = Float[Array, "*#batch"]
 Vector = tuple[Scalars, ...]  # current, speed, and the states of linear effects
 
 # Steps into which a sample is divided at most
@@ -44,7 +44,7 @@ class Weights(NamedTuple):
 
     push: Matrix  # h phi_1(A h)
     linear: Matrix  # A
-    step: Float[Array, "*batch"]  # s
+    step: Float[Array, "*#batch"]  # s
     stages: Stages | None = None  # where the rest changes within a step
 
 
@@ -56,7 +56,7 @@ class Propagator(NamedTuple):
     """
 
     whole: Matrix  # exp(A h)
-    inputs: Float[Array, "n 2 *batch"]  # h phi_1(A h) B
+    inputs: Float[Array, "n 2 *#batch"]  # h phi_1(A h) B
     weights: Weights | None = None
 
 
@@ -87,7 +87,7 @@ def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator
     return Propagator(phi0, step * product(phi1, B), weights)
 
 
-def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 *batch"]]:
+def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 *#batch"]]:
     """A and B of the linear motor, with the states of its linear effects."""
     A, B = motor.state_space(drive)
     linear = tuple(e for effect in motor.effects if (e := effect.linear()) is not None)
@@ -184,7 +184,7 @@ def _cross(
     grips: tuple[Grip | None, Grip | None],
     before: Vector,
     after: Vector,
-    push: Float[Array, "n *batch"],
+    push: Float[Array, "n *#batch"],
 ) -> Vector:
     """Mend a step in which the state that a dry element holds comes to zero.
 
