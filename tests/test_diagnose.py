@@ -13,9 +13,9 @@ from pmdc_jax import Recording
 from pmdc_jax.diagnose import diagnose
 from pmdc_jax.diagnose.candidates import TABLE, Scales
 from pmdc_jax.diagnose.evidence import Block, products
-from pmdc_jax.diagnose.naming import log_chance
 from pmdc_jax.diagnose.noise import Series, whitener
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
+from pmdc_jax.diagnose.screen import log_chance
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.simulate import Tape, free_run
@@ -163,7 +163,7 @@ def test_response_is_the_change_of_the_simulation(x64, name):
     effect = EFFECTS[name](**{f: jnp.asarray(x) for f, x in SMOOTH[name].items()})
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
     without, with_it = (free_run(m, tape, tape.initial, jnp.zeros(2)) for m in (bare, motor))
-    # the angle and whatever else comes of the measured speed is to come of the simulated one here
+
     path = path_of(without, tape, False)
     if EFFECTS[name].equation == "sensor":
         found = sensed(motor, tape, path)

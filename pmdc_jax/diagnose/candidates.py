@@ -158,14 +158,14 @@ RINGING = (6.0, 12.0, 25.0, 50.0, 100.0)
 SHARE = 0.5
 
 
-def _shaft(hertz: float, scales: Scales) -> Values:
-    """A shaft with a twentieth of the critical damping, on which two inertias ring at `hertz`."""
+def _shaft(hertz: float, scales: Scales, share: float = SHARE, damping: float = 0.05) -> Values:
+    """A shaft on which two inertias ring at `hertz`, with a share of the critical damping."""
     rate = 2 * np.pi * hertz
-    stiffness = rate**2 * scales.inertia * SHARE * (1 - SHARE)
+    stiffness = rate**2 * scales.inertia * share * (1 - share)
     return {
         "stiffness_Nm_rad": stiffness,
-        "damping_Nms_rad": 2 * 0.05 * stiffness / rate,
-        "load_share": SHARE,
+        "damping_Nms_rad": 2 * damping * stiffness / rate,
+        "load_share": share,
     }
 
 
@@ -179,14 +179,30 @@ def _compliance(name: str, scales: Scales) -> list[Candidate]:
     return [candidate(hertz) for hertz in RINGING]
 
 
-def _untried(name: str, scales: Scales) -> list[Candidate]:
-    """No column at all: simulating play takes minutes, and what it does looks like a compliant shaft first."""
+def _no_column(name: str, scales: Scales) -> list[Candidate]:
+    """No column at all: what play does is nothing like proportional to it. See `STARTS`."""
     del name, scales
     return []
 
 
-# What is not tried, by the effect that would be named in its place
-UNTRIED = {"shaft_compliance": "gear_backlash"}
+def _shaft_starts(scales: Scales) -> list[Values]:
+    return [_shaft(f, scales, share, 0.1) for f in (200.0, 100.0, 50.0) for share in (0.6, 0.3)]
+
+
+def _backlash_starts(scales: Scales) -> list[Values]:
+    """Of teeth that are stiff beside everything else."""
+    return [
+        {"gap_rad": gap, **_shaft(100.0, scales, share, 0.3)}
+        for gap in (0.1, 0.03, 0.01)
+        for share in (0.6, 0.3)
+    ]
+
+
+# Where else to begin refitting an effect that is easily fitted wrongly: from one start after another
+STARTS: Mapping[str, Callable[[Scales], list[Values]]] = {
+    "shaft_compliance": _shaft_starts,
+    "gear_backlash": _backlash_starts,
+}
 
 
 def _times(scales: Scales) -> list[float]:
@@ -207,7 +223,7 @@ TABLE: Mapping[str, Callable[[str, Scales], list[Candidate]]] = {
     "torque_ripple": _periodic("amplitude", lambda s: 1.0),
     "constant_load": _amplitude("torque_Nm", lambda s: s.torque, signed=True),
     "shaft_compliance": _compliance,
-    "gear_backlash": _untried,
+    "gear_backlash": _no_column,
     "brush_voltage_drop": _amplitude("voltage_V", lambda s: s.voltage),
     "resistance_heating": _amplitude(
         "rise_per_W", lambda s: 1 / (s.voltage * s.current), time_constant_s=_thermal

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-# Rounding hides whatever is smaller than this share.
-VISIBLE = 1e-9
+# A direction with less than this share of the squares is none: responses to first order are good to a thousandth,
+# and what tells one from what the motor's parameters do as well is no more than that error.
+VISIBLE = 1e-6
 
 
 class Block(NamedTuple):

@@ -7,14 +7,16 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy import special, stats
+from scipy import stats
 
 from ..effects import EFFECTS
-from ..identify.refine import Refined, Unknowns, polish
-from .candidates import Candidate, Values
-from .evidence import Block
-from .noise import whitener
-from .screen import Library, Model, Screen, beyond_curves, left_over, rows_of, screen
+from ..identify.pipeline import POOR, Prepared, settle
+from ..identify.refine import POLISH, Refined, Unknowns, polish
+from .candidates import STARTS, Candidate, Values
+from .library import Library
+from .model import Model, rows_of
+from .noise import Whitener, whitener
+from .screen import Screen, Signal, beyond_curves, left_over, screen, signals
 
 # Chance that anything at all is called missing from a motor that lacks nothing
 ALARM = 0.01
@@ -27,44 +29,14 @@ CONTAINS = {
     "stribeck_friction": {"coulomb_friction"},
     "asymmetric_friction": {"coulomb_friction", "constant_load"},
 }
+# What a named effect leaves of the squares that it explains, by a formula that is not quite nature's, asks for no other
+REMAINDER = 0.02
+# Effects that no column shows, with the simpler ones in whose place they are tried if those leave something
+HARDER = [("shaft_compliance", "gear_backlash")]
+# Steps of a refit that is one of several
+ROUGHLY = 8
 # Rivals whose criterion is nearer than this are not told apart
 MARGIN = 8.0
-
-
-class Signal(NamedTuple):
-    """A block of the evidence on its own: how much better the fit is with it."""
-
-    gain: float
-    log_p: float  # natural logarithm of the chance of such a gain by noise
-    candidate: Candidate | None
-    block: Block
-
-
-def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
-    """Of every candidate that physics allows, and of every curve; the most significant first."""
-    base = found.evidence.regress().squares
-
-    def signal(candidate: Candidate | None, block: Block) -> Signal | None:
-        fit = found.evidence.regress([block])
-        if candidate is not None and not found.possible(candidate, fit.coefficients[0]):
-            return None
-        gain = max(base - fit.squares, 0.0)
-        return Signal(gain, log_chance(gain, found.evidence.freedom(block)), candidate, block)
-
-    def ranked(pairs) -> list[Signal]:
-        every = [s for pair in pairs if (s := signal(*pair)) is not None]
-        return sorted(every, key=lambda s: s.log_p)
-
-    of_candidates = ranked(zip(found.candidates, found.of_candidate, strict=True))
-    return of_candidates, ranked((None, block) for block in found.of_curve)
-
-
-def log_chance(gain: float, freedom: int) -> float:
-    """Logarithm of the chance that noise alone gains as much; far out by the leading term of the tail."""
-    if gain < 500:
-        return float(stats.chi2.logsf(gain, freedom))
-    half = freedom / 2
-    return float(-gain / 2 + (half - 1) * np.log(gain / 2) - special.gammaln(half))
 
 
 def chance_of_nothing(
@@ -82,6 +54,14 @@ class Seen(NamedTuple):
     of_candidates: list[Signal]
     of_curves: list[Signal]
     left: float  # chance of it if nothing more were missing
+
+    @property
+    def clearest(self) -> Signal:
+        """The signal with the largest gain."""
+        return max((*self.of_candidates, *self.of_curves), key=lambda s: s.gain)
+
+
+Start = tuple[Prepared, Refined]
 
 
 class Fitted(NamedTuple):
@@ -121,8 +101,12 @@ class Namer:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
         current, first = self.base, self._see(self.base)
         found = first
-        while found.left < ALARM and len(current.effects) < MOST:
-            tried = [self.refit(current, s, found.screen) for s in self._shortlist(current, found)]
+        while found.left < ALARM and len(current.effects) < MOST and self._worth(current, found):
+            shortlist = self._shortlist(current, found)
+            tried = [self.refit(current, s, found.screen) for s in shortlist]
+            tried += [
+                self._in_place(current, *pair) for pair in HARDER if pair[0] in current.effects
+            ]
             tried = [m for m in tried if m is not None]
             if not tried:
                 break
@@ -148,10 +132,17 @@ class Namer:
             nothing=first.left,
             left=found.left,
             explained=alone - mine.squares,
-            unexplained=max(s.gain for s in (*found.of_candidates, *found.of_curves)),
-            noise=np.sqrt(beyond_curves(current, self.library)) if found.left < ALARM else 1.0,
+            unexplained=found.clearest.gain,
+            noise=np.sqrt(beyond_curves(found.screen)) if found.left < ALARM else 1.0,
             without=self._without(current),
         )
+
+    def _worth(self, current: Model, found: Seen) -> bool:
+        """Whether what is left is more than an effect that is there already may leave by its formula."""
+        if not current.effects:
+            return True
+        base, mine = (left_over(m, self._white(current))[0] for m in (self.base, current))
+        return found.clearest.gain > REMAINDER * (base - mine)
 
     def _see(self, model: Model) -> Seen:
         found = screen(model, self.library)
@@ -190,27 +181,49 @@ class Namer:
         values, angles = _values(signal.candidate, fit.coefficients[0], current.dry, runs)
         if values is None:
             return None
-        model = self._fit(current, (*kept, name), {name: values}, fit.moved, angles)
-        self.models[key] = model
-        return model
+        effects = (*kept, name)
+        start = self._start(current, effects, {name: values}, fit.moved, angles)
+        self.models[key] = self._best_of(effects, [start, *self._starts(current, effects)])
+        return self.models[key]
 
-    def _fit(
+    def _in_place(self, current: Model, old: str, new: str) -> Model:
+        """The current model with an effect in place of a simpler one."""
+        effects = (*(e for e in current.effects if e != old), new)
+        key = frozenset(effects)
+        if key not in self.models:
+            self.report(f"trying {' + '.join(sorted(key))}", current.polished.refined.fitness)
+            self.models[key] = self._best_of(effects, self._starts(current, effects))
+        return self.models[key]
+
+    def _starts(self, current: Model, effects: tuple[str, ...]) -> list[Start]:
+        """Where else to begin refitting the last of some effects."""
+        others = STARTS.get(effects[-1], lambda scales: [])(self.library.scales)
+        return [self._start(current, effects, {effects[-1]: values}) for values in others]
+
+    def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start]) -> Model:
+        """The best refit of several, begun one after another until one is as good as the noise."""
+        ends = []
+        for given, start in starts:
+            steps = POLISH if len(starts) == 1 else ROUGHLY
+            ends.append((given, polish(given.problem, start, steps).refined))
+            if ends[-1][1].fitness < POOR * given.problem.outputs:
+                break
+        return _settled(effects, *min(ends, key=lambda end: end[1].fitness))
+
+    def _start(
         self,
         current: Model,
         effects: tuple[str, ...],
         values: dict[str, Values],
-        moved: np.ndarray,
-        angles: np.ndarray,
-    ) -> Model:
-        given = self.base.given.with_effects([EFFECTS[e] for e in effects])
-        parameters = given.problem.parameters
-        before = dict(
-            zip(
-                current.given.problem.parameters.names,
-                np.asarray(current.polished.refined.unknowns.coordinates) + moved,
-                strict=True,
-            )
-        )
+        moved: np.ndarray | float = 0.0,
+        angles: np.ndarray | float = 0.0,
+    ) -> Start:
+        """Where to begin refitting the current model with other effects: their `values`, and how far by the
+        evidence the motor's parameters have `moved` and each run begins turned."""
+        given = current.given.with_effects([EFFECTS[e] for e in effects])
+        parameters, unknowns = given.problem.parameters, current.polished.refined.unknowns
+        names = current.given.problem.parameters.names
+        before = dict(zip(names, np.asarray(unknowns.coordinates) + moved, strict=True))
         coordinates = []
         for name, log in zip(parameters.names, parameters.logarithmic, strict=True):
             if name in before:
@@ -220,10 +233,10 @@ class Namer:
                 value = values[effect][field]
                 coordinates.append(np.log(max(value, 1e-300)) if log else value)
         inside = np.clip(coordinates, parameters.lower, parameters.upper)
-        local = np.array(current.polished.refined.unknowns.local)
+        local = np.array(unknowns.local)
         local[:, 3] += angles
         start = Unknowns(jnp.asarray(inside), jnp.asarray(local))
-        return Model(effects, given, polish(given.problem, Refined(start, np.inf, (), False)))
+        return given, Refined(start, np.inf, (), False)
 
     def _spared(self, model: Model) -> Model:
         """The model without effects that it can do without."""
@@ -235,21 +248,23 @@ class Namer:
         return model
 
     def _drop(self, model: Model, rest: tuple[str, ...]) -> Model:
-        nothing = np.zeros(len(model.given.problem.parameters.names))
-        smaller = self._fit(model, rest, {}, nothing, np.zeros(len(model.given.roles)))
+        smaller = _settled(rest, *self._start(model, rest, {}))
         self.models[frozenset(rest)] = smaller
         return smaller
 
     def compare(self, models: Sequence[Model]) -> list[Fitted]:
         """By the squares of what each leaves, made white by the filter of the one that leaves least."""
         least = min(models, key=lambda m: m.polished.refined.fitness)
-        white = whitener([residual for _, residual in rows_of(least)])
+        white = self._white(least)
         fitted = []
         for model in models:
             squares, rows = left_over(model, white)
             price = len(model.given.problem.parameters.names) * np.log(rows)
             fitted.append(Fitted(model, squares, squares + price))
         return sorted(fitted, key=lambda f: f.criterion)
+
+    def _white(self, model: Model) -> Whitener:
+        return whitener([fit.residual for fit in rows_of(model)])
 
     def _without(self, chosen: Model) -> dict[str, float]:
         chances = {}
@@ -260,6 +275,10 @@ class Namer:
             gain = both[smaller.effects] - both[chosen.effects]
             chances[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
         return chances
+
+
+def _settled(effects: tuple[str, ...], given: Prepared, start: Refined) -> Model:
+    return Model(effects, *settle(given, start))
 
 
 def _values(candidate: Candidate, coefficients: np.ndarray, dry: float, runs: int):

@@ -15,7 +15,6 @@ from ..identify.identification import Identification, Role
 from ..identify.pipeline import judge, prepare, solve
 from ..precision import double_precision
 from ..recording import Recording
-from .candidates import UNTRIED
 from .diagnosis import (
     Detectable,
     Diagnosis,
@@ -27,8 +26,9 @@ from .diagnosis import (
 )
 from .evidence import Block
 from .experiment import next_experiment
-from .naming import ALARM, Namer, Naming, log_chance
-from .screen import Model, Screen
+from .model import Model
+from .naming import ALARM, Namer, Naming
+from .screen import Screen, log_chance
 
 if TYPE_CHECKING:
     from ..report.terminal import ReportProgress
@@ -64,7 +64,7 @@ def diagnose(
     report = progress or (lambda *args, **kwargs: None)
     report("checking the recordings")
     given = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
-    solved = solve(given, search, seed, progress)
+    given, solved = solve(given, search, seed, progress)
     identified = time.perf_counter()
     report("gathering evidence", solved.polished.refined.fitness)
     naming = Namer(Model((), given, solved.polished), report).name()
@@ -106,8 +106,7 @@ def _verdict(naming: Naming) -> Verdict:
         return "not_in_library"
     if not naming.chosen.effects:
         return "not_in_library"
-    untried = UNTRIED.keys() & set(naming.chosen.effects)
-    return "ambiguous" if naming.rivals or untried else "named"
+    return "ambiguous" if naming.rivals else "named"
 
 
 def _nearly_closed(naming: Naming) -> bool:
@@ -123,7 +122,7 @@ def _effects(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:
             EFFECTS[name].equation,
             {f: final.parameters[f"{name}.{f}"] for f in EFFECTS[name].ranges},
             naming.without[name],
-            (*rivals, UNTRIED[name]) if name in UNTRIED else rivals,
+            rivals,
         )
         for name in naming.chosen.effects
     )

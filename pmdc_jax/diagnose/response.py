@@ -28,7 +28,7 @@ class Path(NamedTuple):
 
     current: Signal
     speed: Signal
-    angle: Signal  # rad, from the recorded speed where there is one
+    angle: Signal  # rad, as the tape says that the rotor turned, else as it is simulated to
     held: Bool[Array, "samples blocks"]
 
 
@@ -38,12 +38,11 @@ def path_of(seen: Float[Array, "blocks 2 samples"], tape: Tape, dry: bool | Arra
     current, speed = seen[:, 0].T, seen[:, 1].T
     drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid], tape.drive)
     current = drive.voltage * current + drive.current * jnp.asarray(tape.value).T
-    turning = jnp.where(tape.weight[:, 1] > 0, tape.measured[:, 1], seen[:, 1])
     step = jnp.asarray(tape.sample_time)[tape.grid][:, None]
     # the mean speed over a sample turns the rotor; every run counts from its own start
-    ahead = jnp.append(turning.reshape(-1)[1:], 0.0).reshape(turning.shape)
-    turned = jnp.cumsum(((turning + ahead) / 2 * step).reshape(-1))
-    before = jnp.append(0.0, turned[:-1]).reshape(turning.shape)
+    ahead = jnp.append(seen[:, 1].reshape(-1)[1:], 0.0).reshape(tape.turn.shape)
+    turn = jnp.where(jnp.isnan(tape.turn), (seen[:, 1] + ahead) / 2 * step, tape.turn)
+    before = jnp.append(0.0, jnp.cumsum(turn.reshape(-1))[:-1]).reshape(turn.shape)
     first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
     angle = before - before[first, :1]
     return Path(current, speed, angle.T, (speed == 0) & dry)

@@ -86,10 +86,10 @@ class ShaftCompliance(AbstractEffect):
 class GearBacklash(AbstractEffect):
     """Backlash: a compliant shaft, or gear, that carries torque only once its play is taken up.
 
-    As `shaft_compliance`, with T_s = stiffness bite + damping (w - w_L), where bite = twist - clip(twist,
-    -gap/2, gap/2) is how far the teeth are pressed together; the damping is that of the oil too, so it acts inside
-    the gap as well, and the torque never jumps. Without gap it is a compliant shaft. A run begins with the teeth in
-    contact on the side that the load presses them to, or in the middle without load.
+    As `shaft_compliance`, with T_s = stiffness bite + damping (w - w_L) while the teeth touch, where bite = twist
+    -+ gap/2 is how far they are pressed together, and nothing inside the gap; teeth push and never pull. Without gap
+    it is nearly a compliant shaft. A run begins with the teeth in contact on the side that the load presses them to,
+    or in the middle without load.
 
     **Fields**: `gap_rad`, the whole play in rad, > 0, usually 0.001 to 0.1; `stiffness_Nm_rad` of the teeth in
     contact in N m/rad, > 0; `damping_Nms_rad` in N m s/rad, > 0; `load_share`, s, the share of the inertia behind the
@@ -101,7 +101,9 @@ class GearBacklash(AbstractEffect):
 
     name: ClassVar = "gear_backlash"
     label: ClassVar = "Gear backlash"
-    formula: ClassVar = "T_s = k bite + d (w - w_L), bite = twist - clip(twist, -gap/2, gap/2)"
+    formula: ClassVar = (
+        "T_s = k bite + d (w - w_L) while the teeth touch, bite = |twist| - gap/2, else 0"
+    )
     equation: ClassVar = "mechanical"
     states: ClassVar = ("gear_speed", "gear_twist")
     longest_step: ClassVar = 2.5e-4
@@ -119,8 +121,11 @@ class GearBacklash(AbstractEffect):
 
     def shaft_torque(self, state: State) -> Scalars:
         twist, slip = state.extra["gear_twist"], state.speed - state.extra["gear_speed"]
-        bite = twist - jnp.clip(twist, -self.gap_rad / 2, self.gap_rad / 2)
-        return self.stiffness_Nm_rad * bite + self.damping_Nms_rad * slip
+        play = self.gap_rad / 2
+        spring, damper = self.stiffness_Nm_rad, self.damping_Nms_rad * slip
+        forward = jnp.maximum(spring * (twist - play) + damper, 0.0)
+        backward = jnp.minimum(spring * (twist + play) + damper, 0.0)
+        return jnp.where(twist > play, forward, jnp.where(twist < -play, backward, 0.0))
 
     def parameters(self, motor: Motor, state: State) -> Motor:
         del state

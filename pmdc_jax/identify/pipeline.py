@@ -31,6 +31,7 @@ from .profile import QUADRATIC, profile_interval
 from .refine import Polished, Problem, Refined, Unknowns, fit_own, polish, refine
 from .search import Found
 from .search import search as global_search
+from .turning import turned
 from .uncertainty import FLAT, Information, information
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ SAME = 1e-4
 POOR = 1.5
 SEARCHES = 5
 TIDYINGS = 3
+TURNINGS = 3
 # Starts nearer to each other than this, in natural logarithms, are one.
 DISTINCT = 0.3
 
@@ -79,7 +81,7 @@ def identify(
     given = prepare(
         recordings, holdout, tie=tie, known=known, unloaded=unloaded, effects=effects_named(effects)
     )
-    solved = solve(given, search, seed, progress)
+    given, solved = solve(given, search, seed, progress)
     report("judging the uncertainty", solved.polished.refined.fitness)
     found = judge(given, solved)
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
@@ -159,8 +161,11 @@ class Solved(NamedTuple):
 
 def solve(
     given: Prepared, search: str, seed: int, progress: ReportProgress | None = None
-) -> Solved:
-    """Search the bounds, refine the best candidates; again, from another seed, while the fit is poor."""
+) -> tuple[Prepared, Solved]:
+    """Search the bounds, refine the best candidates; again, from another seed, while the fit is poor.
+
+    **Returns**: the problem with the rotor turned as the fit says, and the fit.
+    """
     began = time.perf_counter()
     report = progress or (lambda *args, **kwargs: None)
     problem, searching = given.problem, Tape.from_recordings(given.training)
@@ -179,14 +184,29 @@ def solve(
         compiled.result()
     ends = _refine_all(problem, found)
     for attempt in range(1, SEARCHES):
-        if found.interrupted or _agreed(ends, searching):
+        if found.interrupted or _agreed(ends, problem.outputs):
             break
         before, found = found, look(seed + attempt)
         found = found._replace(evaluations=before.evaluations + found.evaluations)
         ends = sorted([*ends, *_refine_all(problem, found)], key=_fitness)
-    polished = polish(problem, ends[0])
+    given, polished = settle(given, ends[0])
     seconds = {"search": searched - began, "refine": time.perf_counter() - searched}
-    return Solved(polished, _search_record(search, found, ends), seed, found.interrupted, seconds)
+    record = _search_record(search, found, ends)
+    return given, Solved(polished, record, seed, found.interrupted, seconds)
+
+
+def settle(given: Prepared, end: Refined) -> tuple[Prepared, Polished]:
+    """Polish; again, as long as it helps, where a torque depends on how the better motor turns."""
+    polished = polish(given.problem, end)
+    for _ in range(TURNINGS):
+        again = given._replace(problem=turned(given.problem, polished.evaluation.seen))
+        if not given.problem.angular:
+            return again, polished
+        better = polish(again.problem, polished.refined)
+        if not better.refined.fitness < polished.refined.fitness:
+            break
+        given, polished = again, better
+    return given, polished
 
 
 def judge(given: Prepared, solved: Solved) -> Identification:
@@ -303,12 +323,11 @@ def _fitness(end: Refined) -> float:
     return end.fitness
 
 
-def _agreed(ends: Sequence[Refined], tape: Tape) -> bool:
+def _agreed(ends: Sequence[Refined], outputs: int) -> bool:
     """Whether several starts ended in the best optimum, and it is as good as the noise or was found often.
 
     A misfit may be the model's, or an optimum of the search's own making: only another search can tell.
     """
-    outputs = np.count_nonzero(np.asarray(tape.weight).any((0, 2)))
     needed = 2 if ends[0].fitness < POOR * outputs else STARTS + 1
     return _times_found(ends) >= needed
 

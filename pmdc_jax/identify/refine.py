@@ -47,6 +47,21 @@ class Problem(eqx.Module):
     free: Bool[Array, " parameters"]
     counts: Bool[Array, " runs"]
 
+    @property
+    def outputs(self) -> int:
+        """How many outputs the runs that count have measured."""
+        return int(np.count_nonzero(np.asarray(self.tape.weight)[self.counted].any((0, 2))))
+
+    @property
+    def counted(self) -> Bool[np.ndarray, " blocks"]:
+        """Which blocks are of runs that count."""
+        return np.asarray(self.counts)[np.asarray(self.tape.run)]
+
+    @property
+    def angular(self) -> bool:
+        """Whether a torque depends on the rotor's angle."""
+        return any("angle" in effect.states for effect in self.parameters.effects)
+
     def moves(self) -> Bool[Array, "runs columns"]:
         """Which coordinates and which of its own unknowns each run may tell of."""
         tape = self.tape
@@ -55,7 +70,7 @@ class Problem(eqx.Module):
         known = jnp.asarray(tape.angle_known)
         # where nobody knows an angle, that of the first run is the zero from which phases count
         zero = ~jnp.any(known) & (jnp.arange(tape.runs) == 0)
-        angle = ~known & ~zero & any("angle" in e.states for e in self.parameters.effects)
+        angle = ~known & ~zero & self.angular
         load = jnp.asarray(tape.load_unknown)
         own = jnp.stack([voltage, jnp.ones_like(voltage), load, angle], 1)
         return jnp.concatenate([self.free[None, :] & self.counts[:, None], own], 1)
@@ -202,13 +217,16 @@ class Polished(NamedTuple):
     noise: np.ndarray
 
 
+# Steps after which a fall of the cost by no more than so much ends the polish: dry elements leave kinks where a
+# straight line foretells more than there is to gain
+PATIENCE, IDLE = 5, 1e-5
 # Gauss-Newton steps of the polish, and the fall of the sum of squares, in noise variances, below which a step is
 # not worth it: the square of 0.03 standard errors.
 POLISH = 20
 WORTH = 1e-3
 
 
-def polish(problem: Problem, end: Refined) -> Polished:
+def polish(problem: Problem, end: Refined, steps: int = POLISH) -> Polished:
     """Gauss-Newton to the bottom, while each output is weighed by what its own residuals turn out to be.
 
     The claim of convergence is the gradient's: no step within the bounds would lower the sum of squares by
@@ -218,7 +236,10 @@ def polish(problem: Problem, end: Refined) -> Polished:
     trial, held, share = end.unknowns, set(end.at_bound), 1.0
     best, converged = _weighed(problem, trial), False
     reached, step = best, np.zeros(len(_flatten(trial)))
-    for _ in range(POLISH):
+    costs = [best.cost]
+    for _ in range(steps):
+        if len(costs) > PATIENCE and costs[-1 - PATIENCE] - costs[-1] < IDLE:
+            break
         if reached.cost > best.cost + 1e-9 and share > 1e-3:
             share /= 4  # the last step was too long
         elif reached.cost <= best.cost + 1e-9:
@@ -236,6 +257,7 @@ def polish(problem: Problem, end: Refined) -> Polished:
         held |= set(np.flatnonzero(inside != moved[: len(low)]).tolist())
         moved[: len(low)] = inside
         reached = _weighed(problem, _unflatten(problem, jnp.asarray(moved)))
+        costs.append(min(reached.cost, best.cost))
     refined = Refined(best.unknowns, best.fitness, tuple(sorted(held)), converged)
     return Polished(refined, best.evaluation, best.noise)
 
@@ -254,10 +276,10 @@ class _Weighed(NamedTuple):
 
 
 def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
-    counted = np.asarray(problem.counts)[np.asarray(problem.tape.run)]
     evaluation = evaluate(problem, unknowns)
-    noise, stretch = _own_noise(problem, evaluation, counted)
-    squares = float(np.square(np.asarray(evaluation.residuals)[counted]).sum())
+    with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
+        squares = np.square(np.asarray(evaluation.residuals)[problem.counted]).sum((0, 2))
+        noise, stretch = _own_noise(problem, squares)
     scaled = evaluation._replace(
         residuals=evaluation.residuals * stretch[:, None],
         jacobian=evaluation.jacobian * stretch[:, None, None],
@@ -265,7 +287,7 @@ def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
     matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
     cost = float(np.log(np.maximum(noise, 1e-300)).sum())
     cost = cost if np.isfinite(cost) else np.inf
-    return _Weighed(unknowns, scaled, noise, matrix, cost, squares / _samples(problem))
+    return _Weighed(unknowns, scaled, noise, matrix, cost, float(squares.sum()) / _samples(problem))
 
 
 def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 3) -> tuple[Unknowns, Evaluation]:
@@ -305,18 +327,16 @@ def gauss_newton(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.nda
     return -(vectors @ shrunk) / lengths, float(along @ shrunk)
 
 
-def _own_noise(problem: Problem, evaluation: Evaluation, counted: np.ndarray):
+def _own_noise(problem: Problem, squares: np.ndarray):
     """Standard deviation of the residuals of each output, and the old scale over the new."""
-    weight = np.asarray(problem.tape.weight)[counted].sum((0, 2))
-    squares = np.square(np.asarray(evaluation.residuals)[counted]).sum((0, 2))
+    weight = np.asarray(problem.tape.weight)[problem.counted].sum((0, 2))
     ratio = np.sqrt(squares / np.maximum(weight, 1.0))
-    ratio = np.where(ratio > 0, ratio, 1.0)
+    ratio = np.where(ratio == 0, 1.0, ratio)
     return np.asarray(problem.noise) * ratio, 1 / ratio
 
 
 def _samples(problem: Problem) -> float:
-    counted = np.asarray(problem.counts)[np.asarray(problem.tape.run)]
-    return max(float(np.asarray(problem.tape.weight)[counted].sum((0, 2)).max()), 1.0)
+    return max(float(np.asarray(problem.tape.weight)[problem.counted].sum((0, 2)).max()), 1.0)
 
 
 def _without(free, held) -> Bool[Array, " parameters"]:

@@ -1,0 +1,65 @@
+"""How far the rotor turned in each sample, for torques that depend on its angle."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy import fft, ndimage
+
+from .refine import Problem
+
+# Neighbouring frequencies over which the power of a misfit is averaged
+NEIGHBOURS = 33
+# Median of the square of a normal variable, over its variance
+MEDIAN = 0.4549
+
+
+def turned(problem: Problem, seen: jax.Array | Float[np.ndarray, "blocks 2 samples"]) -> Problem:
+    """The problem with its rotor turned as well as recordings and simulation together tell.
+
+    The angle is the integral of the speed. That of the measured one strays by the sensor's noise, that of the
+    simulated one by whatever torque disturbs the motor: the speed is the simulated one and that part of the
+    misfit that is motion.
+
+    **Arguments**: `seen`, the free run, A and rad/s.
+    """
+    tape = problem.tape
+    turn, run = np.array(tape.turn), np.asarray(tape.run)
+    length = np.asarray(tape.sample_time)[np.asarray(tape.grid)]
+    for index in range(tape.runs):
+        mine = (run == index) & ~np.isnan(turn).all(1)
+        measured, weight = (
+            np.asarray(x)[mine, 1].reshape(-1) for x in (tape.measured, tape.weight)
+        )
+        simulated = np.asarray(seen)[mine, 1].reshape(-1)
+        known = np.flatnonzero(weight)
+        if not len(known) or not np.all(np.isfinite(simulated)):
+            continue
+        end = known[-1] + 1
+        error = np.where(weight[:end] > 0, measured[:end] - simulated[:end], 0.0)
+        speed = simulated.copy()
+        speed[:end] += motion(error)
+        ahead = np.append(speed[1:], speed[-1])
+        turn[mine] = ((speed + ahead) / 2).reshape(turn[mine].shape) * length[mine, None]
+    return eqx.tree_at(lambda p: p.tape.turn, problem, jnp.asarray(turn))
+
+
+def motion(error: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    """The part of measured less simulated speed that is motion and no noise of the sensor.
+
+    By Wiener's smoother: every frequency counts with the share of its power that is above the white noise,
+    which the upper half of the spectrum shows.
+
+    **Source**: Wiener, "Extrapolation, Interpolation, and Smoothing of Stationary Time Series" (1949).
+    """
+    spectrum = np.asarray(fft.dct(error, norm="ortho"))
+    power = spectrum**2
+    noise = np.median(power[len(power) // 2 :]) / MEDIAN
+    # what the average over so few may be by chance alone is no motion
+    noise *= 1 + 2 * np.sqrt(2 / NEIGHBOURS)
+    around = ndimage.uniform_filter1d(power, NEIGHBOURS, mode="reflect")
+    share = np.clip(1 - noise / np.maximum(around, 1e-300), 0.0, 1.0)
+    return np.asarray(fft.idct(share * spectrum, norm="ortho"))
