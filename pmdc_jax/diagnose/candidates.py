@@ -154,7 +154,7 @@ def _periodic(field: str, size: Callable[[Scales], float]):
 PERIODS = (*range(1, 17), 18, 20, 21, 22, 24, 26, 28, 30, 32, 36, 40, 42, 48)
 
 # How often a compliant shaft rings, in Hz
-RINGING = (6.0, 12.0, 25.0, 50.0, 100.0)
+RINGING = (6.0, 12.0, 25.0, 50.0, 100.0, 200.0, 400.0)
 SHARE = 0.5
 
 
@@ -176,7 +176,7 @@ def _compliance(name: str, scales: Scales) -> list[Candidate]:
             name, (values,), (1.0,), lambda c, dry: values if c[0] > 0 else None, whole=True
         )
 
-    return [candidate(hertz) for hertz in RINGING]
+    return [candidate(hertz) for hertz in RINGING if hertz * scales.sample_time < 0.5]
 
 
 def _no_column(name: str, scales: Scales) -> list[Candidate]:

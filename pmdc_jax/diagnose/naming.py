@@ -157,15 +157,20 @@ class Namer:
         return bool(a) and not (a <= b or b <= a or _same_class(a, b) or _contains(a, b))
 
     def _shortlist(self, current: Model, found: Seen) -> list[Signal]:
-        """The most significant shape of each of the best few effects that are not there yet."""
+        """The most significant shape of each of the best few effects.
+
+        None, if that is an effect which is there already: its own formula is what is left to be desired.
+        """
         best: dict[str, Signal] = {}
         for s in found.of_candidates:
             assert s.candidate is not None
-            if s.candidate.effect not in current.effects:
-                best.setdefault(s.candidate.effect, s)
+            best.setdefault(s.candidate.effect, s)
         clear = np.log(ALARM / len(found.screen.candidates))
         ranked = [s for s in best.values() if s.log_p < clear]
-        return [s for s in ranked if s.log_p < COMPARABLE * ranked[0].log_p][:SHORTLIST]
+        if not ranked or next(iter(best)) in current.effects:
+            return []
+        near = [s for s in ranked if s.log_p < COMPARABLE * ranked[0].log_p]
+        return [s for e, s in best.items() if s in near and e not in current.effects][:SHORTLIST]
 
     def refit(self, current: Model, signal: Signal, found: Screen) -> Model | None:
         """The current model with one more effect, in full simulation."""
