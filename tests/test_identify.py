@@ -18,7 +18,6 @@ from scipy.signal import lfilter
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, identify
-from pmdc_jax.identify import refine as refine_module
 from pmdc_jax.identify.binary_ga import BinaryGA
 from pmdc_jax.identify.identification import Identification
 from pmdc_jax.identify.parameters import Parameters
@@ -342,14 +341,12 @@ def test_converged_means_that_nothing_near_is_better(x64, runs):
             assert squares(problem, best.unknowns._replace(coordinates=moved)) > lowest
 
 
-def test_a_refinement_that_is_cut_short_does_not_claim_convergence(x64, runs, monkeypatch):
+def test_a_refinement_that_is_cut_short_does_not_claim_convergence(x64, runs):
     problem = problem_of(runs)
     there = refine(problem, start_at(problem))
     far = there._replace(unknowns=start_at(problem, 1.3))
-    monkeypatch.setattr(refine_module, "POLISH", 1)
-    assert not polish(problem, far).refined.converged
-    monkeypatch.setattr(refine_module, "POLISH", 12)
-    assert polish(problem, there).refined.converged
+    assert not polish(problem, far, steps=1).refined.converged
+    assert polish(problem, there, steps=12).refined.converged
 
 
 def test_a_failed_simulation_is_no_optimum(x64, runs):

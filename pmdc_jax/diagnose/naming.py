@@ -35,6 +35,8 @@ REMAINDER = 0.02
 HARDER = [("shaft_compliance", "gear_backlash")]
 # Steps of a refit that is one of several
 ROUGHLY = 8
+# ... and of which two have ended alike if their misfits differ by no more
+AGREED = 1.05
 # Rivals whose criterion is nearer than this are not told apart
 MARGIN = 8.0
 
@@ -110,10 +112,10 @@ class Namer:
             tried = [m for m in tried if m is not None]
             if not tried:
                 break
-            best = self.compare([current, *tried])[0]
-            if best.model is current:
+            best = _plainest(self.compare([current, *tried]))
+            if best is current:
                 break
-            current = self._spared(best.model)
+            current = self._spared(best)
             found = self._see(current)
         ranked = self.compare(list(self.models.values()))
         price = {frozenset(f.model.effects): f for f in ranked}
@@ -206,12 +208,13 @@ class Namer:
         return [self._start(current, effects, {effects[-1]: values}) for values in others]
 
     def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start]) -> Model:
-        """The best refit of several, begun one after another until one is as good as the noise."""
+        """The best refit of several, begun one after another until one is as good as the noise or found twice."""
         ends = []
         for given, start in starts:
             steps = POLISH if len(starts) == 1 else ROUGHLY
             ends.append((given, polish(given.problem, start, steps).refined))
-            if ends[-1][1].fitness < POOR * given.problem.outputs:
+            best, *others = sorted(end.fitness for _, end in ends)
+            if best < POOR * given.problem.outputs or (others and others[0] < AGREED * best):
                 break
         return _settled(effects, *min(ends, key=lambda end: end[1].fitness))
 
@@ -309,6 +312,17 @@ def _spelt_out(effects: set[str]) -> set[str]:
     if "asymmetric_friction" in effects:
         return (effects - {"asymmetric_friction"}) | {"coulomb_friction", "constant_load"}
     return effects
+
+
+def _plainest(ranked: Sequence[Fitted]) -> Model:
+    """The best model, or a simpler one that it contains and that the data do not tell from it."""
+    best = ranked[0]
+    for other in ranked[1:]:
+        a, b = set(other.model.effects), set(best.model.effects)
+        within = any(a - b and a - b <= CONTAINS.get(e, set()) and b - a == {e} for e in b)
+        if within and other.criterion < best.criterion + MARGIN:
+            return other.model
+    return best.model
 
 
 def _contains(a: set[str], b: set[str]) -> bool:
