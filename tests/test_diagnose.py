@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ from pmdc_jax.diagnose import diagnose
 from pmdc_jax.diagnose.candidates import TABLE, Scales
 from pmdc_jax.diagnose.evidence import Block, products
 from pmdc_jax.diagnose.noise import Series, whitener
+from pmdc_jax.diagnose.periodic import common_line, spectrum
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
 from pmdc_jax.diagnose.screen import log_chance
 from pmdc_jax.effects import EFFECTS
@@ -131,6 +134,45 @@ def test_filter_does_not_look_across_what_is_missing():
     np.testing.assert_array_equal(white(0, clean), white(0, clean._replace(values=spoiled)))
 
 
+# ------------------------------------------------------------------------- lines in the spectrum
+
+
+def shaken(hertz: Sequence[float], driven: float | None = None, size: float = 1.5):
+    """Spectra of runs of 4, 6, 8, ... s of coloured noise, each with an oscillation of its own frequency."""
+    found = []
+    for k, f in enumerate(hertz):
+        time = 1e-3 * np.arange(4000 + 2000 * k)
+        noise = coloured(k, len(time), 1.0)
+        noise[:, 1] += size * noise.std() * np.sin(2 * np.pi * f * time + k)
+        drive = np.random.default_rng(k).normal(size=(len(time), 1))
+        if driven is not None:
+            drive[:, 0] += np.sin(2 * np.pi * driven * time)
+        found.append(spectrum(noise, drive, 1e-3))
+    return found
+
+
+def test_a_periodic_torque_from_outside_is_found_at_its_frequency():
+    line = common_line(shaken([7.3] * 4))
+    assert line.low < 7.3 < line.high
+    assert line.high - line.low < 0.3
+
+
+@pytest.mark.parametrize("hertz", [[7.3, 9.1, 12.4, 31.0], [7.3, 7.3, 21.0, 31.0]])
+def test_a_line_of_few_runs_is_none(hertz):
+    assert common_line(shaken(hertz)) is None
+
+
+def test_a_line_that_drives_is_none():
+    assert common_line(shaken([7.3] * 4, driven=7.3)) is None
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_coloured_noise_has_no_line(seed):
+    rng = np.random.default_rng(seed)
+    runs = [coloured(100 * seed + k, 5000, 1.0) for k in range(3)]
+    assert common_line([spectrum(x, rng.normal(size=(5000, 1)), 1e-3) for x in runs]) is None
+
+
 # ------------------------------------------------------------------------------- the responses
 
 
@@ -205,7 +247,6 @@ NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
 SHAKEN = vb.Noise(current_A=0.1, speed_rad_s=0.5, torque_Nm=0.01, torque_correlation_s=0.02)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("noise", [NOISE, SHAKEN], ids=["white", "coloured"])
 def test_hidden_friction_is_named_and_closes_the_gap(noise):
     truth = vb.BenchMotor(**PAPER, coulomb_Nm=0.08)
@@ -228,7 +269,6 @@ def test_hidden_friction_is_named_and_closes_the_gap(noise):
     assert found.base.parameters["f"].value > found.final.parameters["f"].value
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("noise", [NOISE, SHAKEN], ids=["white", "coloured"])
 def test_nothing_is_found_where_nothing_is_missing(noise):
     found = diagnose(recorded(vb.BenchMotor(**PAPER), 5, noise))

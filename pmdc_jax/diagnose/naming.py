@@ -16,6 +16,7 @@ from .candidates import STARTS, Candidate, Values
 from .library import Library
 from .model import Model, rows_of
 from .noise import Whitener, whitener
+from .periodic import Line, common_line, spectrum
 from .screen import Screen, Signal, beyond_curves, left_over, screen, signals
 
 # Chance that anything at all is called missing from a motor that lacks nothing
@@ -89,6 +90,7 @@ class Naming(NamedTuple):
         float  # share of what the chosen one leaves that no curve takes away, as root mean square
     )
     without: dict[str, float]  # by effect of the chosen: chance of the data without it
+    line: Line | None  # a steady oscillation that the chosen one does not have
 
 
 class Namer:
@@ -137,6 +139,7 @@ class Namer:
             unexplained=found.clearest.gain,
             noise=np.sqrt(beyond_curves(found.screen)) if found.left < ALARM else 1.0,
             without=self._without(current),
+            line=self._line(current),
         )
 
     def _worth(self, current: Model, found: Seen) -> bool:
@@ -270,6 +273,17 @@ class Namer:
             price = len(model.given.problem.parameters.names) * np.log(rows)
             fitted.append(Fitted(model, squares, squares + price))
         return sorted(fitted, key=lambda f: f.criterion)
+
+    def _line(self, model: Model) -> Line | None:
+        spectra = []
+        for run, fit in zip(model.given.training, rows_of(model), strict=True):
+            drives = (run.voltage, run.torque, run.load, run.current)
+            # a current drives only where there is no voltage
+            there = [x for x in drives[: 3 + (run.voltage is None)] if x is not None]
+            residuals = np.where(fit.residual.known[:, None], fit.residual.values, 0.0)
+            driving = np.nan_to_num(np.stack(there, axis=1))
+            spectra.append(spectrum(residuals[: len(driving)], driving, fit.residual.kind[0]))
+        return common_line(spectra)
 
     def _white(self, model: Model) -> Whitener:
         return whitener([fit.residual for fit in rows_of(model)])

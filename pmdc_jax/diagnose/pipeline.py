@@ -85,12 +85,12 @@ def diagnose(
     return Diagnosis(
         verdict=verdict,
         effects=_effects(naming, final),
-        where=_regions(naming.first),
+        where=_regions(naming),
         gap=total,
         gap_of_run=gaps,
         closed_fraction=_closed(total) if naming.chosen.effects else None,
         next_experiment=next_experiment(naming, given.training) if verdict == "ambiguous" else None,
-        curves=_learned(naming.last) if verdict == "not_in_library" else (),
+        curves=_learned(naming) if verdict == "not_in_library" else (),
         detectable=_detectable(naming.last),
         base=base,
         final=final,
@@ -100,6 +100,8 @@ def diagnose(
 
 
 def _verdict(naming: Naming) -> Verdict:
+    if naming.line is not None:
+        return "not_in_library"
     if naming.nothing >= ALARM:
         return "none_detected"
     if naming.left < ALARM and not _nearly_closed(naming):
@@ -128,8 +130,9 @@ def _effects(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:
     )
 
 
-def _regions(found: Screen) -> tuple[Region, ...]:
+def _regions(naming: Naming) -> tuple[Region, ...]:
     """Where the curves over every variable are far from zero, the clearest first."""
+    found, line = naming.first, naming.line
     base = found.evidence.regress().squares
     regions = []
     for curve, block in zip(found.curves, found.of_curve, strict=True):
@@ -141,6 +144,9 @@ def _regions(found: Screen) -> tuple[Region, ...]:
             continue
         z = np.array([_alone(found, column) for column in block.columns])
         regions += _stretches(curve.equation, curve.variable, curve.knots, z)
+    if line is not None:
+        region = (line.low, line.high)
+        regions.append(Region("mechanical", "frequency", region, float(np.sqrt(line.height))))
     return tuple(sorted(regions, key=lambda r: -abs(r.z))[:12])
 
 
@@ -167,8 +173,11 @@ def _stretches(equation: str, variable: str, knots: np.ndarray, z: np.ndarray) -
     return regions
 
 
-def _learned(found: Screen) -> tuple[LearnedCurve, ...]:
-    """The curves that are left, drawn by the data, the most significant first."""
+def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
+    """The curves that are left, drawn by the data, the most significant first; a line in time has none."""
+    found = naming.last
+    if naming.left >= ALARM:
+        return ()
     base = found.evidence.regress().squares
     learned = []
     for curve, block in zip(found.curves, found.of_curve, strict=True):

@@ -27,7 +27,13 @@ VERDICTS = {
     "none_detected": "none detected",
     "not_in_library": "not in the library",
 }
-VARIABLE_UNITS = {"speed": "rad/s", "current": "A", "voltage": "V", "angle": "rad"}
+VARIABLE_UNITS = {
+    "speed": "rad/s",
+    "current": "A",
+    "voltage": "V",
+    "angle": "rad",
+    "frequency": "Hz",
+}
 # a parameter that moved by less is not worth a sentence, in per cent
 NOTEWORTHY = 1.0
 # ends of both directions closer than this ratio are told as one
