@@ -86,9 +86,8 @@ class Naming(NamedTuple):
     left: float  # chance of what is left if nothing more were missing
     explained: float  # how much of the squares the chosen set takes away
     unexplained: float  # and how much the clearest curve would still take
-    noise: (
-        float  # share of what the chosen one leaves that no curve takes away, as root mean square
-    )
+    # share of what the chosen one leaves that no curve takes away, as root mean square
+    noise: float
     without: dict[str, float]  # by effect of the chosen: chance of the data without it
     line: Line | None  # a steady oscillation that the chosen one does not have
 

@@ -269,9 +269,8 @@ class _Weighed(NamedTuple):
     evaluation: Evaluation
     noise: np.ndarray
     matrix: np.ndarray
-    cost: (
-        float  # sum of the logarithms of the noise, which the maximum of the likelihood makes least
-    )
+    # sum of the logarithms of the noise, which the maximum of the likelihood makes least
+    cost: float
     fitness: float
 
 
