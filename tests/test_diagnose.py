@@ -205,7 +205,6 @@ def test_response_is_the_change_of_the_simulation(x64, name):
     effect = EFFECTS[name](**{f: jnp.asarray(x) for f, x in SMOOTH[name].items()})
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
     without, with_it = (free_run(m, tape, tape.initial, jnp.zeros(2)) for m in (bare, motor))
-
     path = path_of(without, tape, False)
     if EFFECTS[name].equation == "sensor":
         found = sensed(motor, tape, path)

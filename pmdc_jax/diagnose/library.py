@@ -149,7 +149,7 @@ def _hat(x, knots: np.ndarray, k: int):
 def _scales(base: Model) -> Scales:
     tape, motor = base.given.problem.tape, base.motor
     seen, weight = np.asarray(base.polished.evaluation.seen), np.asarray(tape.weight)
-    counted = np.asarray(base.given.problem.counts)[np.asarray(tape.run)]
+    counted = base.given.problem.counted
     there = weight[counted].any(1)
     current, speed = (
         float(np.quantile(np.abs(seen[counted][:, c][there]), 0.95)) + 1e-9 for c in range(2)

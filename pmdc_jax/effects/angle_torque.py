@@ -17,31 +17,21 @@ PHASE = ParameterRange("rad", -4.0, 4.0, "linear")
 PERIODS = ParameterRange("", 0.5, 200.0)
 
 
-class _Wave(AbstractEffect):
-    """What goes with the sine of the rotor's angle, which is a state of its own."""
+class _Angular(AbstractEffect):
+    """What goes with the rotor's angle, which is a state of its own."""
 
     states: ClassVar = ("angle",)
-
-    phase_rad: eqx.AbstractVar[Scalars]
-    periods: eqx.AbstractVar[Scalars]
-
-    def wave(self, state: State) -> Scalars:
-        """sin(n angle + phase)."""
-        return jnp.sin(self.periods * state.extra["angle"] + self.phase_rad)
 
     def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del speed, load
         return {"angle": angle}
-
-    def recurrence(self) -> dict[str, Scalars]:
-        return {"angle": 2 * jnp.pi * (1 / self.periods)}
 
     def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
         del motor, load
         return {"angle": state.speed}
 
 
-class CoggingTorque(_Wave):
+class CoggingTorque(_Angular):
     """Cogging: T = a sin(n angle + phase), the pull of the magnets on the teeth, whatever the current.
 
     The angle is that of the record where one was recorded, and otherwise counts from the start of the first
@@ -68,10 +58,13 @@ class CoggingTorque(_Wave):
     periods: Scalars
 
     def torque(self, state: State) -> Scalars:
-        return self.amplitude_Nm * self.wave(state)
+        return self.amplitude_Nm * jnp.sin(self.periods * state.extra["angle"] + self.phase_rad)
+
+    def recurrence(self) -> dict[str, Scalars]:
+        return {"angle": 2 * jnp.pi * (1 / self.periods)}
 
 
-class TorqueRipple(_Wave):
+class TorqueRipple(_Angular):
     """Torque ripple: Kt (1 + a sin(n angle + phase)) in place of Kt, of commutation and winding.
 
     In the torque alone: the back-EMF ripples alike, but the brushes short what of it changes within a segment.
@@ -98,5 +91,8 @@ class TorqueRipple(_Wave):
     periods: Scalars
 
     def parameters(self, motor: Motor, state: State) -> Motor:
-        swing = 1 + self.amplitude * self.wave(state)
-        return eqx.tree_at(lambda m: m.Kt, motor, motor.Kt * swing)
+        wave = jnp.sin(self.periods * state.extra["angle"] + self.phase_rad)
+        return eqx.tree_at(lambda m: m.Kt, motor, motor.Kt * (1 + self.amplitude * wave))
+
+    def recurrence(self) -> dict[str, Scalars]:
+        return {"angle": 2 * jnp.pi * (1 / self.periods)}

@@ -10,7 +10,7 @@ from ..recording import Recording
 # Largest distance of a time stamp from a uniform grid, in steps, that is taken for rounding of the stamps.
 ROUNDING = 0.02
 # An interval longer than this many steps is a gap: outputs inside it count as missing.
-GAP = 3.0
+GAP = 3.0 * (1 + 1e-9)  # exactly three, but for rounding, are none
 
 
 def uniform(recording: Recording) -> Recording:
