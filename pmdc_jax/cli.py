@@ -355,19 +355,22 @@ def paper(out: Folder = Path("paper_out")) -> None:
 
 @app.command(epilog="Example: pmdc demo --out tour")
 def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
-    """Take the tour: identify and diagnose the packaged sample.
+    """Take the tour: identify and diagnose the packaged sample, and tune a controller.
 
-    Four runs are fitted, a fifth tests the motor; results and a report go to a folder.
+    Four runs are fitted, a fifth tests the motor; results and reports go to a folder.
     """
-    from .demo import demo
+    from .demo import WRITTEN, demo
     from .report.diagnosis_tables import print_diagnosis
-    from .report.terminal import print_findings, progress
+    from .report.terminal import print_findings, print_messages, print_tables, progress
+    from .report.tuning import tuning_tables
 
     with progress() as on_progress:
-        diagnosis = demo(out, seed=seed, progress=on_progress)
+        diagnosis, tuning = demo(out, seed=seed, progress=on_progress)
     print_findings(diagnosis.final)
     print_diagnosis(diagnosis)
-    for name in ("report.html", "diagnosis.json", "motor.json"):
+    print_messages(tuning.messages)
+    print_tables(tuning_tables(tuning))
+    for name in WRITTEN:
         typer.echo(out / name)
 
 

@@ -1,46 +1,71 @@
-"""The tour: identify and diagnose the motor of the packaged sample and report on it."""
+"""The tour: identify and diagnose the motor of the packaged sample, tune a controller for it, and report on both."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from .errors import InputError
 
 if TYPE_CHECKING:
+    from .control.tuning import Tuning
     from .diagnose.diagnosis import Diagnosis
     from .report.terminal import ReportProgress
 
 SAMPLE = Path(__file__).parent / "sample"
 TRAINING = ("staircase", "prbs", "triangle", "loaded")
 HOLDOUT = ("drive",)
+WRITTEN = ("report.html", "diagnosis.json", "motor.json", "tuning.html", "controller.json")
+
+
+class Tour(NamedTuple):
+    """What the tour came to."""
+
+    diagnosis: Diagnosis
+    tuning: Tuning
 
 
 def demo(
     out: str | Path = "demo_out", seed: int = 0, progress: ReportProgress | None = None
-) -> Diagnosis:
-    """Diagnose the packaged sample; write report.html, motor.json and diagnosis.json to `out`.
+) -> Tour:
+    """Diagnose the packaged sample and tune a PID controller for the motor found; write the files `WRITTEN` to `out`.
 
-    **Arguments**: `out`, a folder, made where it does not exist; `seed` of the search; `progress`,
+    **Arguments**: `out`, a folder, made where it does not exist; `seed` of the searches; `progress`,
     called now and then with what is being done.
 
-    **Returns**: the diagnosis, whose `final` is the identification of the completed motor.
+    **Returns**: the diagnosis, whose `final` is the identification of the completed motor, and the tuning.
     """
-    folder = result_folder(Path(out), "report.html")
+    folder = result_folder(Path(out), WRITTEN[0])
+    from .control.controller_file import save_controller
+    from .control.tuning import tune
     from .diagnose import diagnose
-    from .motor_file import save_motor
+    from .motor_file import load_motor, load_uncertainty, save_motor
     from .recording import read_recording
     from .report.diagnosis import write_diagnosis
     from .report.json import diagnosis_json, write_json
+    from .report.tuning import write_tuning_report
 
+    report, found, motor, page, controller = (folder / name for name in WRITTEN)
     training, held_out = (
         [read_recording(SAMPLE / f"{name}.csv") for name in names] for names in (TRAINING, HOLDOUT)
     )
     diagnosis = diagnose(training, holdout=held_out, seed=seed, progress=progress)
-    save_motor(folder / "motor.json", diagnosis.final.motor, diagnosis.final)
-    write_json(diagnosis_json(diagnosis), folder / "diagnosis.json")
-    write_diagnosis(diagnosis, folder / "report.html")
-    return diagnosis
+    save_motor(motor, diagnosis.final.motor, diagnosis.final)
+    write_json(diagnosis_json(diagnosis), found)
+    write_diagnosis(diagnosis, report)
+    tuning = tune(
+        load_motor(motor),
+        "pid",
+        setpoint=200.0,
+        voltage_limit=18.0,
+        current_limit=20.0,
+        uncertainty=load_uncertainty(motor),
+        seed=seed,
+        progress=progress,
+    )
+    save_controller(controller, tuning.law)
+    write_tuning_report(tuning, page)
+    return Tour(diagnosis, tuning)
 
 
 def result_folder(path: Path, first: str) -> Path:

@@ -282,10 +282,35 @@ def test_simulate_reads_simulates_and_writes(faked, monkeypatch, capsys):
     assert written == [(("motor motor.json", "drive"), Path("out.csv"))]
 
 
-def test_demo_writes_into_its_folder(faked, capsys, tmp_path):
+@pytest.fixture
+def faked_tuning(monkeypatch):
+    """Tuning replaced, and the writing of what it comes to; what it was called with is kept."""
+    calls = SimpleNamespace(tune=None)
+
+    def tune(motor, controller, **options):
+        calls.tune = (motor, controller, options)
+        return SimpleNamespace(law="law", messages=())
+
+    def write(path, content=None):
+        Path(path).write_text("")
+
+    replace_function(monkeypatch, "pmdc_jax.control.tuning", "tune", tune)
+    replace_function(monkeypatch, "pmdc_jax.motor_file", "load_motor", lambda path: "motor")
+    replace_function(monkeypatch, "pmdc_jax.motor_file", "load_uncertainty", lambda path: "spread")
+    replace_function(monkeypatch, "pmdc_jax.control.controller_file", "save_controller", write)
+    report = "pmdc_jax.report.tuning"
+    replace_function(monkeypatch, report, "write_tuning_report", lambda tuning, path: write(path))
+    replace_function(monkeypatch, report, "tuning_tables", lambda tuning: "gains")
+    return calls
+
+
+def test_demo_writes_into_its_folder(faked, faked_tuning, capsys, tmp_path):
     assert cli.main(["demo", "--out", "deep/tour"]) == 0
     names = {path.name for path in (tmp_path / "deep" / "tour").iterdir()}
-    assert names == {"report.html", "diagnosis.json", "motor.json"}
+    reports = {"report.html", "diagnosis.json", "motor.json", "tuning.html", "controller.json"}
+    assert names == reports
+    motor, controller, options = faked_tuning.tune
+    assert (motor, controller, options["uncertainty"]) == ("motor", "pid", "spread")
     recordings, options = faked.identify
     assert recordings == ["staircase", "prbs", "triangle", "loaded"]
     assert options["holdout"] == ["drive"]
