@@ -263,7 +263,8 @@ def test_hidden_friction_is_named_and_closes_the_gap(noise):
     assert found.closed_fraction > 0.99
     assert any(r.equation == "mechanical" and r.variable == "speed" for r in found.where)
     (friction,) = found.final.motor.effects
-    assert float(friction.torque_Nm) == effect.parameters["torque_Nm"].value
+    # one is the exponential of JAX, the other that of NumPy
+    assert float(friction.torque_Nm) == pytest.approx(effect.parameters["torque_Nm"].value, 1e-14)
     # the motor without friction had bought some of it with viscous friction
     assert found.base.parameters["f"].value > found.final.parameters["f"].value
 

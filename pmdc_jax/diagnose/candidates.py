@@ -104,7 +104,8 @@ def _stribeck(name: str, scales: Scales) -> list[Candidate]:
         def build(c: np.ndarray, dry: float) -> Values | None:
             if c[1] <= 0 or c[0] + c[1] + dry <= 0:
                 return None
-            coulomb = max(float(c[0]) + dry, 1e-3 * float(c[1]))
+            # not so small that no run would see it, and nothing would lead it back
+            coulomb = max(float(c[0]) + dry, 0.1 * float(c[1]))
             return {"coulomb_Nm": coulomb, "static_Nm": coulomb + float(c[1]), "speed_rad_s": speed}
 
         flat = {"coulomb_Nm": small, "static_Nm": small, "speed_rad_s": speed}

@@ -24,15 +24,29 @@ OVER = {
 }
 # Knots of a curve over speed, current or voltage, and over the time of each run.
 KNOTS, KNOTS_IN_TIME = 9, 7
+# Periods a turn of a torque that comes round behind a gear; two neighbours differ by half a period in some 500 rad
+BEHIND_GEAR = np.arange(0.02, 0.25, 0.006)
+KNOTS_IN_PERIOD = 25
 
 
 class Curve(NamedTuple):
-    """An unknown term of one equation, a straight line between knots of one variable."""
+    """An unknown term of one equation: a straight line between knots of one variable, or a sine of the angle."""
 
     equation: str
     variable: str
     knots: np.ndarray
     own: bool = False  # every run has a curve of its own
+    shapes: np.ndarray | None = (
+        None  # (knots, columns): the columns at the knots, where they are no hats
+    )
+
+    def values(self, coefficients: np.ndarray) -> np.ndarray:
+        """The curve at its knots."""
+        return coefficients if self.shapes is None else self.shapes @ coefficients
+
+    def errors(self, errors: np.ndarray) -> np.ndarray:
+        """Standard errors there of coefficients with these standard errors."""
+        return errors if self.shapes is None else np.sqrt(self.shapes**2 @ errors**2)
 
 
 class Library:
@@ -66,7 +80,9 @@ class Library:
                 blocks.append(Block(tuple(range(count, count + shape.order)), shape.own_phase))
                 count += shape.order
         response = respond(self.bare, tape, path, jnp.concatenate(kicked, -1))
-        return response + jnp.concatenate(seen, -1), blocks
+        response = response + jnp.concatenate(seen, -1)
+        # a setting that cannot be simulated says nothing
+        return jnp.where(jnp.all(jnp.isfinite(response), (0, 1, 2)), response, 0.0), blocks
 
     def _small(self, name: str, settings: Sequence[Values], tape: Tape, path: Path):
         """Kicks and sensor errors for small settings of one effect, settings last."""
@@ -103,32 +119,45 @@ class Library:
 
 
 def curves_over(library: Library, tape: Tape, path: Path, count: int):
-    """Responses to curves over every variable in every equation."""
+    """Responses to curves over every variable in every equation, and to torques that a gear brings round."""
     volt, torque = pushes(library.bare, tape)
     value = jnp.asarray(tape.value).T
     known = {"speed": path.speed, "current": path.current, "voltage": value}
-    begins = np.searchsorted(np.asarray(tape.run), np.asarray(tape.run))
-    block = np.arange(len(begins)) - begins
-    time = block * value.shape[0] + np.arange(value.shape[0])[:, None]
-    length = np.bincount(np.asarray(tape.run), minlength=tape.runs) * value.shape[0]
-    share = jnp.asarray(time / length[np.asarray(tape.run)])
+    known["time"] = _share_of_run(tape)
     weight = jnp.asarray(tape.weight).any(1).T
-    kicked, curves, blocks = [], [], []
+    terms: list[tuple[jax.Array, jax.Array, Curve]] = []
     voltage_driven = bool(np.any(np.asarray(tape.drive.voltage) > 0))
     for equation, variables in OVER.items():
         if equation == "electrical" and not voltage_driven:
             continue
         push = torque if equation == "mechanical" else volt
         for variable in variables:
-            own = variable == "time"
-            x = share if own else known[variable]
+            own, x = variable == "time", known[variable]
             knots = np.linspace(0, 1, KNOTS_IN_TIME) if own else _knots(x, weight)
             hats = jnp.stack([_hat(x, knots, k) for k in range(len(knots))], -1)
-            kicked.append(push[..., None] * hats[:, None])
-            curves.append(Curve(equation, variable, knots, own))
-            blocks.append(Block(tuple(range(count, count + len(knots))), own))
-            count += len(knots)
-    return respond(library.bare, tape, path, jnp.concatenate(kicked, -1)), curves, blocks
+            terms.append((push, hats, Curve(equation, variable, knots, own)))
+    for periods in BEHIND_GEAR:
+        turned = np.linspace(0, 2 * np.pi / periods, KNOTS_IN_PERIOD)
+        curve = Curve("mechanical", "angle", turned, True, np.asarray(_wave(periods * turned)))
+        terms.append((torque, _wave(periods * path.angle), curve))
+    blocks = []
+    for _, shape, curve in terms:
+        blocks.append(Block(tuple(range(count, count + shape.shape[-1])), curve.own))
+        count += shape.shape[-1]
+    kicked = jnp.concatenate([push[..., None] * shape[:, None] for push, shape, _ in terms], -1)
+    return respond(library.bare, tape, path, kicked), [curve for *_, curve in terms], blocks
+
+
+def _wave(phase) -> jax.Array:
+    return jnp.stack([jnp.cos(phase), jnp.sin(phase)], -1)
+
+
+def _share_of_run(tape: Tape) -> jax.Array:
+    """The time as a share of each run's, (samples, blocks)."""
+    run, samples = np.asarray(tape.run), tape.value.shape[1]
+    block = np.arange(len(run)) - np.searchsorted(run, run)
+    time = block * samples + np.arange(samples)[:, None]
+    return jnp.asarray(time / (np.bincount(run, minlength=tape.runs) * samples)[run])
 
 
 def _knots(x, weight) -> np.ndarray:

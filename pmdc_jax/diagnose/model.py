@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ..effects import EFFECTS, CoulombFriction
-from ..identify.pipeline import Prepared
-from ..identify.refine import Polished
+from ..identify.pipeline import Prepared, settle
+from ..identify.refine import Polished, Refined, polish
+from ..identify.whitening import Whitening
 from ..motor import Motor
 from ..simulate import Tape
-from .noise import Series
+from .noise import Series, Whitener
 from .response import Path, path_of
 
 
@@ -42,7 +44,57 @@ class Model(NamedTuple):
     @property
     def training(self) -> list[int]:
         """The runs that it was fitted to."""
-        return [run for run, role in enumerate(self.given.roles) if role == "train"]
+        return _training(self.given)
+
+
+# Gauss-Newton steps from one fit to white residuals to another
+SHARPENED = 8
+
+
+def sharpened(model: Model, white: Whitener) -> tuple[Prepared, Polished]:
+    """The problem of fitting a model to residuals that a filter makes white, and that fit."""
+    given = whitened(model.given, white)
+    return given, polish(given.problem, model.polished.refined, SHARPENED)
+
+
+def settled(effects: tuple[str, ...], given: Prepared, start: Refined, white: Whitener) -> Model:
+    """A model fitted from a start to residuals that a filter makes white."""
+    given, ended = settle(whitened(given, white), start)
+    given = given._replace(problem=replace(given.problem, whitening=None))
+    # no step: what it leaves as it is
+    plain = polish(given.problem, ended.refined, steps=0)
+    refined = ended.refined._replace(fitness=plain.refined.fitness)
+    return Model(effects, given, plain._replace(refined=refined))
+
+
+def squares_of(given: Prepared, polished: Polished) -> float:
+    """The sum of squares that a fit leaves of the training runs."""
+    residuals = np.asarray(polished.evaluation.residuals)
+    return float(np.square(residuals[given.problem.counted]).sum())
+
+
+def whitened(given: Prepared, white: Whitener) -> Prepared:
+    """The problem of fitting to residuals that a filter makes white."""
+    tape, noise = given.problem.tape, np.asarray(given.problem.noise)
+    filters = [np.zeros((0, 2, 2))] * tape.runs
+    # hold-outs are nothing to learn a filter from
+    scales = [np.diag(1 / noise)] * tape.runs
+    for run, A, S in zip(_training(given), white.filters, white.scales, strict=True):
+        both = np.ix_(*2 * [_outputs(tape, run)])
+        filters[run], scales[run] = np.zeros((len(A), 2, 2)), np.zeros((2, 2))
+        filters[run][:, *both], scales[run][both] = A, S
+    whitening = Whitening.of(filters, scales, tape.weight, tape.run)
+    return given._replace(problem=replace(given.problem, whitening=whitening))
+
+
+def _training(given: Prepared) -> list[int]:
+    return [run for run, role in enumerate(given.roles) if role == "train"]
+
+
+def _outputs(tape: Tape, run: int) -> np.ndarray:
+    """The outputs that a run has."""
+    weight = np.asarray(tape.weight)[np.asarray(tape.run) == run]
+    return np.flatnonzero(weight.any((0, 2)))
 
 
 class Fit(NamedTuple):
@@ -71,7 +123,7 @@ def series_of(tape: Tape, run: int, signal: np.ndarray) -> Series:
     part = np.moveaxis(signal[mine], 1, 2)
     values = part.reshape(-1, *part.shape[2:])
     weight = np.moveaxis(np.asarray(tape.weight)[mine], 1, 2).reshape(-1, 2) > 0
-    outputs = tuple(int(c) for c in np.flatnonzero(weight.any(0)))
+    outputs = tuple(int(c) for c in _outputs(tape, run))
     first = np.flatnonzero(mine)[0]
     kind = (float(np.asarray(tape.sample_time)[np.asarray(tape.grid)[first]]), outputs)
     return Series(values[:, list(outputs)], np.asarray(weight[:, list(outputs)].all(1)), kind)

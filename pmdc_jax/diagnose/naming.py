@@ -11,13 +11,14 @@ from scipy import stats
 
 from ..effects import EFFECTS
 from ..identify.pipeline import POOR, Prepared, settle
-from ..identify.refine import POLISH, Refined, Unknowns, polish
+from ..identify.refine import Polished, Refined, Unknowns, polish
+from ..identify.uncertainty import FLAT
 from .candidates import STARTS, Candidate, Values
 from .library import Library
-from .model import Model, rows_of
+from .model import Model, rows_of, settled, sharpened, squares_of
 from .noise import Whitener, whitener
 from .periodic import Line, common_line, spectrum
-from .screen import Screen, Signal, beyond_curves, left_over, screen, signals
+from .screen import Screen, Signal, beyond_curves, screen, signals
 
 # Chance that anything at all is called missing from a motor that lacks nothing
 ALARM = 0.01
@@ -30,16 +31,21 @@ CONTAINS = {
     "stribeck_friction": {"coulomb_friction"},
     "asymmetric_friction": {"coulomb_friction", "constant_load"},
 }
-# What a named effect leaves of the squares that it explains, by a formula that is not quite nature's, asks for no other
-REMAINDER = 0.02
+# What effects leave of the squares that they explain, by formulas that are not quite nature's: this little asks for
+# no other effect; up to so much may be all due to them, and more if it is a curve over an effect's own variable
+REMAINDER, FORMULA, OWN_FORMULA = 0.02, 0.1, 0.5
+# An effect is added if it takes away this share of what the clearest signal would
+MUCH_OF_IT = 0.3
 # Effects that no column shows, with the simpler ones in whose place they are tried if those leave something
 HARDER = [("shaft_compliance", "gear_backlash")]
 # Steps of a refit that is one of several
 ROUGHLY = 8
 # ... and of which two have ended alike if their misfits differ by no more
 AGREED = 1.05
-# Rivals whose criterion is nearer than this are not told apart
-MARGIN = 8.0
+# A fit to white residuals may leave so many times the plain squares of the fit that leaves least of them
+NEAR = 1.5
+# Rivals whose criterion is nearer than this, and this share of what neither explains, are not told apart
+MARGIN, OF_UNEXPLAINED = 8.0, 0.1
 
 
 def chance_of_nothing(
@@ -57,11 +63,37 @@ class Seen(NamedTuple):
     of_candidates: list[Signal]
     of_curves: list[Signal]
     left: float  # chance of it if nothing more were missing
+    explained: (
+        float  # how much of the squares the model takes away that the motor without effects leaves
+    )
 
     @property
     def clearest(self) -> Signal:
         """The signal with the largest gain."""
         return max((*self.of_candidates, *self.of_curves), key=lambda s: s.gain)
+
+    @property
+    def unexplained(self) -> float:
+        """What the clearest signal would still take away, over what the model takes away already."""
+        return self.clearest.gain / self.explained if self.explained > 0 else np.inf
+
+    def asks_for_more(self) -> bool:
+        """Whether more is missing than the formulas of the model's effects leave to be desired."""
+        if self.left >= ALARM or self.unexplained < REMAINDER:
+            return False
+        best = max((s.gain for s in self.of_candidates), default=0.0)
+        return bool(best > MUCH_OF_IT * self.clearest.gain)
+
+    def is_formula(self, model: Model) -> bool:
+        """Whether what is left may well be that of the model's effects by formulas of nature's own."""
+        if not model.effects or self.unexplained < FORMULA:
+            return bool(model.effects)
+        clearest = self.clearest.of
+        if isinstance(clearest, Candidate):
+            return clearest.effect in model.effects
+        kinds = [EFFECTS[name] for name in model.effects]
+        own = {("electrical" if k.equation == "input" else k.equation, k.variable) for k in kinds}
+        return self.unexplained < OWN_FORMULA and (clearest.equation, clearest.variable) in own
 
 
 Start = tuple[Prepared, Refined]
@@ -84,11 +116,11 @@ class Naming(NamedTuple):
     last: Screen  # and against the chosen one
     nothing: float  # chance of the evidence if nothing were missing
     left: float  # chance of what is left if nothing more were missing
-    explained: float  # how much of the squares the chosen set takes away
-    unexplained: float  # and how much the clearest curve would still take
+    explained: bool  # whether that is no more than other formulas of the chosen effects might leave
     # share of what the chosen one leaves that no curve takes away, as root mean square
     noise: float
     without: dict[str, float]  # by effect of the chosen: chance of the data without it
+    ended: tuple[Prepared, Polished]  # the last fit of the chosen one
     line: Line | None  # a steady oscillation that the chosen one does not have
 
 
@@ -99,16 +131,21 @@ class Namer:
         self.base, self.report = base, report
         self.library = Library(base)
         self.models: dict[frozenset[str], Model] = {frozenset(): base}
+        self.filters: dict[frozenset[str], Whitener] = {}
+        self.begun: dict[str, Values] = {}  # where each effect was first begun to be fitted
+        self.compared: dict[tuple[frozenset[str], frozenset[str]], Fitted] = {}
 
     def name(self) -> Naming:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
         current, first = self.base, self._see(self.base)
         found = first
-        while found.left < ALARM and len(current.effects) < MOST and self._worth(current, found):
+        while found.asks_for_more() and len(current.effects) < MOST:
             shortlist = self._shortlist(current, found)
             tried = [self.refit(current, s, found.screen) for s in shortlist]
             tried += [
-                self._in_place(current, *pair) for pair in HARDER if pair[0] in current.effects
+                self._in_place(current, found.screen.white, *pair)
+                for pair in HARDER
+                if pair[0] in current.effects
             ]
             tried = [m for m in tried if m is not None]
             if not tried:
@@ -121,12 +158,12 @@ class Namer:
         ranked = self.compare(list(self.models.values()))
         price = {frozenset(f.model.effects): f for f in ranked}
         mine = price[frozenset(current.effects)]
+        margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.left < ALARM else 0.0)
         rivals = [
             f.model
             for f in ranked
-            if f.criterion < mine.criterion + MARGIN and self._is_rival(f.model, current)
+            if f.criterion < mine.criterion + margin and self._is_rival(f.model, current)
         ]
-        alone = price[frozenset()].squares
         return Naming(
             chosen=current,
             rivals=rivals,
@@ -134,26 +171,23 @@ class Namer:
             last=found.screen,
             nothing=first.left,
             left=found.left,
-            explained=alone - mine.squares,
-            unexplained=found.clearest.gain,
+            explained=found.is_formula(current),
             noise=np.sqrt(beyond_curves(found.screen)) if found.left < ALARM else 1.0,
             without=self._without(current),
+            ended=self._ended(current),
             line=self._line(current),
         )
-
-    def _worth(self, current: Model, found: Seen) -> bool:
-        """Whether what is left is more than an effect that is there already may leave by its formula."""
-        if not current.effects:
-            return True
-        base, mine = (left_over(m, self._white(current))[0] for m in (self.base, current))
-        return found.clearest.gain > REMAINDER * (base - mine)
 
     def _see(self, model: Model) -> Seen:
         found = screen(model, self.library)
         of_candidates, of_curves = signals(found)
         count = len(found.candidates) + len(found.curves)
         left = chance_of_nothing(of_candidates, of_curves, count)
-        return Seen(found, of_candidates, of_curves, left)
+        explained = 0.0
+        if model.effects:
+            base, mine = (squares_of(*sharpened(m, found.white)) for m in (self.base, model))
+            explained = base - mine
+        return Seen(found, of_candidates, of_curves, left, explained)
 
     def _is_rival(self, model: Model, chosen: Model) -> bool:
         """Not the same, not a part of it, not the same with something on top."""
@@ -192,16 +226,18 @@ class Namer:
             return None
         effects = (*kept, name)
         start = self._start(current, effects, {name: values}, fit.moved, angles)
-        self.models[key] = self._best_of(effects, [start, *self._starts(current, effects)])
+        starts = [start, *self._starts(current, effects)]
+        self.models[key] = self._best_of(effects, starts, current, found.white)
         return self.models[key]
 
-    def _in_place(self, current: Model, old: str, new: str) -> Model:
+    def _in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model:
         """The current model with an effect in place of a simpler one."""
         effects = (*(e for e in current.effects if e != old), new)
         key = frozenset(effects)
         if key not in self.models:
             self.report(f"trying {' + '.join(sorted(key))}", current.polished.refined.fitness)
-            self.models[key] = self._best_of(effects, self._starts(current, effects))
+            starts = self._starts(current, effects)
+            self.models[key] = self._best_of(effects, starts, current, white)
         return self.models[key]
 
     def _starts(self, current: Model, effects: tuple[str, ...]) -> list[Start]:
@@ -209,16 +245,35 @@ class Namer:
         others = STARTS.get(effects[-1], lambda scales: [])(self.library.scales)
         return [self._start(current, effects, {effects[-1]: values}) for values in others]
 
-    def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start]) -> Model:
+    def _best_of(
+        self, effects: tuple[str, ...], starts: Sequence[Start], current: Model, white: Whitener
+    ) -> Model:
         """The best refit of several, begun one after another until one is as good as the noise or found twice."""
+        if len(starts) == 1:
+            return self._refitted(effects, *starts[0], current, white)
         ends = []
         for given, start in starts:
-            steps = POLISH if len(starts) == 1 else ROUGHLY
-            ends.append((given, polish(given.problem, start, steps).refined))
+            ends.append((given, polish(given.problem, start, ROUGHLY).refined))
             best, *others = sorted(end.fitness for _, end in ends)
             if best < POOR * given.problem.outputs or (others and others[0] < AGREED * best):
                 break
-        return _settled(effects, *min(ends, key=lambda end: end[1].fitness))
+        given, best = min(ends, key=lambda end: end[1].fitness)
+        return settled(effects, given, best, white)
+
+    def _refitted(
+        self,
+        effects: tuple[str, ...],
+        given: Prepared,
+        start: Refined,
+        current: Model,
+        white: Whitener,
+    ) -> Model:
+        """Refitted from where the evidence points; if that leads nowhere, by way of plain least squares."""
+        model = settled(effects, given, start, white)
+        before, after = (squares_of(*sharpened(m, white)) for m in (current, model))
+        if after < before:
+            return model
+        return settled(effects, given, polish(given.problem, start).refined, white)
 
     def _start(
         self,
@@ -233,20 +288,32 @@ class Namer:
         given = current.given.with_effects([EFFECTS[e] for e in effects])
         parameters, unknowns = given.problem.parameters, current.polished.refined.unknowns
         names = current.given.problem.parameters.names
-        before = dict(zip(names, np.asarray(unknowns.coordinates) + moved, strict=True))
+        # a parameter that no run sees may seem to move by any factor
+        near = np.clip(moved, -1.0, 1.0)
+        before = dict(zip(names, np.asarray(unknowns.coordinates) + near, strict=True))
+        for effect, new in values.items():
+            self.begun.setdefault(effect, new)
         coordinates = []
         for name, log in zip(parameters.names, parameters.logarithmic, strict=True):
-            if name in before:
+            effect, _, field = name.partition(".")
+            if name in before and not (field and self._lost(current, name)):
                 coordinates.append(before[name])
             else:
-                effect, field = name.split(".")
-                value = values[effect][field]
+                value = values.get(effect, self.begun.get(effect, {}))[field]
                 coordinates.append(np.log(max(value, 1e-300)) if log else value)
         inside = np.clip(coordinates, parameters.lower, parameters.upper)
         local = np.array(unknowns.local)
         local[:, 3] += angles
         start = Unknowns(jnp.asarray(inside), jnp.asarray(local))
         return given, Refined(start, np.inf, (), False)
+
+    def _lost(self, model: Model, name: str) -> bool:
+        """Whether an effect's parameter has gone where no run sees it, so that nothing leads it back."""
+        column = model.given.problem.parameters.names.index(name)
+        seen = np.asarray(model.polished.evaluation.jacobian)[
+            model.given.problem.counted, ..., column
+        ]
+        return float(np.square(seen).sum()) < 1 / FLAT**2
 
     def _spared(self, model: Model) -> Model:
         """The model without effects that it can do without."""
@@ -258,20 +325,34 @@ class Namer:
         return model
 
     def _drop(self, model: Model, rest: tuple[str, ...]) -> Model:
-        smaller = _settled(rest, *self._start(model, rest, {}))
+        smaller = settled(rest, *self._start(model, rest, {}), self._white(model))
         self.models[frozenset(rest)] = smaller
         return smaller
 
     def compare(self, models: Sequence[Model]) -> list[Fitted]:
         """By the squares of what each leaves, made white by the filter of the one that leaves least."""
         least = min(models, key=lambda m: m.polished.refined.fitness)
-        white = self._white(least)
-        fitted = []
-        for model in models:
-            squares, rows = left_over(model, white)
-            price = len(model.given.problem.parameters.names) * np.log(rows)
-            fitted.append(Fitted(model, squares, squares + price))
-        return sorted(fitted, key=lambda f: f.criterion)
+        return sorted((self._left(m, least) for m in models), key=lambda f: f.criterion)
+
+    def _left(self, model: Model, least: Model) -> Fitted:
+        """What a model leaves, fitted to residuals that the filter of another one's noise makes white."""
+        keys = frozenset(model.effects), frozenset(least.effects)
+        if keys not in self.compared:
+            given, polished = sharpened(model, self._white(least))
+            squares = squares_of(given, polished)
+            samples = np.count_nonzero(given.problem.tape.weight)
+            price = len(given.problem.parameters.names) * np.log(samples)
+            self.compared[keys] = Fitted(model, squares, squares + price)
+        return self.compared[keys]
+
+    def _ended(self, model: Model) -> tuple[Prepared, Polished]:
+        """The last fit of a model: to white residuals, unless that is far from reproducing the runs as they are, as
+        where a formula is not quite nature's."""
+        given, sharp = sharpened(model, self._white(model))
+        as_it_is = polish(model.given.problem, sharp.refined, steps=0).refined.fitness
+        plainly = settle(model.given, model.polished.refined)
+        near = as_it_is < NEAR * plainly[1].refined.fitness
+        return (given, sharp) if near else plainly
 
     def _line(self, model: Model) -> Line | None:
         spectra = []
@@ -285,7 +366,10 @@ class Namer:
         return common_line(spectra)
 
     def _white(self, model: Model) -> Whitener:
-        return whitener([fit.residual for fit in rows_of(model)])
+        key = frozenset(model.effects)
+        if key not in self.filters:
+            self.filters[key] = whitener([fit.residual for fit in rows_of(model)])
+        return self.filters[key]
 
     def _without(self, chosen: Model) -> dict[str, float]:
         chances = {}
@@ -296,10 +380,6 @@ class Namer:
             gain = both[smaller.effects] - both[chosen.effects]
             chances[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
         return chances
-
-
-def _settled(effects: tuple[str, ...], given: Prepared, start: Refined) -> Model:
-    return Model(effects, *settle(given, start))
 
 
 def _values(candidate: Candidate, coefficients: np.ndarray, dry: float, runs: int):

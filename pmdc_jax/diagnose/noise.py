@@ -31,14 +31,14 @@ class Series(NamedTuple):
 
 
 class Whitener(NamedTuple):
-    """A filter for every kind of run, and for every run the matrix that gives it unit variance."""
+    """For every run a filter, shared by runs of a kind, and the matrix that gives what is left unit variance."""
 
-    filters: dict[tuple, Float[np.ndarray, "order outputs outputs"]]
+    filters: list[Float[np.ndarray, "order outputs outputs"]]
     scales: list[Float[np.ndarray, "outputs outputs"]]
 
     def __call__(self, run: int, series: Series) -> Float[np.ndarray, "rows *columns"]:
         """The rows of a run, white if the series is its noise, those of all outputs one after another."""
-        rest = _filtered(series, self.filters[series.kind])
+        rest = _filtered(series, self.filters[run])
         rows = np.einsum("oi,si...->so...", self.scales[run], rest)
         return rows.reshape(-1, *rows.shape[2:])
 
@@ -48,22 +48,23 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
 
     **Arguments**: `residuals`, one `Series` a run, `values` (samples, outputs).
     """
-    filters = {}
+    of_kind = {}
     for kind in dict.fromkeys(series.kind for series in residuals):
-        filters[kind] = _autoregression([s for s in residuals if s.kind == kind])
+        of_kind[kind] = _autoregression([s for s in residuals if s.kind == kind])
+    filters = [of_kind[series.kind] for series in residuals]
     return Whitener(filters, _scales(residuals, filters))
 
 
 def plain(residuals: Sequence[Series]) -> Whitener:
     """No filter at all, only the scale of every run."""
-    filters = {s.kind: np.zeros((0, *2 * s.values.shape[1:2])) for s in residuals}
+    filters = [np.zeros((0, *2 * s.values.shape[1:2])) for s in residuals]
     return Whitener(filters, _scales(residuals, filters))
 
 
 def _scales(residuals: Sequence[Series], filters) -> list[Float[np.ndarray, "outputs outputs"]]:
     scales = []
-    for series in residuals:
-        rest = _filtered(series, filters[series.kind])
+    for series, of_run in zip(residuals, filters, strict=True):
+        rest = _filtered(series, of_run)
         covariance = rest.T @ rest / max(len(rest), 1)
         floor = 1e-12 * np.trace(covariance) + 1e-300
         values, vectors = np.linalg.eigh(covariance)

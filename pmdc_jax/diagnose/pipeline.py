@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 # A hat of a curve whose misfit is so many standard errors is part of a region
 CLEAR = 4.0
-# What a complete model may leave of the gap when a library's formula is not quite nature's
-LEFT = 0.1
 
 
 @double_precision
@@ -71,8 +69,10 @@ def diagnose(
     named = time.perf_counter()
     report("judging the uncertainty", naming.chosen.polished.refined.fitness)
     base = judge(given, solved)
-    chosen = solved._replace(polished=naming.chosen.polished)
-    final = judge(naming.chosen.given, chosen) if naming.chosen.effects else base
+    final = base
+    if naming.chosen.effects:
+        ended, polished = naming.ended
+        final = judge(ended, solved._replace(polished=polished))
     verdict = _verdict(naming)
     gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
     seconds = {
@@ -104,16 +104,11 @@ def _verdict(naming: Naming) -> Verdict:
         return "not_in_library"
     if naming.nothing >= ALARM:
         return "none_detected"
-    if naming.left < ALARM and not _nearly_closed(naming):
+    if naming.left < ALARM and not naming.explained:
         return "not_in_library"
     if not naming.chosen.effects:
         return "not_in_library"
     return "ambiguous" if naming.rivals else "named"
-
-
-def _nearly_closed(naming: Naming) -> bool:
-    """Whether what is left is no more than another formula for the same effect might leave."""
-    return bool(naming.chosen.effects) and naming.unexplained < LEFT * naming.explained
 
 
 def _effects(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:
@@ -184,9 +179,10 @@ def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
         # what the motor's own parameters would do as well is no part of the curve
         fit = found.evidence.regress([block], visible=1e-3)
         chance = log_chance(base - fit.squares, found.evidence.freedom(block))
-        value, error = (
-            np.mean(x, axis=0) if curve.own else x for x in (fit.coefficients[0], fit.errors[0])
-        )
+        value, error = fit.coefficients[0], fit.errors[0]
+        if curve.own:  # of the run that shows it most clearly
+            clearest = np.argmax(np.sum(np.square(value / np.maximum(error, 1e-300)), axis=1))
+            value, error = value[clearest], error[clearest]
         unit = "N m" if curve.equation == "mechanical" else "V"
         learned.append(
             LearnedCurve(
@@ -194,8 +190,8 @@ def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
                 curve.variable,
                 unit,
                 curve.knots,
-                value,
-                error,
+                curve.values(value),
+                curve.errors(error),
                 float(np.exp(chance)),
             )
         )

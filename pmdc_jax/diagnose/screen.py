@@ -21,6 +21,7 @@ class Screen(NamedTuple):
     """Evidence, and which of its columns belong to what."""
 
     evidence: Evidence  # white
+    white: Whitener
     unfiltered: Evidence  # the same without a filter of the noise
     candidates: list[Candidate]
     of_candidate: list[Block]
@@ -45,12 +46,20 @@ def screen(model: Model, library: Library) -> Screen:
     of_candidate, of_curve = (_behind(model, blocks) for blocks in (of_candidate, of_curve))
     fitted, X = rows_of(model), _series(model, jnp.concatenate([shown, curved], -1))
     residuals = [fit.residual for fit in fitted]
-    unfiltered = _products(fitted, plain(residuals), X)
+    as_they_are = plain(residuals)
+    unfiltered = _products(fitted, as_they_are, X)
     found = Screen(
-        unfiltered, unfiltered, library.candidates, of_candidate, curves, of_curve, model.dry
+        evidence=unfiltered,
+        white=as_they_are,
+        unfiltered=unfiltered,
+        candidates=library.candidates,
+        of_candidate=of_candidate,
+        curves=curves,
+        of_curve=of_curve,
+        dry=model.dry,
     )
-    white = _products(fitted, whitener(_without_clearest(found, fitted, X)), X)
-    return found._replace(evidence=white)
+    white = whitener(_without_clearest(found, fitted, X))
+    return found._replace(evidence=_products(fitted, white, X), white=white)
 
 
 def beyond_curves(found: Screen) -> float:
@@ -59,38 +68,49 @@ def beyond_curves(found: Screen) -> float:
     return found.unfiltered.regress(shared).squares / found.unfiltered.regress().squares
 
 
-def left_over(model: Model, whiten: Whitener) -> tuple[float, int]:
-    """The sum of squares that a model leaves, made white by a filter that others share, and of how many rows."""
-    evidence = _products(rows_of(model), whiten, None)
-    return evidence.regress().squares, evidence.rows
-
-
 class Signal(NamedTuple):
     """A block of the evidence on its own: how much better the fit is with it."""
 
     gain: float
     log_p: float  # natural logarithm of the chance of such a gain by noise
-    candidate: Candidate | None
+    of: Candidate | Curve
     block: Block
+
+    @property
+    def candidate(self) -> Candidate | None:
+        """The candidate, if it is one."""
+        return self.of if isinstance(self.of, Candidate) else None
 
 
 def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     """Of every candidate that physics allows, and of every curve; the most significant first."""
     base = found.evidence.regress().squares
 
-    def signal(candidate: Candidate | None, block: Block) -> Signal | None:
+    def gain_of(block: Block) -> float:
+        return max(base - found.evidence.regress([block]).squares, 0.0)
+
+    def signal(gain: float, of: Candidate | Curve, block: Block) -> Signal:
+        return Signal(gain, log_chance(gain, found.evidence.freedom(block)), of, block)
+
+    of_candidates = []
+    for candidate, block in zip(found.candidates, found.of_candidate, strict=True):
         fit = found.evidence.regress([block])
-        if candidate is not None and not found.possible(candidate, fit.coefficients[0]):
-            return None
-        gain = max(base - fit.squares, 0.0)
-        return Signal(gain, log_chance(gain, found.evidence.freedom(block)), candidate, block)
+        if found.possible(candidate, fit.coefficients[0]):
+            of_candidates.append(signal(max(base - fit.squares, 0.0), candidate, block))
+    gains = np.array([gain_of(block) for block in found.of_curve])
+    waves = np.array([curve.shapes is not None for curve in found.curves])
+    gains[waves] /= _dispersion(found, gains[waves], found.of_curve[-1])
+    of_curves = [signal(*one) for one in zip(gains, found.curves, found.of_curve, strict=True)]
+    return sorted(of_candidates, key=_log_p), sorted(of_curves, key=_log_p)
 
-    def ranked(pairs) -> list[Signal]:
-        every = [s for pair in pairs if (s := signal(*pair)) is not None]
-        return sorted(every, key=lambda s: s.log_p)
 
-    of_candidates = ranked(zip(found.candidates, found.of_candidate, strict=True))
-    return of_candidates, ranked((None, block) for block in found.of_curve)
+def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> float:
+    """How much more than by chance most waves gain: they are slow, and of slow noise a filter leaves some."""
+    return max(float(np.median(gains) / stats.chi2.median(found.evidence.freedom(wave))), 1.0)
+
+
+def _log_p(signal: Signal) -> float:
+    return signal.log_p
 
 
 def log_chance(gain: float, freedom: int) -> float:
@@ -132,7 +152,7 @@ def _without_clearest(found: Screen, fitted: Sequence[Fit], X: Sequence[Series])
     of_candidates, of_curves = signals(found)
     clearest = min(
         (s for s in (*of_candidates, *of_curves) if s.candidate or not s.block.own),
-        key=lambda s: s.log_p,
+        key=_log_p,
     ).block
     best = found.evidence.regress([clearest])
     columns = np.array(clearest.columns) - found.evidence.parameters

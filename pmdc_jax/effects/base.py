@@ -69,6 +69,8 @@ class AbstractEffect(eqx.Module):
     equation: ClassVar[Literal["electrical", "mechanical", "input", "sensor"]]
     ranges: ClassVar[dict[str, ParameterRange]]
     states: ClassVar[tuple[str, ...]] = ()
+    # the variable that its term is a curve over, where it is one
+    variable: ClassVar[Literal["speed", "current", "voltage"] | None] = None
     # which state a dry element holds at zero
     holds: ClassVar[Literal["speed", "current"] | None] = None
     # with it the motor is still a linear system with inputs, as long as no dry element changes direction

@@ -20,6 +20,7 @@ class BrushVoltageDrop(AbstractEffect):
     label: ClassVar = "Brush voltage drop"
     formula: ClassVar = "v_b = V_b sign(i)"
     equation: ClassVar = "electrical"
+    variable: ClassVar = "current"
     holds: ClassVar = "current"
     affine: ClassVar = True
     ranges: ClassVar = {"voltage_V": ParameterRange("V", 1e-5, 10.0)}

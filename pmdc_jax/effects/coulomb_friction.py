@@ -20,6 +20,7 @@ class CoulombFriction(AbstractEffect):
     label: ClassVar = "Coulomb friction"
     formula: ClassVar = "T_f = T_c sign(w)"
     equation: ClassVar = "mechanical"
+    variable: ClassVar = "speed"
     holds: ClassVar = "speed"
     affine: ClassVar = True
     ranges: ClassVar = {"torque_Nm": ParameterRange("N m", 1e-7, 1e4)}
@@ -48,6 +49,7 @@ class AsymmetricFriction(AbstractEffect):
     label: ClassVar = "Friction that differs with direction"
     formula: ClassVar = "T_f = T_+ for w > 0, -T_- for w < 0"
     equation: ClassVar = "mechanical"
+    variable: ClassVar = "speed"
     holds: ClassVar = "speed"
     affine: ClassVar = True
     ranges: ClassVar = {

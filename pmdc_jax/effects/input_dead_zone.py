@@ -22,6 +22,7 @@ class InputDeadZone(AbstractEffect):
     label: ClassVar = "Dead zone of the input"
     formula: ClassVar = "v_m = v - clip(v, -width, width)"
     equation: ClassVar = "input"
+    variable: ClassVar = "voltage"
     affine: ClassVar = True
     ranges: ClassVar = {"width_V": ParameterRange("V", 1e-5, 1e2)}
 

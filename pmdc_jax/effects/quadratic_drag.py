@@ -22,6 +22,7 @@ class QuadraticDrag(AbstractEffect):
     label: ClassVar = "Quadratic drag"
     formula: ClassVar = "T_d = c w |w|"
     equation: ClassVar = "mechanical"
+    variable: ClassVar = "speed"
     ranges: ClassVar = {"drag_Nms2_rad2": ParameterRange("N m s^2/rad^2", 1e-12, 1e-2)}
 
     drag_Nms2_rad2: Scalars

@@ -27,6 +27,7 @@ class TorqueConstantSaturation(AbstractEffect):
     label: ClassVar = "Saturation of the torque constant"
     formula: ClassVar = "T_m = Kt i / (1 + c i^2)"
     equation: ClassVar = "mechanical"
+    variable: ClassVar = "current"
     ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 10.0)}
 
     per_A2: Scalars
@@ -49,6 +50,7 @@ class InductanceSaturation(AbstractEffect):
     label: ClassVar = "Saturation of the inductance"
     formula: ClassVar = "L di/dt = (1 + c i^2) (v - R i - Kb w)"
     equation: ClassVar = "electrical"
+    variable: ClassVar = "current"
     longest_step: ClassVar = 2.5e-4
     ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 10.0)}
 

@@ -23,6 +23,7 @@ class StribeckFriction(AbstractEffect):
     label: ClassVar = "Stribeck friction"
     formula: ClassVar = "T_f = (T_c + (T_s - T_c) exp(-(w / w_s)^2)) sign(w)"
     equation: ClassVar = "mechanical"
+    variable: ClassVar = "speed"
     holds: ClassVar = "speed"
     ranges: ClassVar = {
         "coulomb_Nm": ParameterRange("N m", 1e-7, 1e4),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 # A channel without noise (a simulation) is still scaled by something: this share of its size.
 FLOOR = 1e-5
@@ -13,12 +14,25 @@ FLOOR = 1e-5
 def white_noise(signals: Sequence[np.ndarray]) -> float | None:
     """Standard deviation of the white part of some signals of one kind, None without any.
 
-    From second differences, which leave a smooth motion out; by their median, which leaves jumps out.
+    From second differences, which leave a smooth motion out; by their median, which leaves jumps out. No less
+    than what rounding to the quanta of the sensor does, which most differences do not show.
     """
-    differences = [np.diff(s[~np.isnan(s)], 2) for s in signals]
+    known = [s[~np.isnan(s)] for s in signals]
+    differences = [np.diff(s, 2) for s in known]
     differences = np.concatenate([d for d in differences if len(d)] or [np.empty(0)])
     if not len(differences):
         return None
     size = np.sqrt(np.mean([np.nanmean(np.square(s)) for s in signals]))
     spread = np.median(np.abs(differences)) / (0.6745 * np.sqrt(6.0))
-    return float(max(spread, FLOOR * size, 1e-12))
+    rounding = quantum(np.concatenate([np.diff(s) for s in known])) / np.sqrt(12.0)
+    return float(max(spread, rounding, FLOOR * size, 1e-12))
+
+
+def quantum(steps: Float[np.ndarray, " steps"]) -> float:
+    """The step of which all steps are multiples, zero if there is none."""
+    sizes = np.abs(steps[steps != 0])
+    if not len(sizes):
+        return 0.0
+    smallest = float(np.quantile(sizes, 0.01))
+    off = np.abs(sizes / smallest - np.round(sizes / smallest))
+    return smallest if np.mean(off < 0.02) > 0.95 else 0.0

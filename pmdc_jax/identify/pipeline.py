@@ -295,9 +295,16 @@ def _start(tape: Tape, coordinates: jax.Array | np.ndarray) -> Unknowns:
     return Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
 
 
-def _distinct(found: Found) -> list[np.ndarray]:
-    """The best few candidates that are not nearly the same."""
+def _distinct(found: Found, parameters: Parameters) -> list[np.ndarray]:
+    """The best few candidates that are not nearly the same, and the best once more with a middling L.
+
+    Where L is too small to matter the misfit is flat, and nothing leads back from there.
+    """
     kept: list[np.ndarray] = []
+    if "L" in parameters.names:
+        L = parameters.names.index("L")
+        kept.append(np.array(found.candidates[0]))
+        kept[0][L] = (parameters.lower[L] + parameters.upper[L]) / 2
     for candidate in found.candidates:
         if all(np.max(np.abs(candidate - other)) > DISTINCT for other in kept):
             kept.append(candidate)
@@ -314,7 +321,7 @@ def _refine(problem: Problem, start: Unknowns, **options: float) -> Refined:
 
 def _refine_all(problem: Problem, found: Found) -> list[Refined]:
     """Refine the best distinct candidates of a search, one a core at a time; the best first."""
-    starts = [_start(problem.tape, candidate) for candidate in _distinct(found)]
+    starts = [_start(problem.tape, candidate) for candidate in _distinct(found, problem.parameters)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return sorted(pool.map(lambda start: _refine(problem, start), starts), key=_fitness)
 

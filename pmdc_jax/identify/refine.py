@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..simulate import LOCAL, Tape, sensitivities
 from .parameters import Parameters
+from .whitening import Whitening
 
 STEPS = 60
 
@@ -46,6 +48,7 @@ class Problem(eqx.Module):
     noise: Float[Array, "2"]  # standard deviations of current A and speed rad/s
     free: Bool[Array, " parameters"]
     counts: Bool[Array, " runs"]
+    whitening: Whitening | None = None  # in place of the noise, where residuals are correlated
 
     @property
     def outputs(self) -> int:
@@ -91,7 +94,9 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     """Simulate every run of the problem and compare."""
     # Levenberg-Marquardt traces under an empty mesh; under no mesh at all everything would be traced once more
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-        return _evaluate(problem, unknowns)
+        # whitened apart, for the simulation takes long to compile
+        plain = _evaluate(replace(problem, whitening=None), unknowns)
+        return plain if problem.whitening is None else _whitened(problem, plain)
 
 
 @eqx.filter_jit
@@ -103,6 +108,14 @@ def _evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     scale = tape.weight / problem.noise[:, None]
     jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]
     return Evaluation(seen, (seen - tape.measured) * scale, jacobian)
+
+
+@eqx.filter_jit
+def _whitened(problem: Problem, plain: Evaluation) -> Evaluation:
+    both = jnp.concatenate([plain.jacobian, plain.residuals[..., None]], -1)
+    assert problem.whitening is not None
+    both = problem.whitening(both * problem.noise[:, None, None], problem.tape.run)
+    return Evaluation(plain.seen, both[..., -1], both[..., :-1])
 
 
 @eqx.filter_jit
@@ -269,7 +282,8 @@ class _Weighed(NamedTuple):
     evaluation: Evaluation
     noise: np.ndarray
     matrix: np.ndarray
-    # sum of the logarithms of the noise, which the maximum of the likelihood makes least
+    # sum of the logarithms of the noise, which the maximum of the likelihood makes least; of white residuals that of
+    # their squares
     cost: float
     fitness: float
 
@@ -285,6 +299,8 @@ def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
     )
     matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
     cost = float(np.log(np.maximum(noise, 1e-300)).sum())
+    if problem.whitening is not None:
+        cost = float(np.log(np.maximum(squares.sum(), 1e-300)))
     cost = cost if np.isfinite(cost) else np.inf
     return _Weighed(unknowns, scaled, noise, matrix, cost, float(squares.sum()) / _samples(problem))
 
@@ -327,7 +343,9 @@ def gauss_newton(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.nda
 
 
 def _own_noise(problem: Problem, squares: np.ndarray):
-    """Standard deviation of the residuals of each output, and the old scale over the new."""
+    """Standard deviation of the residuals of each output, and the old scale over the new; white ones keep theirs."""
+    if problem.whitening is not None:
+        return np.asarray(problem.noise), np.ones(2)
     weight = np.asarray(problem.tape.weight)[problem.counted].sum((0, 2))
     ratio = np.sqrt(squares / np.maximum(weight, 1.0))
     ratio = np.where(ratio == 0, 1.0, ratio)

@@ -1,0 +1,79 @@
+"""Residuals made white before they are squared: generalised least squares.
+
+Where a torque fluctuates the residuals of a free run are correlated, and plain least squares lets their slow part,
+most of which is noise, outvote the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+# Samples that are filtered by one product of matrices, and the longest memory of a filter
+CHUNK = 32
+
+
+class Whitening(eqx.Module):
+    """A filter for every run, r'(t) = S (r(t) - sum_k A_k r(t - k)), that leaves unit variance and no correlation.
+
+    **Source**: Aitken, Proceedings of the Royal Society of Edinburgh 55 (1936); Ljung, "System Identification",
+    2nd edition, section 7.4.
+    """
+
+    bands: Float[Array, "runs white seen"]  # of a chunk's white rows, by the chunk before and by it
+    usable: Float[
+        Array, "blocks 2 samples"
+    ]  # one where all that the filter looks back on was measured
+
+    @classmethod
+    def of(
+        cls,
+        filters: Sequence[Float[np.ndarray, "_ 2 2"]],
+        scales: Sequence[Float[np.ndarray, "2 2"]],
+        weight: Float[Array | np.ndarray, "blocks 2 samples"],
+        run: Int[Array | np.ndarray, " blocks"],
+    ) -> Whitening:
+        """By the coefficients A and the scale S of every run; `weight` is zero where nothing was measured, `run` the
+        run of each block."""
+        bands = np.stack([_band(A, S) for A, S in zip(filters, scales, strict=True)])
+        known = np.moveaxis(np.asarray(weight) > 0, 1, 2)
+        usable = np.zeros(known.shape)
+        for index, A in enumerate(filters):
+            mine, counts = np.asarray(run) == index, np.any(scales[index], axis=0)
+            whole = known[mine].reshape(-1, 2)[:, counts].all(1)
+            usable[mine] = (_remembered(whole, len(A))[:, None] * counts).reshape(
+                -1, *known.shape[1:]
+            )
+        return cls(jnp.asarray(bands), jnp.asarray(np.moveaxis(usable, 2, 1)))
+
+    def __call__(
+        self, signal: Float[Array, "blocks 2 samples columns"], run
+    ) -> Float[Array, "blocks 2 samples columns"]:
+        """Columns such as residuals, A and rad/s, made white."""
+        blocks, outputs, samples, columns = signal.shape
+        in_time = jnp.moveaxis(signal, 1, 2).reshape(-1, CHUNK * outputs, columns)
+        window = jnp.concatenate([jnp.roll(in_time, 1, axis=0), in_time], axis=1)
+        bands = self.bands[
+            jnp.repeat(jnp.asarray(run), samples // CHUNK, total_repeat_length=len(in_time))
+        ]
+        white = jnp.einsum("kij,kjc->kic", bands, window)
+        white = jnp.moveaxis(white.reshape(blocks, samples, outputs, columns), 2, 1)
+        return white * self.usable[..., None]
+
+
+def _band(A: Float[np.ndarray, "order 2 2"], S: Float[np.ndarray, "2 2"]) -> np.ndarray:
+    band = np.zeros((CHUNK, 2, 2 * CHUNK, 2))
+    here = np.arange(CHUNK)
+    for back, coefficients in enumerate([np.eye(2), *(-A)]):
+        band[here, :, CHUNK + here - back] = S @ coefficients
+    return band.reshape(2 * CHUNK, 4 * CHUNK)
+
+
+def _remembered(known, order: int) -> Bool[np.ndarray, " samples"]:
+    """Samples that were measured, as were the `order` before them."""
+    lost = np.cumsum(np.append(0, ~known))
+    return np.append(np.zeros(order, bool), lost[order + 1 :] == lost[: len(known) - order])
