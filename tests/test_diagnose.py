@@ -11,6 +11,8 @@ import pytest
 from scipy import stats
 
 from benchmarks import virtual_bench as vb
+from benchmarks.naming.cases import Bench, record
+from benchmarks.naming.plant import Plant
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import diagnose
 from pmdc_jax.diagnose.candidates import TABLE, Scales
@@ -223,12 +225,12 @@ def test_response_is_the_change_of_the_simulation(x64, name):
 # --------------------------------------------------------------------------------- whole cases
 
 
+QUANTITIES, LOAD = ("time_s", "voltage_V", "current_A", "speed_rad_s"), "load_torque_Nm"
+
+
 def recorded(motor: vb.BenchMotor, seed: int, noise: vb.Noise) -> list[Recording]:
     """Three short runs of the virtual bench, which shares no code with the package."""
-    rng, quantities = (
-        np.random.default_rng(seed),
-        ("time_s", "voltage_V", "current_A", "speed_rad_s"),
-    )
+    rng = np.random.default_rng(seed)
     excitations = {
         "prbs": vb.prbs(rng, 2.0),
         "triangle": vb.slow_triangle(2.0),
@@ -237,8 +239,7 @@ def recorded(motor: vb.BenchMotor, seed: int, noise: vb.Noise) -> list[Recording
     found = []
     for name, excitation in excitations.items():
         columns = vb.record(motor, excitation, rng, noise)
-        load = columns["load_torque_Nm"]
-        found.append(Recording(name, *(columns[q] for q in quantities), load=load))
+        found.append(Recording(name, *(columns[q] for q in QUANTITIES), load=columns[LOAD]))
     return found
 
 
@@ -278,3 +279,22 @@ def test_nothing_is_found_where_nothing_is_missing(noise):
     assert found.final.parameters == found.base.parameters
     by_name = {d.effect: d for d in found.detectable}
     assert 0 < by_name["coulomb_friction"].amplitude < 0.05
+
+
+def test_a_weight_behind_a_gear_is_something_that_no_library_has():
+    """It comes round once in 11.6 turns, as slowly as the noise of a fluctuating torque."""
+    rng = np.random.default_rng(6)
+    plant = Plant(**PAPER, eccentric_Nm=0.02, eccentric_gear=11.6, eccentric_phase=1.0)
+    runs = []
+    for name, excitation in {
+        "prbs": vb.prbs(rng, 2.0),
+        "triangle": vb.slow_triangle(2.0),
+        "loaded": vb.loaded(rng, 2.0),
+    }.items():
+        columns = record(plant, excitation, rng, NOISE, Bench({}))
+        runs.append(Recording(name, *(columns[q] for q in QUANTITIES), load=columns[LOAD]))
+    found = diagnose(runs)
+    assert found.verdict == "not_in_library"
+    assert {curve.variable for curve in found.curves[:1]} == {"angle"}
+    turn = found.curves[0].x[-1] / (2 * np.pi)
+    assert turn == pytest.approx(11.6, rel=0.2)

@@ -20,10 +20,13 @@ from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, identify
 from pmdc_jax.identify.binary_ga import BinaryGA
 from pmdc_jax.identify.identification import Identification
+from pmdc_jax.identify.noise import quantum, white_noise
 from pmdc_jax.identify.parameters import Parameters
+from pmdc_jax.identify.pipeline import _distinct
 from pmdc_jax.identify.refine import Problem, Unknowns, evaluate, polish, refine
-from pmdc_jax.identify.search import METHODS, search
+from pmdc_jax.identify.search import METHODS, Found, search
 from pmdc_jax.identify.uncertainty import information, long_run_variance
+from pmdc_jax.identify.whitening import Whitening
 from pmdc_jax.motor import PARAMETERS
 from pmdc_jax.recording import Recording
 from pmdc_jax.simulate import Tape
@@ -272,6 +275,58 @@ def test_an_inductance_too_fast_to_see_is_no_confident_number():
         assert L.ci95[0] < truth.L < L.ci95[1], L
     else:
         assert (L.stderr, L.ci95) == (None, None)
+
+
+# ------------------------------------------------------------------------- noise and whitening
+
+
+def test_the_noise_of_a_quantised_sensor_is_that_of_rounding():
+    """A speed that hardly changes shows its quantum only now and then."""
+    speed = 0.5 * np.round(np.sin(np.linspace(0, 7, 5000)) * 30 / 0.5)
+    assert white_noise([speed]) == pytest.approx(0.5 / np.sqrt(12), rel=1e-6)
+    assert quantum(np.diff(speed)) == 0.5
+
+
+def test_a_smooth_or_a_noisy_signal_has_no_quantum():
+    rng = np.random.default_rng(0)
+    smooth = np.sin(np.linspace(0, 7, 5000)) * 30
+    assert quantum(np.diff(smooth)) == 0.0
+    assert quantum(np.diff(smooth + rng.normal(size=5000))) == 0.0
+    assert white_noise([smooth + rng.normal(size=5000)]) == pytest.approx(1.0, rel=0.1)
+
+
+def test_whitening_is_its_formula_sample_by_sample():
+    """Two runs in three blocks, the second without current and with a sample missing."""
+    rng = np.random.default_rng(1)
+    run, samples = np.array([0, 0, 1]), 128
+    weight = np.ones((3, 2, samples))
+    weight[2, 0] = 0.0
+    weight[2, 1, 50] = 0.0
+    filters = [0.3 * rng.normal(size=(4, 2, 2)), np.zeros((2, 2, 2))]
+    filters[1][:, 1, 1] = [0.5, -0.2]
+    scales = [np.array([[2.0, 0.1], [0.1, 0.5]]), np.diag([0.0, 3.0])]
+    signal = rng.normal(size=(3, 2, samples, 2)) * weight[..., None]
+    white = np.asarray(Whitening.of(filters, scales, weight, run)(jnp.asarray(signal), run))
+    for index, (A, S) in enumerate(zip(filters, scales, strict=True)):
+        mine = np.moveaxis(signal[run == index], 1, 2).reshape(-1, 2, 2)
+        found = np.moveaxis(white[run == index], 1, 2).reshape(-1, 2, 2)
+        for t in range(len(mine)):
+            past = sum(A[k - 1] @ mine[t - k] for k in range(1, len(A) + 1)) if t >= len(A) else 0.0
+            lost = t < len(A) or (index == 1 and 50 <= t <= 52)
+            expected = 0.0 * mine[t] if lost else S @ (mine[t] - past)
+            np.testing.assert_allclose(found[t], expected, atol=1e-6, err_msg=f"{index} {t}")
+
+
+def test_one_start_has_a_middling_inductance():
+    """A search may end where L is too small to matter; nothing leads back from there."""
+    parameters = Parameters.of(dict.fromkeys(PARAMETERS, (1e-08, 100000000.0)))
+    stuck = np.log([[0.2, 1e-7, 0.05, 0.05, 5e-4, 2e-4], [0.3, 2e-7, 0.05, 0.05, 5e-4, 2e-4]])
+    nothing = np.zeros(2)
+    found = Found(stuck, nothing, nothing, nothing, 2, False)
+    starts = np.exp(_distinct(found, parameters))
+    assert starts[0, 1] == pytest.approx(1.0)
+    assert np.allclose(np.delete(starts[0], 1), np.delete(np.exp(stuck[0]), 1))
+    assert np.allclose(starts[1:], np.exp(stuck))
 
 
 # ------------------------------------------------------------------------- refine and polish
