@@ -168,6 +168,16 @@ def test_a_line_that_drives_is_none():
     assert common_line(shaken([7.3] * 4, driven=7.3)) is None
 
 
+def test_harmonics_of_a_drive_that_repeats_itself_are_none():
+    """A wrong friction has lines at harmonics that the drive itself may lack."""
+    rng, time = np.random.default_rng(0), np.arange(8000) * 1e-3
+    wave = np.sin(2 * np.pi * 1.3 * time)
+    residuals = 3 * np.sin(2 * np.pi * 3 * 1.3 * time)[:, None] + rng.normal(size=(8000, 2))
+    once = rng.normal(size=(8000, 1)).cumsum(0)
+    assert common_line([spectrum(residuals, wave[:, None], 1e-3)] * 3) is None
+    assert common_line([spectrum(residuals, once, 1e-3)] * 3) is not None
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_coloured_noise_has_no_line(seed):
     rng = np.random.default_rng(seed)

@@ -89,7 +89,8 @@ def cogged(x, v, load, values):
 def rippled(x, v, load, values):
     wave = values["amplitude"] * np.sin(values["periods"] * x[2] + values["phase_rad"])
     Kt = PAPER["Kt"] * (1 + wave)
-    return [electrical(x[0], x[1], v), mechanical(x[0], x[1], load, Kt=Kt), x[1]]
+    emf = 1 + values["emf_share"] * wave
+    return [electrical(x[0], emf * x[1], v), mechanical(x[0], x[1], load, Kt=Kt), x[1]]
 
 
 def two_inertias(x, v, load, values, torque):
@@ -155,7 +156,7 @@ CASES = {
         shows=0.01,
     ),
     "torque_ripple": Case(
-        {"amplitude": 0.3} | WAVE,
+        {"amplitude": 0.3, "emf_share": 0.4} | WAVE,
         "amplitude",
         rates=rippled,
         start=lambda w, load, p: [0.0],

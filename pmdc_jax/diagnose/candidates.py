@@ -130,24 +130,23 @@ def _asymmetric(name: str, scales: Scales) -> list[Candidate]:
     return [Candidate(name, columns, (small, small), build, "backward_Nm")]
 
 
-def _periodic(field: str, size: Callable[[Scales], float]):
-    """Sine and cosine of the angle, in every run of its own phase."""
+def _periodic(field: str, size: Callable[[Scales], float], *others: Values):
+    """Sine and cosine of the angle, in every run of its own phase; `others` are settings of the other fields."""
 
     def rows(name: str, scales: Scales) -> list[Candidate]:
         small = SMALL * size(scales)
 
-        def candidate(periods: int) -> Candidate:
+        def candidate(periods: int, other: Values) -> Candidate:
+            shape = {"periods": float(periods), **other}
+
             def build(c: np.ndarray, dry: float) -> Values | None:
                 phase = float(np.arctan2(c[1], c[0]))
-                return {field: float(np.hypot(c[0], c[1])), "phase_rad": phase, "periods": periods}
+                return {field: float(np.hypot(c[0], c[1])), "phase_rad": phase, **shape}
 
-            columns = tuple(
-                {field: small, "phase_rad": phase, "periods": float(periods)}
-                for phase in (0.0, np.pi / 2)
-            )
+            columns = tuple({field: small, "phase_rad": p, **shape} for p in (0.0, np.pi / 2))
             return Candidate(name, columns, (small, small), build, field, own_phase=True)
 
-        return [candidate(periods) for periods in PERIODS]
+        return [candidate(periods, other) for other in others or ({},) for periods in PERIODS]
 
     return rows
 
@@ -221,7 +220,7 @@ TABLE: Mapping[str, Callable[[str, Scales], list[Candidate]]] = {
     "asymmetric_friction": _asymmetric,
     "quadratic_drag": _amplitude("drag_Nms2_rad2", lambda s: s.torque / s.speed**2),
     "cogging_torque": _periodic("amplitude_Nm", lambda s: s.torque),
-    "torque_ripple": _periodic("amplitude", lambda s: 1.0),
+    "torque_ripple": _periodic("amplitude", lambda s: 1.0, {"emf_share": 0.0}, {"emf_share": 1.0}),
     "constant_load": _amplitude("torque_Nm", lambda s: s.torque, signed=True),
     "shaft_compliance": _compliance,
     "gear_backlash": _no_column,

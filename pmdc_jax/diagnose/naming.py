@@ -38,6 +38,8 @@ REMAINDER, FORMULA, OWN_FORMULA = 0.02, 0.1, 0.5
 MUCH_OF_IT = 0.3
 # Effects that no column shows, with the simpler ones in whose place they are tried if those leave something
 HARDER = [("shaft_compliance", "gear_backlash")]
+# Share of the gain foretold by the evidence that a refit keeps, or else is tried in another way
+KEPT = 0.5
 # Steps of a refit that is one of several
 ROUGHLY = 8
 # ... and of which two have ended alike if their misfits differ by no more
@@ -105,6 +107,7 @@ class Fitted(NamedTuple):
     model: Model
     squares: float
     criterion: float  # squares and the price of every parameter; less is better
+    white: Whitener
 
 
 class Naming(NamedTuple):
@@ -133,7 +136,7 @@ class Namer:
         self.models: dict[frozenset[str], Model] = {frozenset(): base}
         self.filters: dict[frozenset[str], Whitener] = {}
         self.begun: dict[str, Values] = {}  # where each effect was first begun to be fitted
-        self.compared: dict[tuple[frozenset[str], frozenset[str]], Fitted] = {}
+        self.compared: dict[tuple[frozenset[str], int], Fitted] = {}
 
     def name(self) -> Naming:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
@@ -150,12 +153,14 @@ class Namer:
             tried = [m for m in tried if m is not None]
             if not tried:
                 break
-            best = _plainest(self.compare([current, *tried]))
-            if best is current:
+            best = self._best(tried, found.screen.white)
+            # judged by the noise that the clearest signal leaves: a filter of what a poorer model leaves takes
+            # for noise what is missing
+            if _plainest(self.compare([current, best], found.screen.white)) is current:
                 break
             current = self._spared(best)
             found = self._see(current)
-        ranked = self.compare(list(self.models.values()))
+        ranked = self.compare(list(self.models.values()), found.screen.white)
         price = {frozenset(f.model.effects): f for f in ranked}
         mine = price[frozenset(current.effects)]
         margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.left < ALARM else 0.0)
@@ -173,7 +178,7 @@ class Namer:
             left=found.left,
             explained=found.is_formula(current),
             noise=np.sqrt(beyond_curves(found.screen)) if found.left < ALARM else 1.0,
-            without=self._without(current),
+            without=self._without(current, found.screen.white),
             ended=self._ended(current),
             line=self._line(current),
         )
@@ -185,9 +190,14 @@ class Namer:
         left = chance_of_nothing(of_candidates, of_curves, count)
         explained = 0.0
         if model.effects:
-            base, mine = (squares_of(*sharpened(m, found.white)) for m in (self.base, model))
-            explained = base - mine
+            base, mine = (self._left(m, found.white) for m in (self.base, model))
+            explained = base.squares - mine.squares
         return Seen(found, of_candidates, of_curves, left, explained)
+
+    def _best(self, tried: Sequence[Model], white: Whitener) -> Model:
+        """The best of some refits, by the filter of what the one that leaves least leaves."""
+        least = self.compare(tried, white)[0].model
+        return _plainest(self.compare(tried, self._white(least)))
 
     def _is_rival(self, model: Model, chosen: Model) -> bool:
         """Not the same, not a part of it, not the same with something on top."""
@@ -226,8 +236,11 @@ class Namer:
             return None
         effects = (*kept, name)
         start = self._start(current, effects, {name: values}, fit.moved, angles)
-        starts = [start, *self._starts(current, effects)]
-        self.models[key] = self._best_of(effects, starts, current, found.white)
+        others = self._starts(current, effects)
+        if others:
+            self.models[key] = self._best_of(effects, [start, *others], found.white)
+        else:
+            self.models[key] = self._refitted(effects, start, current, signal, found.white)
         return self.models[key]
 
     def _in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model:
@@ -237,7 +250,7 @@ class Namer:
         if key not in self.models:
             self.report(f"trying {' + '.join(sorted(key))}", current.polished.refined.fitness)
             starts = self._starts(current, effects)
-            self.models[key] = self._best_of(effects, starts, current, white)
+            self.models[key] = self._best_of(effects, starts, white)
         return self.models[key]
 
     def _starts(self, current: Model, effects: tuple[str, ...]) -> list[Start]:
@@ -245,12 +258,8 @@ class Namer:
         others = STARTS.get(effects[-1], lambda scales: [])(self.library.scales)
         return [self._start(current, effects, {effects[-1]: values}) for values in others]
 
-    def _best_of(
-        self, effects: tuple[str, ...], starts: Sequence[Start], current: Model, white: Whitener
-    ) -> Model:
+    def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener) -> Model:
         """The best refit of several, begun one after another until one is as good as the noise or found twice."""
-        if len(starts) == 1:
-            return self._refitted(effects, *starts[0], current, white)
         ends = []
         for given, start in starts:
             ends.append((given, polish(given.problem, start, ROUGHLY).refined))
@@ -263,17 +272,20 @@ class Namer:
     def _refitted(
         self,
         effects: tuple[str, ...],
-        given: Prepared,
-        start: Refined,
+        start: Start,
         current: Model,
+        signal: Signal,
         white: Whitener,
     ) -> Model:
-        """Refitted from where the evidence points; if that leads nowhere, by way of plain least squares."""
-        model = settled(effects, given, start, white)
+        """Refitted from where the evidence points; if that leads nowhere near what it promises, also by way of plain
+        least squares."""
+        given, begun = start
+        model = settled(effects, given, begun, white)
         before, after = (squares_of(*sharpened(m, white)) for m in (current, model))
-        if after < before:
+        if before - after > KEPT * signal.gain:
             return model
-        return settled(effects, given, polish(given.problem, start).refined, white)
+        plainly = settled(effects, given, polish(given.problem, begun).refined, white)
+        return plainly if squares_of(*sharpened(plainly, white)) < after else model
 
     def _start(
         self,
@@ -320,7 +332,7 @@ class Namer:
         for effect in model.effects[:-1]:
             rest = tuple(e for e in model.effects if e != effect)
             smaller = self.models.get(frozenset(rest)) or self._drop(model, rest)
-            if self.compare([model, smaller])[0].model is smaller:
+            if self.compare([model, smaller], self._white(model))[0].model is smaller:
                 return self._spared(smaller)
         return model
 
@@ -329,21 +341,19 @@ class Namer:
         self.models[frozenset(rest)] = smaller
         return smaller
 
-    def compare(self, models: Sequence[Model]) -> list[Fitted]:
-        """By the squares of what each leaves, made white by the filter of the one that leaves least."""
-        least = min(models, key=lambda m: m.polished.refined.fitness)
-        return sorted((self._left(m, least) for m in models), key=lambda f: f.criterion)
+    def compare(self, models: Sequence[Model], white: Whitener) -> list[Fitted]:
+        """By the squares of what each leaves when fitted to residuals that a filter makes white, the best first."""
+        return sorted((self._left(m, white) for m in models), key=lambda f: f.criterion)
 
-    def _left(self, model: Model, least: Model) -> Fitted:
-        """What a model leaves, fitted to residuals that the filter of another one's noise makes white."""
-        keys = frozenset(model.effects), frozenset(least.effects)
-        if keys not in self.compared:
-            given, polished = sharpened(model, self._white(least))
+    def _left(self, model: Model, white: Whitener) -> Fitted:
+        key = frozenset(model.effects), id(white)
+        if key not in self.compared:
+            given, polished = sharpened(model, white)
             squares = squares_of(given, polished)
             samples = np.count_nonzero(given.problem.tape.weight)
             price = len(given.problem.parameters.names) * np.log(samples)
-            self.compared[keys] = Fitted(model, squares, squares + price)
-        return self.compared[keys]
+            self.compared[key] = Fitted(model, squares, squares + price, white)
+        return self.compared[key]
 
     def _ended(self, model: Model) -> tuple[Prepared, Polished]:
         """The last fit of a model: to white residuals, unless that is far from reproducing the runs as they are, as
@@ -371,12 +381,12 @@ class Namer:
             self.filters[key] = whitener([fit.residual for fit in rows_of(model)])
         return self.filters[key]
 
-    def _without(self, chosen: Model) -> dict[str, float]:
+    def _without(self, chosen: Model, white: Whitener) -> dict[str, float]:
         chances = {}
         for effect in chosen.effects:
             rest = tuple(e for e in chosen.effects if e != effect)
             smaller = self.models.get(frozenset(rest)) or self._drop(chosen, rest)
-            both = {f.model.effects: f.squares for f in self.compare([chosen, smaller])}
+            both = {f.model.effects: f.squares for f in self.compare([chosen, smaller], white)}
             gain = both[smaller.effects] - both[chosen.effects]
             chances[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
         return chances

@@ -21,6 +21,8 @@ NEIGHBOURS, SLOWEST = 41, 12
 STANDS_OUT = 50.0
 # A line that what drives has as well is no line of its own
 DRIVEN = 10.0
+# ... and a drive that repeats itself this well has harmonics, at which any misfit has lines
+REPEATED = 0.95
 PEAKS = 5
 
 
@@ -45,8 +47,11 @@ def spectrum(
     driving: Float[np.ndarray, "samples inputs"],
     step: float,
 ) -> Spectrum:
-    """The spectra of one run, sampled every `step` seconds."""
-    return Spectrum(_over_level(residuals), _over_level(driving), len(residuals) * step)
+    """The spectra of one run, sampled every `step` seconds; without any line where what drives repeats itself."""
+    shown = _over_level(residuals)
+    if any(_repeats(one) for one in driving.T):
+        shown = np.zeros_like(shown)
+    return Spectrum(shown, _over_level(driving), len(residuals) * step)
 
 
 def common_line(spectra: Sequence[Spectrum]) -> Line | None:
@@ -87,3 +92,19 @@ def _over_level(signals: Float[np.ndarray, "samples signals"]) -> Float[np.ndarr
     ratio = (power / np.maximum(level, floor)).max(1)
     ratio[:SLOWEST] = 0.0
     return ratio
+
+
+def _repeats(driving: Float[np.ndarray, " samples"]) -> bool:
+    """Whether a signal is itself again after some time of no more than half its length."""
+    x, n = driving - driving.mean(), len(driving)
+    if not np.any(x):
+        return False
+    power = np.abs(np.fft.rfft(x, 2 * n)) ** 2
+    products = np.fft.irfft(power)[:n]
+    squares = np.append(0.0, np.cumsum(x**2))
+    lags = np.arange(n // 20, n // 2)
+    both = squares[n - lags] * (squares[n] - squares[lags])
+    alike = products[lags] / np.sqrt(np.maximum(both, 1e-300))
+    # what hardly changes within the lag is alike without repeating itself
+    apart = np.flatnonzero(alike < 0.5)
+    return bool(len(apart) and np.any(alike[apart[0] :] > REPEATED))

@@ -67,32 +67,39 @@ class CoggingTorque(_Angular):
 class TorqueRipple(_Angular):
     """Torque ripple: Kt (1 + a sin(n angle + phase)) in place of Kt, of commutation and winding.
 
-    In the torque alone: the back-EMF ripples alike, but the brushes short what of it changes within a segment.
-    The angle is as in `cogging_torque`.
+    The back-EMF ripples alike, Kb (1 + e a sin(n angle + phase)), as far as the brushes do not short what of it
+    changes within a segment. The angle is as in `cogging_torque`.
 
     **Fields**: `amplitude`, a, a plain number > 0, usually 0.01 to 0.1; `phase_rad` in rad; `periods`, n for one
-    revolution, commonly the number of commutator segments, or twice it.
+    revolution, commonly the number of commutator segments, or twice it; `emf_share`, e, between 0 and 1.
     **Excitation needed**: slow motion over several periods with a current that is not small.
     **Source**: Hanselman, "Brushless Permanent Magnet Motor Design", 2nd edition, chapter 9.
     """
 
     name: ClassVar = "torque_ripple"
     label: ClassVar = "Torque ripple"
-    formula: ClassVar = "T_m = Kt i (1 + a sin(n angle + phase))"
+    formula: ClassVar = (
+        "T_m = Kt i (1 + a sin(n angle + phase)), e = Kb w (1 + e_s a sin(n angle + phase))"
+    )
     equation: ClassVar = "mechanical"
     ranges: ClassVar = {
         "amplitude": ParameterRange("", 1e-5, 1.0),
         "phase_rad": PHASE,
         "periods": PERIODS,
+        # estimates scatter about its ends
+        "emf_share": ParameterRange("", -0.5, 1.5, "linear"),
     }
 
     amplitude: Scalars
     phase_rad: Scalars
     periods: Scalars
+    emf_share: Scalars
 
     def parameters(self, motor: Motor, state: State) -> Motor:
         wave = jnp.sin(self.periods * state.extra["angle"] + self.phase_rad)
-        return eqx.tree_at(lambda m: m.Kt, motor, motor.Kt * (1 + self.amplitude * wave))
+        ripple = self.amplitude * wave
+        constants = motor.Kt * (1 + ripple), motor.Kb * (1 + self.emf_share * ripple)
+        return eqx.tree_at(lambda m: (m.Kt, m.Kb), motor, constants)
 
     def recurrence(self) -> dict[str, Scalars]:
         return {"angle": 2 * jnp.pi * (1 / self.periods)}
