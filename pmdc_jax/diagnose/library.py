@@ -56,7 +56,12 @@ class Library:
         """`base` is the motor without effects, as fitted."""
         self.bare = jax.tree.map(jnp.asarray, base.motor)
         self.scales = _scales(base)
-        self.candidates = candidates(self.scales)
+        tape = base.given.problem.tape
+        measured = bool(np.any(np.asarray(tape.weight)[base.given.problem.counted, 0]))
+        known = measured or bool(np.any(np.asarray(tape.drive.current) > 0))
+        self.candidates = [
+            c for c in candidates(self.scales) if known or not EFFECTS[c.effect].needs_current
+        ]
         self._whole: dict[int, jax.Array] = {}
         self._base = base
 

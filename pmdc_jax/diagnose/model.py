@@ -49,6 +49,8 @@ class Model(NamedTuple):
 
 # Gauss-Newton steps from one fit to white residuals to another
 SHARPENED = 8
+# A fit to white residuals may leave so many times the plain squares of the fit that leaves least of them
+NEAR = 1.5
 
 
 def sharpened(model: Model, white: Whitener) -> tuple[Prepared, Polished]:
@@ -65,6 +67,16 @@ def settled(effects: tuple[str, ...], given: Prepared, start: Refined, white: Wh
     plain = polish(given.problem, ended.refined, steps=0)
     refined = ended.refined._replace(fitness=plain.refined.fitness)
     return Model(effects, given, plain._replace(refined=refined))
+
+
+def ended(model: Model, white: Whitener) -> tuple[Prepared, Polished]:
+    """The last fit of a model: to white residuals, unless that is far from reproducing the runs as they are, as where
+    a formula is not quite nature's."""
+    given, sharp = sharpened(model, white)
+    as_it_is = polish(model.given.problem, sharp.refined, steps=0).refined.fitness
+    plainly = settle(model.given, model.polished.refined)
+    near = as_it_is < NEAR * plainly[1].refined.fitness
+    return (given, sharp) if near else plainly
 
 
 def squares_of(given: Prepared, polished: Polished) -> float:

@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
+from .model import Model, rows_of
+
 # Neighbours whose median is the level about a line, and how far from the slowest ones a line is looked for
 NEIGHBOURS, SLOWEST = 41, 12
 # How far a line stands out of the level about it. Measured on six runs each of motors that lack nothing: in single
@@ -40,6 +42,19 @@ class Spectrum(NamedTuple):
     residual: Float[np.ndarray, " frequencies"]
     driving: Float[np.ndarray, " frequencies"]
     duration: float  # s
+
+
+def line_of(model: Model) -> Line | None:
+    """The steady oscillation that a model leaves in most of the runs, if it leaves one."""
+    spectra = []
+    for run, fit in zip(model.given.training, rows_of(model), strict=True):
+        drives = (run.voltage, run.torque, run.load, run.current)
+        # a current drives only where there is no voltage
+        there = [x for x in drives[: 3 + (run.voltage is None)] if x is not None]
+        residuals = np.where(fit.residual.known[:, None], fit.residual.values, 0.0)
+        driving = np.nan_to_num(np.stack(there, axis=1))
+        spectra.append(spectrum(residuals[: len(driving)], driving, fit.residual.kind[0]))
+    return common_line(spectra)
 
 
 def spectrum(

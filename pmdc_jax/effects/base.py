@@ -71,6 +71,8 @@ class AbstractEffect(eqx.Module):
     states: ClassVar[tuple[str, ...]] = ()
     # the variable that its term is a curve over, where it is one
     variable: ClassVar[Literal["speed", "current", "voltage"] | None] = None
+    # its size is in amperes, and says something only where the current was measured
+    needs_current: ClassVar[bool] = False
     # which state a dry element holds at zero
     holds: ClassVar[Literal["speed", "current"] | None] = None
     # with it the motor is still a linear system with inputs, as long as no dry element changes direction

@@ -28,6 +28,7 @@ class ResistanceHeating(AbstractEffect):
     label: ClassVar = "Heating of the winding"
     formula: ClassVar = "R (1 + rise), tau drise/dt = a R i^2 - rise"
     equation: ClassVar = "electrical"
+    needs_current: ClassVar = True
     states: ClassVar = ("resistance_rise",)
     ranges: ClassVar = {
         "rise_per_W": ParameterRange("1/W", 1e-7, 1.0),

@@ -27,6 +27,7 @@ class TorqueConstantSaturation(AbstractEffect):
     label: ClassVar = "Saturation of the torque constant"
     formula: ClassVar = "T_m = Kt i / (1 + c i^2)"
     equation: ClassVar = "mechanical"
+    needs_current: ClassVar = True
     variable: ClassVar = "current"
     ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 10.0)}
 
@@ -50,6 +51,7 @@ class InductanceSaturation(AbstractEffect):
     label: ClassVar = "Saturation of the inductance"
     formula: ClassVar = "L di/dt = (1 + c i^2) (v - R i - Kb w)"
     equation: ClassVar = "electrical"
+    needs_current: ClassVar = True
     variable: ClassVar = "current"
     longest_step: ClassVar = 2.5e-4
     ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 10.0)}

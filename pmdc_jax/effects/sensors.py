@@ -79,6 +79,7 @@ class CurrentSensorOffset(AbstractEffect):
     label: ClassVar = "Offset of the current sensor"
     formula: ClassVar = "i_reported = i + i_0"
     equation: ClassVar = "sensor"
+    needs_current: ClassVar = True
     affine: ClassVar = True
     ranges: ClassVar = {"offset_A": ParameterRange("A", -1e3, 1e3, "linear")}
 

@@ -37,6 +37,10 @@ from .tape import BLOCK, Tape
 # The last pass corrects to first order what is left, so the joint error is about the square of this.
 JOINED = 1e-4
 
+# Passes after which a fit gives up on a motor, whose blocks hardly depend on how they begin but by chance: teeth that
+# rattle in their play. There are as many passes as a run has blocks, and nothing to learn from the derivatives.
+PASSES = 24
+
 # Columns of the sensitivities for a run's own unknowns: initial current, initial speed, load offset, initial angle.
 LOCAL = 4
 
@@ -96,7 +100,8 @@ def sensitivities(
     """Free run, and its derivatives by `parameters` and then by the run's own initial current, initial speed,
     load offset and initial angle.
 
-    `assemble` makes a motor of the parameters; the rest is as in `free_run`.
+    `assemble` makes a motor of the parameters; the rest is as in `free_run`. A motor whose runs depend on their
+    beginning by chance gives NaN.
     """
     own = _own(tape, initial, load_offset, angle)
     count = len(parameters)
@@ -122,7 +127,7 @@ def sensitivities(
 
     # joined with few columns, for that takes several passes; the derivatives are then those at the joined starts
     still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
-    starts, *_ = _join(prepared, still, tape, own, begins)
+    starts, *_ = _join(prepared, still, tape, own, begins, PASSES)
     passed = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
     joined, d_starts = _stitch_tangents(passed, tape, starts, begins, d_begins, count)
 
@@ -182,17 +187,19 @@ def _guess(motor: Motor, own: Own, tape: Tape, begins: Starts) -> Starts:
     return jnp.where(jnp.asarray(tape.begins)[:, None], begins, guess)
 
 
-def _join(prepared, still, tape: Tape, own: Own, begins: Starts) -> tuple[Starts, Starts, Pass]:
+def _join(
+    prepared, still, tape: Tape, own: Own, begins: Starts, most: int | None = None
+) -> tuple[Starts, Starts, Pass]:
     """Starts at which every block begins where the one before it ended; those of the last pass, and that pass.
 
-    `still` are the derivatives of the prepared motor by the starts: none.
+    `still` are the derivatives of the prepared motor by the starts: none. What `most` passes do not join is NaN.
     """
     motor = prepared[0]
     guess = _guess(motor, own, tape, begins)
     # a linear motor is joined exactly by the correction of its one pass; any other block is exact once the one
     # before it is, so this ends however hard the motor
     exact = motor.affine and not motor.sticks
-    passes = 1 if exact else len(guess) + 1
+    passes = 1 if exact else min(most or len(guess) + 1, len(guess) + 1)
 
     def unjoined(carry):
         *_, gap, passed = carry
@@ -208,7 +215,9 @@ def _join(prepared, still, tape: Tape, own: Own, begins: Starts) -> tuple[Starts
     shapes = jax.eval_shape(again, (guess, guess, None, 0.0, 0))[2]
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     carry = (guess, guess, nothing, jnp.asarray(jnp.inf), jnp.asarray(0))
-    starts, joined, run, *_ = jax.lax.while_loop(unjoined, again, carry)
+    starts, joined, run, gap, _ = jax.lax.while_loop(unjoined, again, carry)
+    if most is not None and not exact:
+        joined = jnp.where(gap > JOINED, jnp.nan, joined)
     return joined, starts, run
 
 

@@ -1,0 +1,43 @@
+"""Which sets of effects are one while the motor turns, or contain one another."""
+
+from __future__ import annotations
+
+# An effect that contains another one replaces it
+CONTAINS = {
+    "stribeck_friction": {"coulomb_friction"},
+    "asymmetric_friction": {"coulomb_friction", "constant_load"},
+}
+
+
+def are_rivals(a: set[str], b: set[str]) -> bool:
+    """Not the same, none a part of the other, and none with an effect in place of one that it contains."""
+    return bool(a) and not (a <= b or b <= a or _same_class(a, b) or _contains(a, b))
+
+
+def is_within(a: set[str], b: set[str]) -> bool:
+    """Whether `a` is `b` with one effect in a simpler form."""
+    return any(a - b and a - b <= CONTAINS.get(e, set()) and b - a == {e} for e in b)
+
+
+def _same_class(a: set[str], b: set[str]) -> bool:
+    """While the motor turns, asymmetric friction and Coulomb friction with a constant load are one torque."""
+    return _spelt_out(a) == _spelt_out(b)
+
+
+def _spelt_out(effects: set[str]) -> set[str]:
+    if "asymmetric_friction" in effects:
+        return (effects - {"asymmetric_friction"}) | {"coulomb_friction", "constant_load"}
+    return effects
+
+
+def _contains(a: set[str], b: set[str]) -> bool:
+    """Whether one set is the other but for an effect that another one contains."""
+    return any(_simplified(x) <= y or _simplified(x) == _simplified(y) for x, y in ((a, b), (b, a)))
+
+
+def _simplified(effects: set[str]) -> set[str]:
+    return {
+        simple
+        for e in effects
+        for simple in (CONTAINS[e] - {"constant_load"} if e in CONTAINS else {e})
+    }

@@ -1,0 +1,186 @@
+"""Motors with sets of effects, each fitted once in full simulation, from where the evidence points."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..effects import EFFECTS
+from ..identify.pipeline import POOR, Prepared
+from ..identify.refine import Refined, Unknowns, polish
+from ..identify.uncertainty import FLAT
+from .candidates import STARTS, Candidate, Values
+from .kinship import CONTAINS
+from .library import Library
+from .model import Model, settled, sharpened, squares_of
+from .noise import Whitener
+from .screen import Screen, Signal
+
+# Share of the gain foretold by the evidence that a refit keeps, or else is tried in another way
+KEPT = 0.5
+# Steps of a refit that is one of several
+ROUGHLY = 8
+# ... and of which two have ended alike if their misfits differ by no more
+AGREED = 1.05
+
+Start = tuple[Prepared, Refined]
+
+
+class Refits:
+    """The models that were fitted so far."""
+
+    def __init__(self, base: Model, library: Library, report):
+        self.library, self.report = library, report
+        self.models: dict[frozenset[str], Model] = {frozenset(): base}
+        self.begun: dict[str, Values] = {}  # where each effect was first begun to be fitted
+
+    def with_signal(self, current: Model, signal: Signal, found: Screen) -> Model | None:
+        """The current model with one more effect, None where its evidence is none that physics allows."""
+        candidate = signal.candidate
+        assert candidate is not None
+        kept = [e for e in current.effects if e not in CONTAINS.get(candidate.effect, ())]
+        effects = (*kept, candidate.effect)
+
+        def refit() -> Model | None:
+            fit = found.evidence.regress([signal.block])
+            runs = len(current.given.roles)
+            values, angles = _values(candidate, fit.coefficients[0], current.dry, runs)
+            if values is None:
+                return None
+            start = self._start(current, effects, {candidate.effect: values}, fit.moved, angles)
+            others = self._starts(current, effects)
+            if others:
+                return self._best_of(effects, [start, *others], found.white)
+            return self._refitted(effects, start, current, signal, found.white)
+
+        return self._once(effects, current, refit)
+
+    def in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
+        """The current model with an effect in place of a simpler one."""
+        effects = (*(e for e in current.effects if e != old), new)
+        return self._once(
+            effects,
+            current,
+            lambda: self._best_of(effects, self._starts(current, effects), white),
+        )
+
+    def without(self, model: Model, effect: str, white: Whitener) -> Model:
+        """The model without one of its effects."""
+        rest = tuple(e for e in model.effects if e != effect)
+        smaller = self._once(
+            rest, model, lambda: settled(rest, *self._start(model, rest, {}), white)
+        )
+        assert smaller is not None
+        return smaller
+
+    def _once(
+        self, effects: Sequence[str], current: Model, refit: Callable[[], Model | None]
+    ) -> Model | None:
+        key = frozenset(effects)
+        if key not in self.models:
+            self.report(f"trying {' + '.join(sorted(key))}", current.polished.refined.fitness)
+            found = refit()
+            if found is None:
+                return None
+            self.models[key] = found
+        return self.models[key]
+
+    def _starts(self, current: Model, effects: tuple[str, ...]) -> list[Start]:
+        """Where else to begin refitting the last of some effects."""
+        others = STARTS.get(effects[-1], lambda scales: [])(self.library.scales)
+        return [self._start(current, effects, {effects[-1]: values}) for values in others]
+
+    def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener) -> Model:
+        """The best refit of several, begun one after another until one is as good as the noise or found twice."""
+        given, ends, cores = starts[0][0], [], os.cpu_count() or 1
+        with ThreadPoolExecutor(cores) as pool:
+            for first in range(0, len(starts), cores):
+                ends += pool.map(_roughly, starts[first : first + cores])
+                best, *others = sorted(end.fitness for end in ends)
+                if best < POOR * given.problem.outputs or (others and others[0] < AGREED * best):
+                    break
+        return settled(effects, given, min(ends, key=lambda end: end.fitness), white)
+
+    def _refitted(
+        self,
+        effects: tuple[str, ...],
+        start: Start,
+        current: Model,
+        signal: Signal,
+        white: Whitener,
+    ) -> Model:
+        """Refitted from where the evidence points; if that leads nowhere near what it promises, also by way of plain
+        least squares."""
+        given, begun = start
+        model = settled(effects, given, begun, white)
+        before, after = (squares_of(*sharpened(m, white)) for m in (current, model))
+        if before - after > KEPT * signal.gain:
+            return model
+        plainly = settled(effects, given, polish(given.problem, begun).refined, white)
+        return plainly if squares_of(*sharpened(plainly, white)) < after else model
+
+    def _start(
+        self,
+        current: Model,
+        effects: tuple[str, ...],
+        values: dict[str, Values],
+        moved: np.ndarray | float = 0.0,
+        angles: np.ndarray | float = 0.0,
+    ) -> Start:
+        """Where to begin refitting the current model with other effects: their `values`, and how far by the
+        evidence the motor's parameters have `moved` and each run begins turned."""
+        given = current.given.with_effects([EFFECTS[e] for e in effects])
+        parameters, unknowns = given.problem.parameters, current.polished.refined.unknowns
+        names = current.given.problem.parameters.names
+        # a parameter that no run sees may seem to move by any factor
+        near = np.clip(moved, -1.0, 1.0)
+        before = dict(zip(names, np.asarray(unknowns.coordinates) + near, strict=True))
+        for effect, new in values.items():
+            self.begun.setdefault(effect, new)
+        coordinates = []
+        for name, log in zip(parameters.names, parameters.logarithmic, strict=True):
+            effect, _, field = name.partition(".")
+            if name in before and not (field and self._lost(current, name)):
+                coordinates.append(before[name])
+            else:
+                value = values.get(effect, self.begun.get(effect, {}))[field]
+                coordinates.append(np.log(max(value, 1e-300)) if log else value)
+        inside = np.clip(coordinates, parameters.lower, parameters.upper)
+        local = np.array(unknowns.local)
+        local[:, 3] += angles
+        start = Unknowns(jnp.asarray(inside), jnp.asarray(local))
+        return given, Refined(start, np.inf, (), False)
+
+    def _lost(self, model: Model, name: str) -> bool:
+        """Whether an effect's parameter has gone where no run sees it, so that nothing leads it back."""
+        column = model.given.problem.parameters.names.index(name)
+        seen = np.asarray(model.polished.evaluation.jacobian)[
+            model.given.problem.counted, ..., column
+        ]
+        return float(np.square(seen).sum()) < 1 / FLAT**2
+
+
+def _roughly(start: Start) -> Refined:
+    """A few steps of a refit in a thread, to which the precision does not carry over by itself."""
+    given, begun = start
+    with jax.enable_x64(True):
+        return polish(given.problem, begun, ROUGHLY).refined
+
+
+def _values(candidate: Candidate, coefficients: np.ndarray, dry: float, runs: int):
+    """An effect's parameters by the coefficients of its columns, and how far each run starts turned."""
+    angles = np.zeros(runs)
+    if not candidate.own_phase:
+        return candidate.build(coefficients, dry), angles
+    sizes = np.hypot(*coefficients.T)
+    phases = np.arctan2(coefficients[:, 1], coefficients[:, 0])
+    values = candidate.build(coefficients[0], dry)
+    assert values is not None and candidate.amplitude is not None
+    values = {**values, candidate.amplitude: float(np.median(sizes))}
+    angles[: len(phases)] = (phases - phases[0]) / values["periods"]
+    return values, angles
