@@ -227,9 +227,7 @@ def test_response_is_the_change_of_the_simulation(x64, name):
     for c in range(2):
         scale = np.abs(expected[:, c] * weight[:, c]).max()
         error = np.abs((found - expected)[:, c] * weight[:, c]).max()
-        # the column of a delay cuts the corners of the speed by straight lines between samples
-        share = 0.03 if name == "speed_sensor_delay" else 0.02
-        assert error <= share * scale + 1e-12, (name, c, error, scale)
+        assert error <= 0.02 * scale + 1e-12, (name, c, error, scale)
 
 
 # --------------------------------------------------------------------------------- whole cases

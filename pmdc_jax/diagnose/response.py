@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from ..effects import State
 from ..motor import Drive, Motor
 from ..simulate import Tape
+from ..simulate.shooting import outputs, reported
 from ..simulate.solver import Propagator, along_grids, held_step, pick_grid, steps_in_sample
 
 Signal = Float[Array, "samples blocks"]
@@ -59,10 +60,12 @@ def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
 @eqx.filter_jit
 def sensed(motor: Motor, tape: Tape, path: Path) -> Outputs:
     """By how much the sensors of `motor` report something else than the path."""
-    current, speed = motor.sensors(_states(motor, tape, path))
-    if (delay := motor.speed_delay()) is not None:
-        speed = _delayed(jnp.asarray(speed), delay, tape)
-    return jnp.stack([current - path.current, speed - path.speed], 1)
+    before, after = _states(motor, tape, path), _one_sample(motor, tape, path)
+    _, drive = _of_blocks(motor, tape)
+    value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T
+    seen = outputs(motor, drive, before, after, value, load)
+    late = reported(motor, tape, seen.transpose(2, 0, 1))
+    return late.transpose(2, 1, 0) - jnp.stack([path.current, path.speed], 1)
 
 
 @eqx.filter_jit
@@ -156,13 +159,3 @@ def _states(motor: Motor, tape: Tape, path: Path) -> State:
     nothing = jax.tree.map(lambda x: 0.0 * x[0], in_time[1])
     extra = jax.lax.scan(advance, nothing, in_time)[1]
     return start._replace(extra=jax.tree.map(lambda x: x.reshape(load.shape[::-1]).T, extra))
-
-
-def _delayed(speed: Signal, delay, tape: Tape) -> Signal:
-    """The speed as it was, by straight lines between samples."""
-    flat = speed.T.reshape(-1)
-    length, step = speed.shape[0], jnp.asarray(tape.sample_time)[tape.grid]
-    first = jnp.searchsorted(jnp.asarray(tape.run), tape.run) * length
-    here = jnp.arange(len(flat))
-    back = jnp.maximum(here - delay / jnp.repeat(step, length), jnp.repeat(first, length))
-    return jnp.interp(back, here, flat).reshape(speed.shape[::-1]).T

@@ -85,7 +85,7 @@ def free_run(
     still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
     joined, starts, last = _join(prepared, still, tape, own, begins)
     seen = last.seen + jnp.einsum("sncb,bn->scb", last.d_seen[:, -states:], joined - starts)
-    return _reported(motor, tape, seen.transpose(2, 1, 0))
+    return reported(motor, tape, seen.transpose(2, 1, 0))
 
 
 @eqx.filter_jit
@@ -139,7 +139,7 @@ def sensitivities(
     if motor.speed_delay() is None:
         return seen.transpose(2, 1, 0), d_seen
     seen, d_seen = _along_columns(
-        lambda motor, seen: _reported(motor, tape, seen),
+        lambda motor, seen: reported(motor, tape, seen),
         (motor, seen.transpose(2, 1, 0)),
         (d_motor, jnp.moveaxis(d_seen, -1, 0)),
     )
@@ -246,7 +246,7 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
         def look_and_step(motor, along, state, load):
             after = held_step(motor, along, drive, state, value[k], load, steps)
             after = _turned(state, after, turn[k])
-            return after, _outputs(motor, drive, state, after, value[k], load)
+            return after, outputs(motor, drive, state, after, value[k], load)
 
         (state, seen), (d_state, d_seen) = jax.vmap(
             lambda *tangents: jax.jvp(look_and_step, (motor, along, state, load[k]), tangents),
@@ -261,8 +261,8 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
         .set(jnp.eye(states)[:, :, None])
     )
     d_state = jax.vmap(lambda column: _unpack(motor, column))(identity)
-    outputs = 2 if motor.speed_delay() is None else 4
-    seen = (jnp.zeros((outputs, len(starts))), jnp.zeros((columns, outputs, len(starts))))
+    reports = 2 if motor.speed_delay() is None else 4
+    seen = (jnp.zeros((reports, len(starts))), jnp.zeros((columns, reports, len(starts))))
     saveat = diffrax.SaveAt(
         subs=[
             diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: y.seen),
@@ -338,7 +338,7 @@ def _stitch_tangents(
     return jax.lax.scan(follow, nothing, blocks)[1]
 
 
-def _outputs(motor: Motor, drive: Drive, before: State, after: State, value, load):
+def outputs(motor: Motor, drive: Drive, before: State, after: State, value, load):
     """Reported current and speed, and for a delay the slope of the latter at both ends of the sample."""
     current, speed = motor.sensors(before)
     if motor.speed_delay() is None:
@@ -351,7 +351,7 @@ def _outputs(motor: Motor, drive: Drive, before: State, after: State, value, loa
     return jnp.stack([current, speed, slope(before), slope(after)])
 
 
-def _reported(motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]):
+def reported(motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]):
     """Current and speed, the latter as late as the motor's sensor reports it.
 
     Between samples by the cubic of Hermite: speeds and slopes at both ends of the sample, within which nothing
