@@ -12,7 +12,7 @@ from ..effects import EFFECTS
 from ..identify.pipeline import Prepared
 from ..identify.refine import Polished
 from .candidates import Candidate
-from .kinship import are_rivals, is_within
+from .kinship import CONTAINS, are_rivals, is_within
 from .library import Library
 from .model import Model, ended, rows_of, sharpened, squares_of
 from .noise import Whitener, whitener
@@ -26,11 +26,12 @@ ALARM = 0.01
 MOST, SHORTLIST = 3, 3
 # ... those whose evidence to first order is at least this share of the best one's
 COMPARABLE = 0.6
-# What effects leave of the squares that they explain, by formulas that are not quite nature's: this little asks for
-# no other effect; up to so much may be all due to them, and more if it is a curve over an effect's own variable
-REMAINDER, FORMULA, OWN_FORMULA = 0.02, 0.1, 0.5
-# An effect is added if it takes away this share of what the clearest signal would
-MUCH_OF_IT = 0.3
+# What effects may leave of the squares that they explain, by formulas that are not quite nature's: so much, and more
+# if it is a curve over an effect's own variable
+FORMULA, OWN_FORMULA = 0.1, 0.5
+# An effect is added if it takes away this share of what the clearest signal would, and the larger one where a formula
+# may be all that is left to be desired
+MUCH_OF_IT, MOST_OF_IT = 0.3, 0.7
 # Effects that no column shows, with the simpler ones in whose place they are tried if those leave something
 HARDER = [("shaft_compliance", "gear_backlash")]
 # Rivals whose criterion is nearer than this, and this share of what neither explains, are not told apart
@@ -66,10 +67,9 @@ class Seen(NamedTuple):
 
     def asks_for_more(self) -> bool:
         """Whether more is missing than the formulas of the model's effects leave to be desired."""
-        if self.left >= ALARM or self.unexplained < REMAINDER:
-            return False
         best = max((s.gain for s in self.of_candidates), default=0.0)
-        return bool(best > MUCH_OF_IT * self.clearest.gain)
+        share = MUCH_OF_IT if self.unexplained > FORMULA else MOST_OF_IT
+        return bool(self.left < ALARM and best > share * self.clearest.gain)
 
     def is_formula(self, model: Model) -> bool:
         """Whether what is left may well be that of the model's effects by formulas of nature's own."""
@@ -186,7 +186,8 @@ class Namer:
     def _shortlist(self, current: Model, found: Seen) -> list[Signal]:
         """The most significant shape of each of the best few effects.
 
-        None, if that is an effect which is there already: its own formula is what is left to be desired.
+        None, if that is an effect which is there already: its own formula is what is left to be desired. One that
+        contains an effect which is there, and explains most of what is left, needs no other beside it.
         """
         best: dict[str, Signal] = {}
         for s in found.of_candidates:
@@ -196,6 +197,10 @@ class Namer:
         ranked = [s for s in best.values() if s.log_p < clear]
         if not ranked or next(iter(best)) in current.effects:
             return []
+        richer = [s for e, s in best.items() if CONTAINS.get(e, set()) & set(current.effects)]
+        for s in richer:
+            if s.gain > MOST_OF_IT * found.clearest.gain:
+                return [s]
         near = [s for s in ranked if s.log_p < COMPARABLE * ranked[0].log_p]
         return [s for e, s in best.items() if s in near and e not in current.effects][:SHORTLIST]
 
