@@ -10,7 +10,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from io import TextIOWrapper
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -18,6 +17,31 @@ import typer
 
 from .compilation_cache import keep_compiled
 from .errors import InputError
+from .options import (
+    Column,
+    Controller,
+    ControllerFile,
+    Effects,
+    Experiment,
+    Folder,
+    HeaderFile,
+    Holdout,
+    Input,
+    Json,
+    Known,
+    MotorFile,
+    Output,
+    Report,
+    Runs,
+    Save,
+    SaveController,
+    Search,
+    Seed,
+    Tie,
+    Unloaded,
+    fit_options,
+    pairs,
+)
 
 if TYPE_CHECKING:
     from .identify.identification import Identification
@@ -35,80 +59,6 @@ app = typer.Typer(
     rich_markup_mode=None,  # plain help is shorter and comes in half the time
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-
-# the options, in the order they are first used
-Runs = Annotated[
-    list[Path],
-    typer.Argument(metavar="RUN", help="Recordings to fit, one run a file: CSV, Parquet or MAT."),
-]
-Holdout = Annotated[
-    list[Path],
-    typer.Option(metavar="RUN", help="A run kept out of the fit to test it. Repeatable."),
-]
-Save = Annotated[
-    Path | None, typer.Option(metavar="MOTOR.json", help="Write the motor, for pmdc simulate.")
-]
-Json = Annotated[
-    str | None,
-    typer.Option(metavar="OUT", help="Write the result as JSON; - is standard output."),
-]
-Report = Annotated[
-    Path | None, typer.Option(metavar="OUT.html", help="Write a report with pictures.")
-]
-Experiment = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="OUT.csv", help="Write the voltage to record next, where these runs cannot tell."
-    ),
-]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the search.")]
-Column = Annotated[
-    list[str],
-    typer.Option(
-        metavar="QUANTITY=HEADER:UNIT",
-        help="What a column holds, where its header does not say. Repeatable.",
-    ),
-]
-Tie = Annotated[
-    list[str],
-    typer.Option(metavar="A=B", help="Two parameters that are one, such as Kt=Kb. Repeatable."),
-]
-Known = Annotated[
-    list[str],
-    typer.Option(metavar="NAME=VALUE", help="A parameter known from elsewhere, in SI. Repeatable."),
-]
-Unloaded = Annotated[
-    bool, typer.Option("--unloaded", help="Runs without a load column have no load at all.")
-]
-Effects = Annotated[
-    list[str],
-    typer.Option(
-        metavar="NAME", help="An effect to identify too, such as coulomb_friction. Repeatable."
-    ),
-]
-Search = Annotated[str, typer.Option(metavar="NAME", help="The global search.")]
-MotorFile = Annotated[
-    Path, typer.Argument(metavar="MOTOR.json", help="Written by pmdc identify --save.")
-]
-Input = Annotated[
-    Path, typer.Option("--input", metavar="RUN", help="Recording that drives the motor.")
-]
-Output = Annotated[
-    Path, typer.Option("--out", metavar="RUN_OUT", help="Where it goes: .csv or .parquet.")
-]
-Controller = Annotated[
-    str,
-    typer.Option(metavar="NAME", help="pi, pid, state-feedback or state-feedback-integral."),
-]
-SaveController = Annotated[
-    Path | None,
-    typer.Option(metavar="CONTROLLER.json", help="Write the controller, for pmdc export."),
-]
-ControllerFile = Annotated[
-    Path, typer.Argument(metavar="CONTROLLER.json", help="Written by pmdc tune --save.")
-]
-HeaderFile = Annotated[Path, typer.Option("--c", metavar="CONTROLLER.h", help="Where the C goes.")]
-Folder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")]
 
 
 @app.callback()
@@ -142,8 +92,8 @@ def identify(
     from .report.files import check_outputs
 
     check_outputs({"--save": save, "--json": json, "--report": report}, [*runs, *holdout])
-    columns = dict(_pairs("--column", column))
-    options = _options(tie, known, unloaded, search, seed) | {"effects": tuple(effect)}
+    columns = dict(pairs("--column", column))
+    options = fit_options(tie, known, unloaded, search, seed) | {"effects": tuple(effect)}
     from .identify import identify
 
     identification = _work_on(identify, runs, holdout, columns, options)
@@ -185,8 +135,8 @@ def diagnose(
 
     outputs = {"--save": save, "--json": json, "--report": report, "--experiment": experiment}
     check_outputs(outputs, [*runs, *holdout])
-    columns = dict(_pairs("--column", column))
-    options = _options(tie, known, unloaded, search, seed)
+    columns = dict(pairs("--column", column))
+    options = fit_options(tie, known, unloaded, search, seed)
     from .diagnose import diagnose
 
     diagnosis = _work_on(diagnose, runs, holdout, columns, options)
@@ -215,7 +165,7 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
     from .report.files import check_outputs
 
     check_outputs({"--out": out}, [motor, input])
-    columns = dict(_pairs("--column", column))
+    columns = dict(pairs("--column", column))
     from .motor_file import load_motor
     from .recording import read_recording, write_recording
     from .simulate import simulate
@@ -374,19 +324,6 @@ def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
         typer.echo(out / name)
 
 
-def _options(
-    tie: list[str], known: list[str], unloaded: bool, search: str, seed: int
-) -> dict[str, Any]:
-    """What identification and diagnosis are told beside the runs."""
-    return {
-        "tie": tuple(_pairs("--tie", tie)),
-        "known": {name: _number("--known", name, text) for name, text in _pairs("--known", known)},
-        "unloaded": unloaded,
-        "search": search,
-        "seed": seed,
-    }
-
-
 def _work_on(
     work: Callable[..., Result],
     runs: list[Path],
@@ -465,31 +402,3 @@ def _usage(error: typer.TyperException) -> str:
     context = getattr(error, "ctx", None)
     command = context.command_path if context else "pmdc"
     return f"{error.format_message().rstrip('.')}. See {command} --help"
-
-
-def _pairs(option: str, texts: list[str]) -> list[tuple[str, str]]:
-    return [_pair(option, text) for text in texts]
-
-
-def _pair(option: str, text: str) -> tuple[str, str]:
-    """ "Kt=Kb" as ("Kt", "Kb")."""
-    left, equals, right = (part.strip() for part in text.partition("="))
-    if not (left and equals and right):
-        examples = {"--column": "speed=rpm_meas:rpm", "--tie": "Kt=Kb", "--known": "R=0.157"}
-        raise InputError(
-            f"{option} {text}",
-            "this is not a pair",
-            f"Write for example {option} {examples[option]}",
-        )
-    return left, right
-
-
-def _number(option: str, name: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not isfinite(value):
-        mend = f"Write the value in SI units, for example {option} {name}=0.157"
-        raise InputError(f"{option} {name}={text}", f"'{text}' is not a number", mend)
-    return value

@@ -181,7 +181,7 @@ def regress(
     scale = np.sqrt(np.mean(X**2, axis=0))
     scale[scale <= 1e-12 * largest] = np.inf  # a constant column has no effect
     U, s, Vt = np.linalg.svd(X / scale, full_matrices=False)
-    s = np.maximum(s, 1e-8 * s[0] + 1e-300)
+    s = np.maximum(s, 1e-8 * s[0] + 1e-150)  # whose square is a number still
     coefficients = Vt.T @ (U.T @ y / s)
     residual = y - X / scale @ coefficients
     # rms of what only this regressor can explain

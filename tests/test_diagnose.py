@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from attrs import evolve
 from scipy import stats
 
 from benchmarks import virtual_bench as vb
@@ -17,11 +18,16 @@ from pmdc_jax import Recording
 from pmdc_jax.diagnose import diagnose
 from pmdc_jax.diagnose.candidates import TABLE, Scales
 from pmdc_jax.diagnose.evidence import Block, products
+from pmdc_jax.diagnose.kinship import are_rivals, is_within
+from pmdc_jax.diagnose.library import Library
+from pmdc_jax.diagnose.model import model_of
 from pmdc_jax.diagnose.noise import Series, whitener
 from pmdc_jax.diagnose.periodic import common_line, spectrum
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
 from pmdc_jax.diagnose.screen import log_chance
 from pmdc_jax.effects import EFFECTS
+from pmdc_jax.identify.prepare import prepare
+from pmdc_jax.identify.refine import Refined, Unknowns, polish
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.simulate import Tape, free_run
 
@@ -228,6 +234,47 @@ def test_response_is_the_change_of_the_simulation(x64, name):
         scale = np.abs(expected[:, c] * weight[:, c]).max()
         error = np.abs((found - expected)[:, c] * weight[:, c]).max()
         assert error <= 0.02 * scale + 1e-12, (name, c, error, scale)
+
+
+# --------------------------------------------------------------------------------- sets of effects
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "rivals"),
+    [
+        ("brush_voltage_drop", "input_dead_zone", True),
+        ("coulomb_friction", "quadratic_drag", True),
+        ("coulomb_friction", "stribeck_friction", False),  # the one contains the other
+        ("coulomb_friction constant_load", "asymmetric_friction", False),  # one torque in motion
+        ("coulomb_friction", "coulomb_friction quadratic_drag", False),  # a part
+        ("coulomb_friction quadratic_drag", "stribeck_friction quadratic_drag", False),
+        ("coulomb_friction quadratic_drag", "coulomb_friction cogging_torque", True),
+        ("speed_sensor_lag", "speed_sensor_delay", True),
+    ],
+)
+def test_rivals_differ_in_more_than_form(one, other, rivals):
+    a, b = set(one.split()), set(other.split())
+    assert are_rivals(a, b) == are_rivals(b, a) == rivals
+
+
+def test_a_simpler_form_is_within_a_richer_one():
+    drag = {"quadratic_drag"}
+    assert is_within({"coulomb_friction"} | drag, {"stribeck_friction"} | drag)
+    assert not is_within({"stribeck_friction"} | drag, {"coulomb_friction"} | drag)
+    assert not is_within({"coulomb_friction"}, {"stribeck_friction"} | drag)
+
+
+def test_sizes_in_amperes_are_not_tried_where_no_current_was_measured(x64):
+    """Voltage and speed alone say nothing of what a current does."""
+    recordings = recorded(vb.BenchMotor(**PAPER), 7, NOISE)
+    silent = [evolve(run, current=None) for run in recordings]
+    given = prepare(silent, [], unloaded=True)
+    coordinates = jnp.log(jnp.asarray([PAPER[n] for n in PARAMETERS]))
+    start = Unknowns(coordinates, jnp.zeros((len(silent), 4)))
+    base = model_of((), given, polish(given.problem, Refined(start, np.inf, (), False), steps=0))
+    tried = {candidate.effect for candidate in Library(base).candidates}
+    assert {"coulomb_friction", "speed_sensor_delay"} <= tried
+    assert not any(EFFECTS[name].needs_current for name in tried)
 
 
 # --------------------------------------------------------------------------------- whole cases

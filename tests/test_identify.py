@@ -22,9 +22,9 @@ from pmdc_jax.identify.binary_ga import BinaryGA
 from pmdc_jax.identify.identification import Identification
 from pmdc_jax.identify.noise import quantum, white_noise
 from pmdc_jax.identify.parameters import Parameters
-from pmdc_jax.identify.pipeline import _distinct
 from pmdc_jax.identify.refine import Problem, Unknowns, evaluate, polish, refine
 from pmdc_jax.identify.search import METHODS, Found, search
+from pmdc_jax.identify.solve import _distinct
 from pmdc_jax.identify.uncertainty import information, long_run_variance
 from pmdc_jax.identify.whitening import Whitening
 from pmdc_jax.motor import PARAMETERS

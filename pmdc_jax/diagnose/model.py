@@ -8,8 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..effects import EFFECTS, CoulombFriction
-from ..identify.pipeline import Prepared, settle
+from ..identify.prepare import Prepared
 from ..identify.refine import Polished, Refined, polish
+from ..identify.solve import settle
+from ..identify.turning import turned
 from ..identify.whitening import Whitening
 from ..motor import Motor
 from ..simulate import Tape
@@ -66,7 +68,14 @@ def settled(effects: tuple[str, ...], given: Prepared, start: Refined, white: Wh
     # no step: what it leaves as it is
     plain = polish(given.problem, ended.refined, steps=0)
     refined = ended.refined._replace(fitness=plain.refined.fitness)
-    return Model(effects, given, plain._replace(refined=refined))
+    return model_of(effects, given, plain._replace(refined=refined))
+
+
+def model_of(effects: tuple[str, ...], given: Prepared, polished: Polished) -> Model:
+    """A fitted model, its rotor turned as the fit says."""
+    if not given.problem.angular:  # or else it was fitted so
+        given = given._replace(problem=turned(given.problem, polished.evaluation.seen))
+    return Model(effects, given, polished)
 
 
 def ended(model: Model, white: Whitener) -> tuple[Prepared, Polished]:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from ..effects import EFFECTS
-from ..identify.pipeline import Prepared
+from ..identify.prepare import Prepared
 from ..identify.refine import Polished
 from .candidates import Candidate
 from .kinship import CONTAINS, are_rivals, is_within

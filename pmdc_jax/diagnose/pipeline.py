@@ -12,7 +12,9 @@ from scipy import stats
 
 from ..effects import EFFECTS
 from ..identify.identification import Identification, Role
-from ..identify.pipeline import judge, prepare, solve
+from ..identify.judge import judge
+from ..identify.prepare import prepare
+from ..identify.solve import solve
 from ..precision import double_precision
 from ..recording import Recording
 from .diagnosis import (
@@ -26,7 +28,7 @@ from .diagnosis import (
 )
 from .evidence import Block
 from .experiment import next_experiment
-from .model import Model
+from .model import model_of
 from .naming import ALARM, Namer, Naming
 from .screen import Screen, log_chance
 
@@ -65,7 +67,7 @@ def diagnose(
     given, solved = solve(given, search, seed, progress)
     identified = time.perf_counter()
     report("gathering evidence", solved.polished.refined.fitness)
-    naming = Namer(Model((), given, solved.polished), report).name()
+    naming = Namer(model_of((), given, solved.polished), report).name()
     named = time.perf_counter()
     report("judging the uncertainty", naming.chosen.polished.refined.fitness)
     base = judge(given, solved)

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..effects import EFFECTS
-from ..identify.pipeline import POOR, Prepared
+from ..identify.prepare import Prepared
 from ..identify.refine import Refined, Unknowns, polish
+from ..identify.solve import POOR
 from ..identify.uncertainty import FLAT
 from .candidates import STARTS, Candidate, Values
 from .kinship import CONTAINS

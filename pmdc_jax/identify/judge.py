@@ -1,0 +1,209 @@
+"""What a fit tells of every parameter and of every run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from statistics import NormalDist
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ..motor import PARAMETERS, Motor
+from ..recording import Recording
+from ..simulate import Tape
+from .identifiability import explain
+from .identification import Estimate, Identification, Role, RunFit, Status
+from .noise import white_noise
+from .parameters import Parameters, unit_of
+from .prepare import Prepared
+from .profile import QUADRATIC, profile_interval
+from .refine import Polished, Problem, Refined, fit_own, polish
+from .solve import SAME, Solved
+from .uncertainty import FLAT, Information, information
+
+REACH = NormalDist().inv_cdf(0.975)  # of a 95 % interval, in standard errors
+TIDYINGS = 3
+
+
+def judge(given: Prepared, solved: Solved) -> Identification:
+    """What a fit tells of every parameter and of every run."""
+    polished = solved.polished
+    problem, training = given.problem, given.training
+    parameters = problem.parameters
+    free = np.array([k not in polished.refined.at_bound for k in range(len(parameters.names))])
+    evaluation = polished.evaluation
+    info = information(
+        evaluation.residuals, evaluation.jacobian, problem.tape.run, free, len(training)
+    )
+    chosen = _tidy(problem, polished, info)
+    best = chosen.refined
+    problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
+
+    def interval(k: int, spread: float, centre: float) -> tuple[float, float]:
+        if not parameters.logarithmic[k] or spread < QUADRATIC:
+            return centre - REACH * spread, centre + REACH * spread
+        return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], REACH)
+
+    unknowns, ended = fit_own(problem, best.unknowns)
+    fit = _fits(
+        given.runs, given.roles, problem.tape, np.asarray(ended.seen), np.asarray(unknowns.local)
+    )
+    return Identification(
+        motor=_plain(parameters(best.unknowns.coordinates)),
+        parameters=_estimates(parameters, best, info, given.untouched, given.known, interval),
+        unidentified_directions=explain(info.unseen, parameters, training),
+        fit=fit,
+        noise=_noise_of(fit),
+        converged=best.converged,
+        seed=solved.seed,
+        seconds=solved.seconds,
+        search=solved.search,
+        findings=given.findings,
+        covariance=info.covariance,
+        covariance_names=parameters.names,
+        messages=_messages(solved, best, chosen is not polished),
+    )
+
+
+def _tidy(problem: Problem, polished: Polished, info: Information) -> Polished:
+    """Along an unseen direction in which Kt may be anything, choose Kt = Kb, equals in SI.
+
+    The direction is straight only nearby, so whatever else is free is refined again; a fit that is worse
+    then is no choice.
+    """
+    names, best = problem.parameters.names, polished.refined
+    if "Kt" not in names or "Kb" not in names:
+        return polished
+    k, b = names.index("Kt"), names.index("Kb")
+    along = [d for d in info.unseen if abs(d[k]) > 0.1 and abs(d[b]) < 1e-2]
+    if not along:
+        return polished
+    held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
+    tidied = polished
+    for _ in range(TIDYINGS):  # Kb moves a little as well
+        coordinates = np.array(tidied.refined.unknowns.coordinates)
+        coordinates += along[0] * (coordinates[b] - coordinates[k]) / along[0][k]
+        coordinates[k] = coordinates[b]
+        unknowns = tidied.refined.unknowns._replace(coordinates=jnp.asarray(coordinates))
+        tidied = polish(held, tidied.refined._replace(unknowns=unknowns))
+    return tidied if tidied.refined.fitness <= best.fitness * (1 + SAME) else polished
+
+
+def _plain(motor: Motor) -> Motor:
+    return eqx.tree_at(
+        lambda m: [getattr(m, name) for name in PARAMETERS],
+        motor,
+        [np.asarray(getattr(motor, name)) for name in PARAMETERS],
+    )
+
+
+def _estimates(
+    parameters: Parameters,
+    best: Refined,
+    info: Information,
+    untouched: Mapping[str, float],
+    known: Mapping[str, float],
+    interval: Callable[[int, float, float], tuple[float, float]],
+) -> dict[str, Estimate]:
+    """What to say of each parameter; `interval` gives the 95 % interval of a coordinate from its spread."""
+    coordinates = np.asarray(best.unknowns.coordinates)
+    ties = dict(parameters.ties)
+    names = [*PARAMETERS, *(n for n in parameters.names if n not in PARAMETERS)]
+    estimates = {}
+    for name in names:
+        unit, source = unit_of(name), ties.get(name, name)
+        if source in untouched and source not in known:
+            estimates[name] = Estimate(None, None, None, unit, "not_identifiable")
+            continue
+        value = parameters.value(name, coordinates)
+        if source in known:
+            estimates[name] = Estimate(value, 0.0, (value, value), unit, "known")
+            continue
+        k = parameters.names.index(source)
+        status = _status(k, best, info, name in ties)
+        if status in ("at_bound", "not_identifiable"):
+            estimates[name] = Estimate(value, None, None, unit, status)
+            continue
+        spread = float(np.sqrt(info.covariance[k, k]))
+        low, high = interval(k, spread, coordinates[k])
+        if parameters.logarithmic[k]:
+            stderr, low, high = value * spread, np.exp(low), np.exp(high)
+        else:
+            stderr = spread
+        ends = (float(low), float(high))
+        estimates[name] = Estimate(value, stderr, ends, unit, status)
+    return estimates
+
+
+def _status(k: int, best: Refined, info: Information, tied: bool) -> Status:
+    if k in best.at_bound:
+        return "at_bound"
+    unseen = any(abs(direction[k]) > 0.05 for direction in info.unseen)
+    if unseen or np.sqrt(info.covariance[k, k]) > FLAT:
+        return "not_identifiable"
+    return "tied" if tied else "identified"
+
+
+def _fits(
+    even: Sequence[Recording],
+    roles: Sequence[Role],
+    tape: Tape,
+    seen: np.ndarray,
+    local: np.ndarray,
+) -> dict[str, RunFit]:
+    fits = {}
+    for index, (run, role) in enumerate(zip(even, roles, strict=True)):
+        current, speed = (tape.samples_of(index, seen[:, c], len(run.time)) for c in range(2))
+        driven = run.drive == "voltage"
+        fits[run.name] = RunFit(
+            role=role,
+            current_rmse=_rmse(run.current, current) if driven else None,
+            speed_rmse=_rmse(run.speed, speed),
+            current_fit_percent=_fit_percent(run.current, current) if driven else None,
+            speed_fit_percent=_fit_percent(run.speed, speed),
+            load_offset=float(local[index, 2]) if tape.load_unknown[index] else None,
+            time=run.time,
+            voltage=run.voltage,
+            current=run.current,
+            current_simulated=current if driven else None,
+            speed=run.speed,
+            speed_simulated=speed,
+            load=run.load,
+        )
+    return fits
+
+
+def _rmse(measured: np.ndarray | None, simulated: np.ndarray) -> float | None:
+    return None if measured is None else float(np.sqrt(np.nanmean(np.square(measured - simulated))))
+
+
+def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | None:
+    if measured is None:
+        return None
+    spread = np.sqrt(np.nansum(np.square(measured - np.nanmean(measured))))
+    error = np.sqrt(np.nansum(np.square(measured - simulated)))
+    return float(100 * (1 - error / spread)) if spread > 0 else None
+
+
+def _noise_of(fit: Mapping[str, RunFit]) -> dict[str, float | None]:
+    def errors(name: str) -> list[np.ndarray]:
+        runs = [f for f in fit.values() if f.role == "train"]
+        pairs = [(getattr(f, name), getattr(f, f"{name}_simulated")) for f in runs]
+        return [m - s for m, s in pairs if m is not None and s is not None]
+
+    return {
+        "current_A": white_noise(errors("current")),
+        "speed_rad_s": white_noise(errors("speed")),
+    }
+
+
+def _messages(solved: Solved, best: Refined, tied: bool) -> tuple[str, ...]:
+    messages = []
+    if solved.interrupted:
+        messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
+    if not best.converged:
+        messages.append("the refinement did not converge: the gradient is not zero at its end")
+    if tied:
+        messages.append("Kt was set equal to Kb, as they are in SI, and J and f go with it")
+    return tuple(messages)

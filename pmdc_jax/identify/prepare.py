@@ -1,0 +1,124 @@
+"""Recordings checked and laid out as the least-squares problem that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..check import check
+from ..effects import AbstractEffect
+from ..errors import InputError
+from ..motor import PARAMETERS
+from ..recording import Finding, Recording
+from ..simulate import Tape, uniform
+from .bounds import search_bounds
+from .identification import Role
+from .noise import white_noise
+from .parameters import Parameters, check_names
+from .refine import Problem
+
+
+class Prepared(NamedTuple):
+    """Checked recordings, training runs first, and the least-squares problem they make."""
+
+    runs: list[Recording]  # evenly sampled
+    roles: list[Role]
+    findings: tuple[Finding, ...]
+    untouched: Mapping[str, float]
+    known: Mapping[str, float]
+    ties: tuple[tuple[str, str], ...]
+    problem: Problem
+
+    @property
+    def training(self) -> list[Recording]:
+        """The runs that are fitted."""
+        return [run for run, role in zip(self.runs, self.roles, strict=True) if role == "train"]
+
+    def with_effects(self, effects: Sequence[type[AbstractEffect]]) -> Prepared:
+        """The same runs for a motor with other effects."""
+        parameters = Parameters.of(
+            search_bounds(self.training), effects, {**self.untouched, **self.known}, self.ties
+        )
+        problem = Problem(
+            parameters,
+            self.problem.tape,
+            self.problem.noise,
+            free=jnp.ones(len(parameters.names), bool),
+            counts=self.problem.counts,
+        )
+        return self._replace(problem=problem)
+
+
+def prepare(
+    recordings: Sequence[Recording],
+    holdout: Sequence[Recording],
+    *,
+    tie: Sequence[tuple[str, str]] = (),
+    known: Mapping[str, float] | None = None,
+    unloaded: bool = False,
+    effects: Sequence[type[AbstractEffect]] = (),
+) -> Prepared:
+    """Check the recordings and lay them out; raises `InputError` where they cannot give an answer."""
+    _refuse(recordings, holdout, tie, known)
+    findings = check([*recordings, *holdout])
+    _refuse_errors(findings)
+    runs = [uniform(r) for r in (*recordings, *holdout)]
+    training = runs[: len(recordings)]
+    noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in ("current", "speed")])
+    untouched = _untouched(training)
+    parameters = Parameters.of(search_bounds(training), effects, untouched | dict(known or {}), tie)
+    # hold-outs lie on the tape too, but do not count: only what is their own is fitted to them
+    problem = Problem(
+        parameters,
+        jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True)),
+        jnp.asarray(noise),
+        free=jnp.ones(len(parameters.names), bool),
+        counts=jnp.arange(len(runs)) < len(recordings),
+    )
+    roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
+    return Prepared(runs, roles, findings, untouched, dict(known or {}), tuple(tie), problem)
+
+
+def _refuse(recordings, holdout, tie, known) -> None:
+    if not recordings:
+        raise InputError("RUN", "there is no recording to fit", "Name at least one")
+    names = [r.name for r in (*recordings, *holdout)]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(name, "two runs have this name", "Rename one, or name it only once")
+    check_names("--tie", [name for pair in tie for name in pair])
+    check_names("--known", list(known or {}))
+    targets = [target for target, _ in tie]
+    for target, source in tie:
+        if targets.count(target) > 1:
+            raise InputError("--tie", f"{target} is tied twice", "Drop one")
+        if target == source or target in (known or {}) or target in {b for _, b in tie}:
+            raise InputError(
+                "--tie", f"{target}={source} ties in a circle or a known value", "Drop one"
+            )
+    for name, value in (known or {}).items():
+        if not 0 < value < np.inf:
+            raise InputError("--known", f"{name}={value} is not positive", "Give a value in SI")
+
+
+def _refuse_errors(findings: Sequence[Finding]) -> None:
+    for finding in findings:
+        if finding.severity == "error":
+            where = ", ".join(filter(None, (finding.run, finding.column, finding.where)))
+            raise InputError(where, finding.what, finding.mend)
+
+
+def _signals(recordings: Sequence[Recording], name: str) -> list[np.ndarray]:
+    return [signal for r in recordings if (signal := getattr(r, name)) is not None]
+
+
+def _untouched(recordings: Sequence[Recording]) -> dict[str, float]:
+    """Parameters that no run has anything to do with, at a harmless value."""
+    drives = {r.drive for r in recordings}
+    touched = {"torque": "J f", "current": "Kt J f", "voltage": "R L Kb Kt J f"}
+    known = {name for drive in drives for name in touched[drive].split()}
+    return {name: 1.0 for name in PARAMETERS if name not in known}

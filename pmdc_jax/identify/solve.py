@@ -1,0 +1,158 @@
+"""The best fit: search the bounds, refine the best candidates, polish."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..simulate import Tape
+from .identification import Search
+from .parameters import Parameters
+from .prepare import Prepared
+from .refine import Polished, Problem, Refined, Unknowns, polish, refine
+from .search import Found
+from .search import search as global_search
+from .turning import turned
+
+if TYPE_CHECKING:
+    from ..report.terminal import ReportProgress
+
+STARTS = 4
+# Two refinements found the same optimum if their fitness agrees to this share.
+SAME = 1e-4
+# A fit worse than this many times the noise asks for another search, up to so many.
+POOR = 1.5
+SEARCHES = 5
+TURNINGS = 3
+# Starts nearer to each other than this, in natural logarithms, are one.
+DISTINCT = 0.3
+
+
+class Solved(NamedTuple):
+    """The best fit that a search and its refinements found, and how it was found."""
+
+    polished: Polished
+    search: Search
+    seed: int
+    interrupted: bool
+    seconds: Mapping[str, float]
+
+
+def solve(
+    given: Prepared, search: str, seed: int, progress: ReportProgress | None = None
+) -> tuple[Prepared, Solved]:
+    """Search the bounds, refine the best candidates; again, from another seed, while the fit is poor.
+
+    **Returns**: the problem with the rotor turned as the fit says, and the fit.
+    """
+    began = time.perf_counter()
+    report = progress or (lambda *args, **kwargs: None)
+    problem, searching = given.problem, Tape.from_recordings(given.training)
+    noise = np.asarray(problem.noise)
+
+    def look(seed: int) -> Found:
+        return global_search(problem.parameters, searching, noise, search, seed, progress=progress)
+
+    middle = (problem.parameters.lower + problem.parameters.upper) / 2
+    with ThreadPoolExecutor(1) as beside:
+        # a refinement that gives up at once: it is compiled on another core while the search runs
+        compiled = beside.submit(_refine, problem, _start(problem.tape, middle), tolerance=1e3)
+        found = look(seed)
+        searched = time.perf_counter()
+        report("refining the best candidates", float(found.best[-1]))
+        compiled.result()
+    ends = _refine_all(problem, found)
+    for attempt in range(1, SEARCHES):
+        if found.interrupted or _agreed(ends, problem.outputs):
+            break
+        before, found = found, look(seed + attempt)
+        found = found._replace(evaluations=before.evaluations + found.evaluations)
+        ends = sorted([*ends, *_refine_all(problem, found)], key=_fitness)
+    given, polished = settle(given, ends[0])
+    seconds = {"search": searched - began, "refine": time.perf_counter() - searched}
+    record = _search_record(search, found, ends)
+    return given, Solved(polished, record, seed, found.interrupted, seconds)
+
+
+def settle(given: Prepared, end: Refined) -> tuple[Prepared, Polished]:
+    """Polish; again, as long as it helps, where a torque depends on how the better motor turns."""
+    polished = polish(given.problem, end)
+    for _ in range(TURNINGS if given.problem.angular else 0):
+        again = given._replace(problem=turned(given.problem, polished.evaluation.seen))
+        better = polish(again.problem, polished.refined)
+        if not better.refined.fitness < polished.refined.fitness:
+            break
+        given, polished = again, better
+    return given, polished
+
+
+def _start(tape: Tape, coordinates: jax.Array | np.ndarray) -> Unknowns:
+    local = np.column_stack([tape.initial, np.zeros(tape.runs), tape.angle])
+    return Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
+
+
+def _distinct(found: Found, parameters: Parameters) -> list[np.ndarray]:
+    """The best few candidates that are not nearly the same, and the best once more with a middling L.
+
+    Where L is too small to matter the misfit is flat, and nothing leads back from there.
+    """
+    kept: list[np.ndarray] = []
+    if "L" in parameters.names:
+        L = parameters.names.index("L")
+        kept.append(np.array(found.candidates[0]))
+        kept[0][L] = (parameters.lower[L] + parameters.upper[L]) / 2
+    for candidate in found.candidates:
+        if all(np.max(np.abs(candidate - other)) > DISTINCT for other in kept):
+            kept.append(candidate)
+        if len(kept) == STARTS:
+            break
+    return kept
+
+
+def _refine(problem: Problem, start: Unknowns, **options: float) -> Refined:
+    """Refine in a thread, to which the precision does not carry over by itself."""
+    with jax.enable_x64(True):
+        return refine(problem, start, **options)
+
+
+def _refine_all(problem: Problem, found: Found) -> list[Refined]:
+    """Refine the best distinct candidates of a search, one a core at a time; the best first."""
+    starts = [_start(problem.tape, candidate) for candidate in _distinct(found, problem.parameters)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return sorted(pool.map(lambda start: _refine(problem, start), starts), key=_fitness)
+
+
+def _fitness(end: Refined) -> float:
+    return end.fitness
+
+
+def _agreed(ends: Sequence[Refined], outputs: int) -> bool:
+    """Whether several starts ended in the best optimum, and it is as good as the noise or was found often.
+
+    A misfit may be the model's, or an optimum of the search's own making: only another search can tell.
+    """
+    needed = 2 if ends[0].fitness < POOR * outputs else STARTS + 1
+    return _times_found(ends) >= needed
+
+
+def _times_found(ends: Sequence[Refined]) -> int:
+    fitness = np.array([end.fitness for end in ends])
+    return int(np.sum(fitness <= fitness[0] * (1 + SAME) + 1e-12))
+
+
+def _search_record(method: str, found: Found, ends: Sequence[Refined]) -> Search:
+    return Search(
+        method=method,
+        evaluations=found.evaluations,
+        best=found.best,
+        median=found.median,
+        refined=np.array([end.fitness for end in ends]),
+        times_found=_times_found(ends),
+    )
