@@ -32,6 +32,8 @@ FORMULA, OWN_FORMULA = 0.1, 0.5
 # An effect is added if it takes away this share of what the clearest signal would, and the larger one where a formula
 # may be all that is left to be desired
 MUCH_OF_IT, MOST_OF_IT = 0.3, 0.7
+# ... and there may then be left no more than this share of it
+NEXT_TO_NOTHING = 0.1
 # Effects that no column shows, with the simpler ones in whose place they are tried if those leave something
 HARDER = [("shaft_compliance", "gear_backlash")]
 # Rivals whose criterion is nearer than this, and this share of what neither explains, are not told apart
@@ -70,6 +72,12 @@ class Seen(NamedTuple):
         best = max((s.gain for s in self.of_candidates), default=0.0)
         share = MUCH_OF_IT if self.unexplained > FORMULA else MOST_OF_IT
         return bool(self.left < ALARM and best > share * self.clearest.gain)
+
+    def is_settled(self, again: Seen) -> bool:
+        """Whether one more effect, after which the evidence is `again`, is more than a way to mend the formula of those
+        that were there: then next to nothing is left."""
+        clear = self.unexplained > FORMULA or again.left >= ALARM
+        return clear or again.clearest.gain < NEXT_TO_NOTHING * self.clearest.gain
 
     def is_formula(self, model: Model) -> bool:
         """Whether what is left may well be that of the model's effects by formulas of nature's own."""
@@ -131,8 +139,13 @@ class Namer:
             # for noise what is missing
             if _plainest(self.compare([current, best], found.screen.white)) is current:
                 break
-            current = self._spared(best)
-            found = self._see(current)
+            better = self._spared(best)
+            again = self._see(better)
+            if not (
+                is_within(set(current.effects), set(better.effects)) or found.is_settled(again)
+            ):
+                break
+            current, found = better, again
         return Naming(
             chosen=current,
             rivals=self._rivals(current, found),
