@@ -1,7 +1,7 @@
 """Make the packaged sample, `pmdc_jax/sample/*.csv`: `python -m benchmarks.make_sample`.
 
-The truth stays in this script. It is a plausible 24 V catalogue motor, linear throughout: about
-3,600 rev/min and 0.7 A without load, 40 A at stall, time constants 1.1 ms and 19 ms.
+The truth stays in this script. It is a plausible 24 V catalogue motor, linear but for the dry friction of its
+brushes and bearings: about 3,600 rev/min and 0.9 A without load, 40 A at stall, time constants 1.1 ms and 19 ms.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks import virtual_bench as vb
 
 SAMPLE = Path(__file__).parents[1] / "pmdc_jax" / "sample"
-TRUTH = vb.BenchMotor(R=0.60, L=0.65e-3, Kb=0.0635, Kt=0.0635, J=1.3e-4, f=1.2e-4)
+TRUTH = vb.BenchMotor(R=0.60, L=0.65e-3, Kb=0.0635, Kt=0.0635, J=1.3e-4, f=1.2e-4, coulomb_Nm=0.012)
 NOISE = vb.Noise(current_A=0.05, speed_rad_s=0.3, torque_Nm=0.002, torque_correlation_s=0.01)
 DECIMALS = {"current_A": 2, "speed_rad_s": 2, "Current (mA)": 0, "Speed [rpm]": 1}
 

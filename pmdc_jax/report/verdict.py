@@ -60,7 +60,7 @@ def _none_detected(diagnosis: Diagnosis) -> list[str]:
     return [
         "No missing effect was detected: what simulation and measurement differ by is no more than"
         f" noise may do ({chance(diagnosis.p_nothing)}).",
-        _would_have_been_seen("One would have been seen from these amplitudes on", diagnosis),
+        _would_have_been_seen("", diagnosis),
     ]
 
 
@@ -68,7 +68,7 @@ def _named(diagnosis: Diagnosis) -> list[str]:
     return [
         _disagreement(diagnosis),
         f"Missing: {_found(diagnosis)}. Added.",
-        _would_have_been_seen("These runs call for nothing else in the library", diagnosis),
+        _would_have_been_seen("These runs call for nothing else in the library: ", diagnosis),
     ]
 
 
@@ -238,7 +238,8 @@ def _would_have_been_seen(begin: str, diagnosis: Diagnosis) -> str:
     parts = [f"{words_of(x.effect)} above {amount(x.amplitude, x.unit)}" for x in told]
     if not parts:
         return ""
-    return f"{begin}: {enumerate_words(parts)} would have shown, nine times of ten."
+    sentence = f"{begin}{enumerate_words(parts)} would have shown, nine times of ten."
+    return sentence[0].upper() + sentence[1:]
 
 
 def role_that_counts(diagnosis: Diagnosis) -> Role:
