@@ -20,7 +20,7 @@ from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, identify
 from pmdc_jax.identify.binary_ga import BinaryGA
 from pmdc_jax.identify.identification import Identification
-from pmdc_jax.identify.noise import quantum, white_noise
+from pmdc_jax.identify.noise import is_coarse, quantum, white_noise
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.refine import Problem, Unknowns, evaluate, polish, refine
 from pmdc_jax.identify.search import METHODS, Found, search
@@ -285,6 +285,11 @@ def test_the_noise_of_a_quantised_sensor_is_that_of_rounding():
     speed = 0.5 * np.round(np.sin(np.linspace(0, 7, 5000)) * 30 / 0.5)
     assert white_noise([speed]) == pytest.approx(0.5 / np.sqrt(12), rel=1e-6)
     assert quantum(np.diff(speed)) == 0.5
+    assert is_coarse(speed)
+    rng = np.random.default_rng(0)
+    assert not is_coarse(speed + rng.normal(size=5000))
+    # three quanta of noise blur them, though all values are still multiples
+    assert not is_coarse(0.5 * np.round((speed + 1.5 * rng.normal(size=5000)) / 0.5))
 
 
 def test_a_smooth_or_a_noisy_signal_has_no_quantum():

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..effects import EFFECTS, AbstractEffect
+from ..identify.noise import is_coarse
 from ..motor import Motor
 from ..simulate import Tape, free_run
 from .candidates import Candidate, Scales, Values, candidates
@@ -62,6 +63,9 @@ class Library:
         self.candidates = [
             c for c in candidates(self.scales) if known or not EFFECTS[c.effect].needs_current
         ]
+        # errors that last look like a change in time
+        speeds = [run.speed for run in base.given.training if run.speed is not None]
+        self.coarse = any(is_coarse(speed) for speed in speeds)
         self._whole: dict[int, jax.Array] = {}
         self._base = base
 
@@ -137,6 +141,8 @@ def curves_over(library: Library, tape: Tape, path: Path, count: int):
             continue
         push = torque if equation == "mechanical" else volt
         for variable in variables:
+            if variable == "time" and library.coarse:
+                continue
             own, x = variable == "time", known[variable]
             knots = np.linspace(0, 1, KNOTS_IN_TIME) if own else _knots(x, weight)
             hats = jnp.stack([_hat(x, knots, k) for k in range(len(knots))], -1)

@@ -32,8 +32,8 @@ FORMULA, OWN_FORMULA = 0.1, 0.5
 # An effect is added if it takes away this share of what the clearest signal would, and the larger one where a formula
 # may be all that is left to be desired
 MUCH_OF_IT, MOST_OF_IT = 0.3, 0.7
-# ... and there may then be left no more than this share of it
-NEXT_TO_NOTHING = 0.1
+# ... and there may then be left no more than this share of it, or the larger one of a richer form of what was there
+NEXT_TO_NOTHING, LITTLE = 0.1, 0.3
 # Effects that no column shows, with the simpler ones in whose place they are tried if those leave something
 HARDER = [("shaft_compliance", "gear_backlash")]
 # Rivals whose criterion is nearer than this, and this share of what neither explains, are not told apart
@@ -73,11 +73,11 @@ class Seen(NamedTuple):
         share = MUCH_OF_IT if self.unexplained > FORMULA else MOST_OF_IT
         return bool(self.left < ALARM and best > share * self.clearest.gain)
 
-    def is_settled(self, again: Seen) -> bool:
+    def is_settled(self, again: Seen, share: float) -> bool:
         """Whether one more effect, after which the evidence is `again`, is more than a way to mend the formula of those
-        that were there: then next to nothing is left."""
+        that were there: then no more than a share is left."""
         clear = self.unexplained > FORMULA or again.left >= ALARM
-        return clear or again.clearest.gain < NEXT_TO_NOTHING * self.clearest.gain
+        return clear or again.clearest.gain < share * self.clearest.gain
 
     def is_formula(self, model: Model) -> bool:
         """Whether what is left may well be that of the model's effects by formulas of nature's own."""
@@ -141,9 +141,8 @@ class Namer:
                 break
             better = self._spared(best)
             again = self._see(better)
-            if not (
-                is_within(set(current.effects), set(better.effects)) or found.is_settled(again)
-            ):
+            richer = is_within(set(current.effects), set(better.effects))
+            if not found.is_settled(again, LITTLE if richer else NEXT_TO_NOTHING):
                 break
             current, found = better, again
         return Naming(

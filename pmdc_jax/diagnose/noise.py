@@ -18,6 +18,8 @@ from jaxtyping import Bool, Float
 
 # Orders that are tried; the Bayesian criterion chooses.
 ORDERS = (1, 2, 4, 8, 12, 20, 30)
+# Frequencies of a run, from the lowest on, that are its slowest
+SLOWEST = 15
 
 Rows = Float[np.ndarray, "samples outputs *columns"]
 
@@ -52,13 +54,31 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
     for kind in dict.fromkeys(series.kind for series in residuals):
         of_kind[kind] = _autoregression([s for s in residuals if s.kind == kind])
     filters = [of_kind[series.kind] for series in residuals]
-    return Whitener(filters, _scales(residuals, filters))
+    scales = [
+        scale / np.sqrt(_slow_power(_filtered(series, A) @ scale.T))
+        for series, A, scale in zip(residuals, filters, _scales(residuals, filters), strict=True)
+    ]
+    return Whitener(filters, scales)
 
 
 def plain(residuals: Sequence[Series]) -> Whitener:
     """No filter at all, only the scale of every run."""
     filters = [np.zeros((0, *2 * s.values.shape[1:2])) for s in residuals]
     return Whitener(filters, _scales(residuals, filters))
+
+
+def _slow_power(white: Rows) -> float:
+    """By how much the slowest part of what ought to be white is stronger than the rest, at least one.
+
+    A short filter cannot take out errors that last: those of a coarse encoder while the motor hardly turns. A run with
+    such noise counts for less.
+    """
+    count = min(SLOWEST, len(white) // 4)
+    if not count:
+        return 1.0
+    power = np.abs(np.fft.rfft(white, axis=0)[1 : count + 1]) ** 2 / len(white)
+    by_chance = 1 + 2 / np.sqrt(count)
+    return max(float(power.mean(0).max()) / by_chance, 1.0)
 
 
 def _scales(residuals: Sequence[Series], filters) -> list[Float[np.ndarray, "outputs outputs"]]:
