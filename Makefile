@@ -1,5 +1,5 @@
 # Everything is set up once, in .venv: Python 3.11, make and a way to PyPI are all it takes.
-#   make demo     diagnose the packaged sample; results and a report go to demo_out/
+#   make demo     identify, diagnose and tune on the packaged sample; reports go to demo_out/
 #   make test     style, types, tests
 #   make test-all the slow tests too; twenty minutes and more
 #   make lint     style and types alone

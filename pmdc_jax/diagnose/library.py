@@ -179,6 +179,7 @@ def _knots(x, weight) -> np.ndarray:
     inner = np.quantile(values, np.linspace(0, 1, KNOTS)[1:-1])
     about_zero = [s * spread for s in (-0.02, 0.02) if low < s * spread < high]
     knots = np.sort(np.concatenate([[low, high], inner, about_zero]))
+    knots[np.abs(knots) < 1e-3 * spread] = 0.0  # where a motor rests, whatever its noise
     return knots[np.append(True, np.diff(knots) > 0.01 * spread)]
 
 
