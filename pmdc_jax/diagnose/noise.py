@@ -37,6 +37,7 @@ class Whitener(NamedTuple):
 
     filters: list[Float[np.ndarray, "order outputs outputs"]]
     scales: list[Float[np.ndarray, "outputs outputs"]]
+    slow: list[float]  # by how much what is slow is stronger than the rest, at least one
 
     def __call__(self, run: int, series: Series) -> Float[np.ndarray, "rows *columns"]:
         """The rows of a run, white if the series is its noise, those of all outputs one after another."""
@@ -54,17 +55,18 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
     for kind in dict.fromkeys(series.kind for series in residuals):
         of_kind[kind] = _autoregression([s for s in residuals if s.kind == kind])
     filters = [of_kind[series.kind] for series in residuals]
-    scales = [
-        scale / np.sqrt(_slow_power(_filtered(series, A) @ scale.T))
-        for series, A, scale in zip(residuals, filters, _scales(residuals, filters), strict=True)
+    scales = _scales(residuals, filters)
+    slow = [
+        _slow_power(_filtered(series, A) @ S.T)
+        for series, A, S in zip(residuals, filters, scales, strict=True)
     ]
-    return Whitener(filters, scales)
+    return Whitener(filters, [S / np.sqrt(s) for S, s in zip(scales, slow, strict=True)], slow)
 
 
 def plain(residuals: Sequence[Series]) -> Whitener:
     """No filter at all, only the scale of every run."""
     filters = [np.zeros((0, *2 * s.values.shape[1:2])) for s in residuals]
-    return Whitener(filters, _scales(residuals, filters))
+    return Whitener(filters, _scales(residuals, filters), [1.0] * len(residuals))
 
 
 def _slow_power(white: Rows) -> float:

@@ -8,13 +8,19 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import special, stats
+from scipy import ndimage, special, stats
 
 from .candidates import Candidate
 from .evidence import Block, Evidence, products
 from .library import Curve, Library, curves_over
 from .model import Fit, Model, rows_of, series_of
 from .noise import Series, Whitener, plain, whitener
+
+# Waves about one whose median gain is that of the noise
+NEIGHBOURS = 13
+# How much stronger slow noise may be over the few knots of a curve over time than over all the slowest frequencies: of
+# a torque that keeps for 0.2 s, in runs of some seconds
+SLOWER = 4.0
 
 
 class Screen(NamedTuple):
@@ -100,13 +106,16 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     gains = np.array([gain_of(block) for block in found.of_curve])
     waves = np.array([curve.shapes is not None for curve in found.curves])
     gains[waves] /= _dispersion(found, gains[waves], found.of_curve[-1])
+    in_time = np.array([curve.variable == "time" for curve in found.curves])
+    gains[in_time] /= min(1 + SLOWER * (max(found.white.slow) - 1), SLOWER)
     of_curves = [signal(*one) for one in zip(gains, found.curves, found.of_curve, strict=True)]
     return sorted(of_candidates, key=_log_p), sorted(of_curves, key=_log_p)
 
 
-def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> float:
-    """How much more than by chance most waves gain: they are slow, and of slow noise a filter leaves some."""
-    return max(float(np.median(gains) / stats.chi2.median(found.evidence.freedom(wave))), 1.0)
+def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> np.ndarray:
+    """How much more than by chance the waves about each gain: they are slow, and of slow noise a filter leaves some."""
+    level = ndimage.median_filter(gains, NEIGHBOURS, mode="nearest")
+    return np.maximum(level / stats.chi2.median(found.evidence.freedom(wave)), 1.0)
 
 
 def _log_p(signal: Signal) -> float:
