@@ -32,7 +32,7 @@ FORMULA, OWN_FORMULA = 0.1, 0.5
 # An effect is added if it takes away this share of what the clearest signal would, and the larger one where a formula
 # may be all that is left to be desired
 MUCH_OF_IT, MOST_OF_IT = 0.3, 0.7
-# ... and there may then be left no more than this share of it, or the larger one of a richer form of what was there
+# ... and there may then be left no more than this share of it, or the larger one by a richer form of what was there
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.3
 # Effects that no column shows, with the simpler ones in whose place they are tried if those leave something
 HARDER = [("shaft_compliance", "gear_backlash")]
@@ -130,10 +130,7 @@ class Namer:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
         current, first = self.base, self._see(self.base)
         found = first
-        while found.asks_for_more() and len(current.effects) < MOST:
-            tried = self._tried(current, found)
-            if not tried:
-                break
+        while len(current.effects) < MOST and (tried := self._tried(current, found)):
             best = self._best(tried, found.screen.white)
             # judged by the noise that the clearest signal leaves: a filter of what a poorer model leaves takes
             # for noise what is missing
@@ -141,8 +138,10 @@ class Namer:
                 break
             better = self._spared(best)
             again = self._see(better)
-            richer = is_within(set(current.effects), set(better.effects))
-            if not found.is_settled(again, LITTLE if richer else NEXT_TO_NOTHING):
+            new = set(better.effects) - set(current.effects)
+            harder = bool(new & {harder for _, harder in HARDER})
+            grown = len(better.effects) > len(current.effects)
+            if not (harder or found.is_settled(again, NEXT_TO_NOTHING if grown else LITTLE)):
                 break
             current, found = better, again
         return Naming(
@@ -161,14 +160,13 @@ class Namer:
 
     def _tried(self, current: Model, found: Seen) -> list[Model]:
         """The current model with one effect more, or with a harder one in place of another."""
-        clean = found.screen.white
-        tried = [
-            self.refits.with_signal(current, s, found.screen)
-            for s in self._shortlist(current, found)
-        ]
-        tried += [
-            self.refits.in_place(current, clean, *p) for p in HARDER if p[0] in current.effects
-        ]
+        tried = []
+        if found.asks_for_more():
+            shortlist = self._shortlist(current, found)
+            tried += [self.refits.with_signal(current, s, found.screen) for s in shortlist]
+        if found.left < ALARM:
+            simpler = [pair for pair in HARDER if pair[0] in current.effects]
+            tried += [self.refits.in_place(current, found.screen.white, *pair) for pair in simpler]
         return [model for model in tried if model is not None]
 
     def _rivals(self, chosen: Model, found: Seen) -> list[Model]:

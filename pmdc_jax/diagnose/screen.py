@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import ndimage, special, stats
+from scipy import special, stats
 
 from .candidates import Candidate
 from .evidence import Block, Evidence, products
@@ -16,8 +16,8 @@ from .library import Curve, Library, curves_over
 from .model import Fit, Model, rows_of, series_of
 from .noise import Series, Whitener, plain, whitener
 
-# Waves about one whose median gain is that of the noise
-NEIGHBOURS = 13
+# How much stronger slow noise may be at the slowest waves than at most of them
+SLOWEST_WAVES = 1.5
 # How much stronger slow noise may be over the few knots of a curve over time than over all the slowest frequencies: of
 # a torque that keeps for 0.2 s, in runs of some seconds
 SLOWER = 4.0
@@ -112,10 +112,13 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     return sorted(of_candidates, key=_log_p), sorted(of_curves, key=_log_p)
 
 
-def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> np.ndarray:
-    """How much more than by chance the waves about each gain: they are slow, and of slow noise a filter leaves some."""
-    level = ndimage.median_filter(gains, NEIGHBOURS, mode="nearest")
-    return np.maximum(level / stats.chi2.median(found.evidence.freedom(wave)), 1.0)
+def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> float:
+    """How much more than by chance waves gain: they are slow, and of slow noise a filter leaves some.
+
+    By their lower quartile, for in short runs a wave that is there shows in many of its neighbours.
+    """
+    level = float(np.quantile(gains, 0.25) / stats.chi2.ppf(0.25, found.evidence.freedom(wave)))
+    return SLOWEST_WAVES * max(level, 1.0)
 
 
 def _log_p(signal: Signal) -> float:
