@@ -37,9 +37,8 @@ class Curve(NamedTuple):
     variable: str
     knots: np.ndarray
     own: bool = False  # every run has a curve of its own
-    shapes: np.ndarray | None = (
-        None  # (knots, columns): the columns at the knots, where they are no hats
-    )
+    # (knots, columns): the columns at the knots, where they are no hats
+    shapes: np.ndarray | None = None
 
     def values(self, coefficients: np.ndarray) -> np.ndarray:
         """The curve at its knots."""

@@ -16,7 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-# Orders that are tried; the Bayesian criterion chooses.
+from ..identify.whitening import CHUNK, remembered
+
+# Orders that are tried, none longer than `CHUNK`; the Bayesian criterion chooses.
 ORDERS = (1, 2, 4, 8, 12, 20, 30)
 # Frequencies of a run, from the lowest on, that are its slowest
 SLOWEST = 15
@@ -125,11 +127,7 @@ def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order out
 def _lagged(series: Series, order: int) -> Float[np.ndarray, "rows lags"]:
     values = series.values
     whole = np.concatenate([values[order - k : len(values) - k] for k in range(order + 1)], axis=1)
-    return whole[_usable(series.known, order)]
-
-
-# Samples that are filtered by one product of matrices.
-CHUNK = 32
+    return whole[remembered(series.known, order)[order:]]
 
 
 def _filtered(series: Series, filters: Float[np.ndarray, "order outputs outputs"]) -> Rows:
@@ -147,10 +145,4 @@ def _filtered(series: Series, filters: Float[np.ndarray, "order outputs outputs"
         part = rest[first : first + len(band)]
         part[:] = band[: len(part), : len(window)] @ window
     rest = rest.reshape(len(values) - order, *values.shape[1:])
-    return rest[_usable(series.known, order)]
-
-
-def _usable(known: Bool[np.ndarray, " samples"], order: int) -> Bool[np.ndarray, " rows"]:
-    """Samples that were measured, as were all that the filter looks back on."""
-    lost = np.cumsum(np.append(0, ~known))
-    return lost[order + 1 :] == lost[: len(known) - order]
+    return rest[remembered(series.known, order)[order:]]

@@ -58,10 +58,10 @@ class CoggingTorque(_Angular):
     periods: Scalars
 
     def torque(self, state: State) -> Scalars:
-        return self.amplitude_Nm * jnp.sin(self.periods * state.extra["angle"] + self.phase_rad)
+        return self.amplitude_Nm * _wave(self, state)
 
     def recurrence(self) -> dict[str, Scalars]:
-        return {"angle": 2 * jnp.pi * (1 / self.periods)}
+        return _period(self)
 
 
 class TorqueRipple(_Angular):
@@ -96,10 +96,19 @@ class TorqueRipple(_Angular):
     emf_share: Scalars
 
     def parameters(self, motor: Motor, state: State) -> Motor:
-        wave = jnp.sin(self.periods * state.extra["angle"] + self.phase_rad)
-        ripple = self.amplitude * wave
+        ripple = self.amplitude * _wave(self, state)
         constants = motor.Kt * (1 + ripple), motor.Kb * (1 + self.emf_share * ripple)
         return eqx.tree_at(lambda m: (m.Kt, m.Kb), motor, constants)
 
     def recurrence(self) -> dict[str, Scalars]:
-        return {"angle": 2 * jnp.pi * (1 / self.periods)}
+        return _period(self)
+
+
+def _wave(effect: CoggingTorque | TorqueRipple, state: State) -> Scalars:
+    """sin(n angle + phase)."""
+    return jnp.sin(effect.periods * state.extra["angle"] + effect.phase_rad)
+
+
+def _period(effect: CoggingTorque | TorqueRipple) -> dict[str, Scalars]:
+    """The angle after which the torque comes again."""
+    return {"angle": 2 * jnp.pi * (1 / effect.periods)}

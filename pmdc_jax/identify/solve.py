@@ -50,7 +50,7 @@ def solve(
 ) -> tuple[Prepared, Solved]:
     """Search the bounds, refine the best candidates; again, from another seed, while the fit is poor.
 
-    **Returns**: the problem with the rotor turned as the fit says, and the fit.
+    **Returns**: the problem, its rotor turned as the fit says where a torque depends on the angle, and the fit.
     """
     began = time.perf_counter()
     report = progress or (lambda *args, **kwargs: None)

@@ -25,9 +25,8 @@ class Whitening(eqx.Module):
     """
 
     bands: Float[Array, "runs white seen"]  # of a chunk's white rows, by the chunk before and by it
-    usable: Float[
-        Array, "blocks 2 samples"
-    ]  # one where all that the filter looks back on was measured
+    # one where all that the filter looks back on was measured
+    usable: Float[Array, "blocks 2 samples"]
 
     @classmethod
     def of(
@@ -45,7 +44,7 @@ class Whitening(eqx.Module):
         for index, A in enumerate(filters):
             mine, counts = np.asarray(run) == index, np.any(scales[index], axis=0)
             whole = known[mine].reshape(-1, 2)[:, counts].all(1)
-            usable[mine] = (_remembered(whole, len(A))[:, None] * counts).reshape(
+            usable[mine] = (remembered(whole, len(A))[:, None] * counts).reshape(
                 -1, *known.shape[1:]
             )
         return cls(jnp.asarray(bands), jnp.asarray(np.moveaxis(usable, 2, 1)))
@@ -73,7 +72,7 @@ def _band(A: Float[np.ndarray, "order 2 2"], S: Float[np.ndarray, "2 2"]) -> np.
     return band.reshape(2 * CHUNK, 4 * CHUNK)
 
 
-def _remembered(known, order: int) -> Bool[np.ndarray, " samples"]:
+def remembered(known, order: int) -> Bool[np.ndarray, " samples"]:
     """Samples that were measured, as were the `order` before them."""
     lost = np.cumsum(np.append(0, ~known))
     return np.append(np.zeros(order, bool), lost[order + 1 :] == lost[: len(known) - order])
