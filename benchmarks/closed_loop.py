@@ -2,10 +2,11 @@
 
 1,024 PID loops of the paper's motor, 200 samples of 1 ms with a sample of delay, saturation and
 back-calculation, double precision. Ours beside the same law in numba (threads, and vectors where
-LLVM finds them), and beside `control.forced_response`, which knows no limits and so is compared on
-gentle gains without any.
+LLVM finds them); beside `control.forced_response`, which knows no limits and so is compared without
+any; and beside the motor of gym-electric-motor, which has one constant for torque and back-EMF.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +23,7 @@ from pmdc_jax.motor import PARAMETERS, Motor
 LOOPS, SAMPLES, STEP = 1024, 200, 1e-3
 SETPOINT, VOLTS, UNLIMITED = 481.0, 30.0, 1e6
 MOTOR = Motor(**{name: getattr(vb.paper_motor(), name) for name in PARAMETERS})
+ONE_CONSTANT = eqx.tree_at(lambda motor: motor.Kt, MOTOR, MOTOR.Kb)
 
 
 def gains(count: int = LOOPS) -> np.ndarray:
@@ -39,8 +41,7 @@ def motion() -> np.ndarray:
 
 
 @jax.jit
-def _ours(table, volts):
-    motor = jax.tree.map(jnp.asarray, MOTOR)
+def _ours(motor, table, volts):
     model = Model.of(motor, STEP)
     course = Course(jnp.full(SAMPLES, SETPOINT), jnp.zeros(SAMPLES), jnp.zeros(SAMPLES))
 
@@ -54,14 +55,15 @@ def _ours(table, volts):
     return jax.vmap(one)(table)
 
 
-def ours(count: int = LOOPS, volts: float = VOLTS) -> Row:
+def ours(count: int = LOOPS, volts: float = VOLTS, motor: Motor = MOTOR) -> Row:
     """Our loop, vmapped over gains."""
     with jax.enable_x64(True):
         table = jnp.asarray(gains(count))
+        motor = jax.tree.map(jnp.asarray, motor)
 
     def run():
         with jax.enable_x64(True):
-            return np.asarray(_ours(table, volts))
+            return np.asarray(_ours(motor, table, volts))
 
     limited = "" if volts < UNLIMITED else ", no limit"
     return Row(f"ours{limited}, {count:,}", run, count)
@@ -85,6 +87,16 @@ def python_control(count: int = 32) -> Row:
         return peers.control_speeds(given, moved, SETPOINT, STEP, SAMPLES)
 
     return Row(f"control.forced_response, no limit, {count:,}", run, count, 3)
+
+
+def gym_electric_motor(count: int = 32) -> Row:
+    """The same law around gym-electric-motor's PMDC motor, one loop after another."""
+    given, motor = gains(count), {name: float(getattr(ONE_CONSTANT, name)) for name in PARAMETERS}
+
+    def run():
+        return peers.gym_speeds(given, motor, SETPOINT, VOLTS, STEP, SAMPLES - 1)
+
+    return Row(f"gym-electric-motor, {count:,}", run, count, 3)
 
 
 def table(title: str, rows: list[Row]) -> Table:
@@ -113,6 +125,7 @@ def main() -> None:
     console = Console(width=110)
     console.print(table("PID on 30 V", [numba(), ours()]))
     console.print(table("Without limits", [ours(volts=UNLIMITED), python_control()]))
+    console.print(table("Kt = Kb, 30 V", [ours(motor=ONE_CONSTANT), gym_electric_motor()]))
 
 
 if __name__ == "__main__":

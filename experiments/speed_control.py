@@ -18,8 +18,9 @@ from rich.table import Table
 
 from pmdc_jax.control import fastest_settling, step_metrics
 from pmdc_jax.control.continuous import continuous_loop
+from pmdc_jax.control.judge import Robustness
 from pmdc_jax.control.spread import drawn_motors, even_spread
-from pmdc_jax.control.tuning import JUDGED_ON, Robustness, Tuning, judged, tune
+from pmdc_jax.control.tuning import JUDGED_ON, Tuning, robustness, tune
 from pmdc_jax.wheelchair import PRINTED, SETPOINT
 
 KINDS = ("pi", "pid", "state-feedback")
@@ -47,7 +48,7 @@ def nominal_table(volts: list[float], options: dict, continuous: bool) -> Table:
     shown = Table(title=f"0 to {SETPOINT:g} rad/s, {options}")
     for heading in ("V", "controller", "limit s", "settling / limit", "overshoot %", "load N m"):
         shown.add_column(heading, justify="right")
-    for heading in ("steady error rad/s", "sensitivity", "seconds"):
+    for heading in ("steady error rad/s", "to half, under load: ms, %", "sensitivity", "seconds"):
         shown.add_column(heading, justify="right")
     if continuous:
         shown.add_column("continuous: / limit, %", justify="right")
@@ -60,6 +61,7 @@ def nominal_table(volts: list[float], options: dict, continuous: bool) -> Table:
 
 def _cells(volts: float, kind: str, found: Tuning, continuous: bool) -> list[str]:
     limit, settling = found.fastest_possible_settling, found.metrics["SettlingTime"]
+    second = found.candidates[0].second
     cells = [
         f"{volts:g}",
         kind,
@@ -68,6 +70,7 @@ def _cells(volts: float, kind: str, found: Tuning, continuous: bool) -> list[str
         f"{found.metrics['Overshoot']:.3f}",
         f"{found.load_torque:.2f}",
         f"{found.load['SteadyStateError']:.3f}",
+        f"{1e3 * (second['SettlingTime'] or float('inf')):.1f}, {second['Overshoot']:.1f}",
         f"{found.margins.sensitivity_peak or float('inf'):.2f}",
         f"{found.seconds['total']:.1f}",
     ]
@@ -99,7 +102,7 @@ def robust_table(volts: list[float]) -> Table:
             for candidate in robust.candidates:
                 name = "robust" if candidate.name == "tuned" else candidate.name
                 shown.add_row(f"{v:g}", kind, name, *_percentiles(candidate.robust, nominal))
-            cells = _percentiles(judged(alone, 0.1, robust.seed), nominal)
+            cells = _percentiles(robustness(alone, 0.1, robust.seed), nominal)
             shown.add_row(f"{v:g}", kind, "nominal", *cells)
     return shown
 
@@ -116,7 +119,7 @@ def main() -> None:
     parser.add_argument("study", choices=("ideal", "sampled", "robust"))
     parser.add_argument("--volts", type=float, nargs="+", default=[25, 26, 28, 30, 36, 48])
     options = parser.parse_args()
-    console = Console(width=140)
+    console = Console(width=170)
     if options.study == "robust":
         console.print(robust_table(options.volts))
         return

@@ -88,7 +88,7 @@ def test_the_report_tells_the_same(tmp_path):
 @pytest.mark.slow
 def test_a_loop_that_misses_is_said_to_miss():
     found = example()
-    missed = evolve(found, max_overshoot=-1.0, max_settling=1e-3)
+    missed = evolve(found, asked=evolve(found.asked, max_overshoot=0.0, max_settling=1e-3))
     assert not missed.meets_specification
     slow = {**found.metrics, "SettlingTime": None}
     never = evolve(found, candidates=(evolve(found.candidates[0], metrics=slow),))
@@ -113,7 +113,7 @@ IMPOSSIBLE = {
         {"setpoint": 481.0, "voltage_limit": 30.0, "max_settling": 0.04},
         "0.04 s is less than any controller needs within the limits (0.0441 s)",
     ),
-    "no speed": ({"setpoint": 0.0}, "0 is no speed to go to"),
+    "no speed": ({"setpoint": 0.0}, "0 is not a speed to go to"),
     "negative voltage": ({"voltage_limit": -3.0}, "-3 is not a positive number"),
     "delay": ({"delay": 2}, "2 samples are not supported"),
     "overshoot": ({"max_overshoot": math.nan}, "nan is not a number from 0 up"),

@@ -1,4 +1,4 @@
-"""The same sampled PID loop written by hand: numba, and python-control's linear response."""
+"""The same sampled PID loop by others: numba by hand, python-control, gym-electric-motor."""
 
 import numpy as np
 from numba import njit, prange
@@ -56,4 +56,46 @@ def control_speeds(gains: NDArray, motion: NDArray, setpoint: float, step: float
         loop = ct.ss(A, B, [[0, 1, 0, 0, 0]], 0, step)
         speed = ct.forced_response(loop, time, reference).outputs
         seen[n] = speed[-1], speed.max()
+    return seen
+
+
+def gym_speeds(
+    gains: NDArray,
+    motor: dict[str, float],
+    setpoint: float,
+    volts: float,
+    step: float,
+    samples: int,
+):
+    """Last and largest speed in the physical system of gym-electric-motor, without its rewards and references."""
+    import gym_electric_motor as gem
+    from gym_electric_motor.physical_systems import converters, mechanical_loads, voltage_supplies
+
+    most = {"omega": 2000.0, "i": 1000.0, "u": volts, "torque": 100.0}
+    rotor = {"r_a": motor["R"], "l_a": motor["L"], "psi_e": motor["Kb"], "j_rotor": motor["J"] / 2}
+    load = {"a": 0.0, "b": motor["f"], "c": 0.0, "j_load": motor["J"] / 2}
+    system = gem.make(
+        "Cont-SC-PermExDc-v0",
+        motor={"motor_parameter": rotor, "limit_values": most, "nominal_values": most},
+        load=mechanical_loads.PolynomialStaticLoad(load_parameter=load),
+        supply=voltage_supplies.IdealVoltageSupply(u_nominal=volts),
+        converter=converters.ContFourQuadrantConverter(tau=step),
+        tau=step,
+        constraints=(),
+    ).unwrapped.physical_system
+    seen = np.zeros((len(gains), 2))
+    for n, (kp, ki, kd, filter_time, weight, tracking) in enumerate(gains):
+        speed = most["omega"] * system.reset()[0]
+        integral = filtered = pending = 0.0
+        for _ in range(samples):
+            slope = (speed - filtered) / (filter_time + step)
+            asked = kp * (weight * setpoint - speed) + integral - kd * slope
+            applied = min(max(asked, -volts), volts)
+            back = (applied - asked) / max(tracking, step)
+            integral += step * (ki * (setpoint - speed) + back)
+            filtered += step * slope
+            speed = most["omega"] * system.simulate(np.array([pending / volts]))[0]
+            pending = applied
+            seen[n, 1] = max(seen[n, 1], speed)
+        seen[n, 0] = speed
     return seen

@@ -31,8 +31,9 @@ TAIL = 0.1
 # Cost of a relative steady error: one that fills the band costs as much as half the fastest settling.
 STEADY = 25.0
 PARTS, LOWER = 3, 0.5
-# Weight of the second step, whose overshoot may fill the band: it has no specification of its own.
-SECOND = 0.15
+# Weights of the second step's settling and of its overshoot, which may fill the band: it has no specification of its
+# own.
+SECOND_SETTLING, SECOND_OVERSHOOT = 0.05, 0.15
 
 
 class Task(eqx.Module):
@@ -102,8 +103,8 @@ def _smooth_cost(task: Task, law: Law, motor: Motor, width: Number) -> One:
         + jnp.mean(errors[0])
         + jnp.mean(errors[1])
         + jnp.mean(jnp.abs(second[1] / lower - 1))
-        + SECOND * second_settling / task.limit
-        + SECOND * overshoot_cost(dip, 100 * BAND)
+        + SECOND_SETTLING * second_settling / task.limit
+        + SECOND_OVERSHOOT * overshoot_cost(dip, 100 * BAND)
         + STEADY * sum(_late(error) for error in errors)
         + jnp.mean(jnp.abs(jnp.diff(response.voltage[:: task.substeps])))
         / task.hardware.voltage_limit
@@ -169,7 +170,8 @@ def exact_cost(task: Task, found: Score) -> Float[Array, ""]:
     costs = settling / task.limit + 0.1 * jnp.nan_to_num(found.recovery, nan=never) / task.limit
     costs = costs + STEADY * found.late_error + found.effort
     second = jnp.nan_to_num(found.second_settling, nan=never) / task.limit
-    costs = costs + SECOND * (second + overshoot_cost(found.second_overshoot, 100 * BAND))
+    costs = costs + SECOND_SETTLING * second
+    costs = costs + SECOND_OVERSHOOT * overshoot_cost(found.second_overshoot, 100 * BAND)
     costs = costs + 3 * overshoot_cost(found.overshoot, 0.97 * task.max_overshoot)
     cost = _mean_and_tail(costs)
     if task.max_sensitivity is None:

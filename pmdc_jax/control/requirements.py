@@ -73,14 +73,6 @@ def check_time(max_settling: float | None, fastest: float | None, setpoint: floa
     return fastest
 
 
-def check_positive(**values: float | None) -> None:
-    """Refuse what must be a positive, finite number and is not; names as of Python arguments."""
-    for name, value in values.items():
-        if value is not None and not (math.isfinite(value) and value > 0):
-            option = "--" + name.replace("_", "-")
-            raise InputError(option, f"{value:g} is not a positive number", "Give it in SI units")
-
-
 def spare_torque(
     motor: Motor, setpoint: float, voltage_limit: float, current_limit: float | None
 ) -> float:

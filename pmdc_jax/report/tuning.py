@@ -11,9 +11,10 @@ from rich.table import Table
 from rich.text import Text
 
 from ..control.controller_file import gains_of, law_content
+from ..control.judge import Candidate, Robustness
 from ..control.metrics import BAND
 from ..control.objective import LOWER
-from ..control.tuning import Candidate, Robustness, Tuning
+from ..control.tuning import Tuning
 from .notation import NARROW, UNKNOWN, percent, pretty_unit, significant
 
 TITLES = {
@@ -233,7 +234,7 @@ def write_tuning_report(tuning: Tuning, path: str | Path) -> None:
     ratio = None if settling is None else settling / tuning.fastest_possible_settling
     tiles = [
         ("Settling", _time(settling), f"{significant(ratio)} times the limit"),
-        ("Overshoot", percent(overshoot), f"at most {tuning.max_overshoot:g} % asked for"),
+        ("Overshoot", percent(overshoot), f"at most {tuning.asked.max_overshoot:g} % asked for"),
         ("Largest current", f"{significant(tuning.peak_current)} A", _limits(tuning)),
     ]
     if tuning.robust is not None:

@@ -1,0 +1,105 @@
+"""What comes of a controller: its exact metrics on the nominal motor, and over the motors that might be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from attrs import field, frozen
+from jaxtyping import Array, Float
+
+from ..motor import Motor
+from .controllers import AbstractController
+from .law import Law, Model
+from .loop import Response, closed_loop
+from .margins import margins
+from .metrics import load_metrics, step_metrics
+from .objective import LOWER, Score, Task, score
+
+SUBSTEPS = 10  # instants a sample in what is reported
+
+
+@frozen
+class Robustness:
+    """The metrics over motors drawn from the uncertainty: 95th percentiles, None where more than 5 % never settle."""
+
+    samples: int
+    Overshoot_p95: float
+    SettlingTime_p95: float | None
+    overshoot: np.ndarray = field(repr=False)  # % of each motor
+    settling: np.ndarray = field(repr=False)  # s of each motor, infinite where it never settles
+
+
+@frozen
+class Candidate:
+    """One way of choosing the gains, and what comes of it."""
+
+    name: str
+    controller: AbstractController
+    metrics: Mapping[str, float | None]
+    load: Mapping[str, float | None]
+    second: Mapping[str, float | None]  # of the step from the set point to half of it
+    robust: Robustness | None
+    stable: bool
+
+
+def judged(
+    name: str, task: Task, motor: Motor, controller: AbstractController, judges: Motor | None
+) -> Candidate:
+    """A controller by its exact metrics; `judges`, motors along a leading axis, give the percentiles."""
+    controller = jax.tree.map(jnp.asarray, controller)
+    law = Law.of(controller, task.hardware, motor)
+    response = simulated(task, motor, law)
+    step, loaded, second = task.parts(response, SUBSTEPS * task.substeps)
+    robust = None
+    if judges is not None:
+        model = Model.of(motor, task.hardware.sample_time)
+        robust = _robustness(_score(task, model, judges, controller))
+    found = (
+        _by_name(step_metrics(*step, task.setpoint)),
+        _by_name(load_metrics(*loaded, task.setpoint)),
+        _by_name(step_metrics(*second, LOWER * task.setpoint, task.setpoint)),
+    )
+    return Candidate(name, controller, *found, robust, margins(motor, law).stable)
+
+
+@eqx.filter_jit
+def simulated(task: Task, motor: Motor, law: Law) -> Response:
+    """The whole course, ten instants a sample."""
+    return closed_loop(motor, law, task.course(), SUBSTEPS * task.substeps)
+
+
+@eqx.filter_jit
+def speeds(task: Task, motors: Motor, law: Law) -> Float[Array | np.ndarray, "motors samples"]:
+    """Of every motor at every sample, rad/s."""
+
+    def speed(motor):
+        return closed_loop(motor, law, task.course(), task.substeps).speed[:: task.substeps]
+
+    return jax.vmap(speed)(motors)
+
+
+def _by_name(metrics) -> dict[str, float | None]:
+    """Numbers by name, None for what never happens."""
+    values = {name: float(value) for name, value in metrics._asdict().items()}
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+def _robustness(found: Score) -> Robustness:
+    settling = np.nan_to_num(np.asarray(found.settling), nan=np.inf)
+    overshoot = np.asarray(found.overshoot)
+    slow = float(np.quantile(settling, 0.95, method="higher"))
+    return Robustness(
+        samples=len(settling),
+        Overshoot_p95=float(np.quantile(overshoot, 0.95, method="higher")),
+        SettlingTime_p95=slow if math.isfinite(slow) else None,
+        overshoot=overshoot,
+        settling=settling,
+    )
+
+
+_score = eqx.filter_jit(score)
