@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from io import TextIOWrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
 
@@ -21,6 +21,9 @@ from .options import (
     Column,
     Controller,
     ControllerFile,
+    CurrentLimit,
+    CurrentSensor,
+    Delay,
     Effects,
     Experiment,
     Folder,
@@ -29,16 +32,25 @@ from .options import (
     Input,
     Json,
     Known,
+    LoadTorque,
+    MaxOvershoot,
+    MaxSettling,
     MotorFile,
     Output,
     Report,
     Runs,
+    SampleTime,
     Save,
     SaveController,
     Search,
     Seed,
+    Setpoint,
+    SpeedNoise,
+    SpeedStep,
+    Spread,
     Tie,
     Unloaded,
+    VoltageLimit,
     fit_options,
     pairs,
 )
@@ -179,43 +191,18 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
 def tune(
     motor: MotorFile,
     controller: Controller,
-    setpoint: Annotated[float | None, typer.Option(metavar="RAD_S", help="Speed to go to.")] = None,
-    voltage_limit: Annotated[
-        float | None, typer.Option(metavar="V", help="Voltage there is, in either direction.")
-    ] = None,
-    current_limit: Annotated[
-        float | None, typer.Option(metavar="A", help="Current that is allowed, none if not given.")
-    ] = None,
-    sample_time: Annotated[
-        float | None, typer.Option(metavar="S", help="Of the controller. 1 ms, or less if needed.")
-    ] = None,
-    max_overshoot: Annotated[
-        float, typer.Option(metavar="PCT", help="Overshoot that is allowed, % of the step.")
-    ] = 1.0,
-    max_settling: Annotated[
-        float | None, typer.Option(metavar="S", help="Settling time that is asked for.")
-    ] = None,
-    load_torque: Annotated[
-        float | None, typer.Option(metavar="NM", help="Load step that has to be withstood.")
-    ] = None,
-    delay: Annotated[
-        int, typer.Option(metavar="SAMPLES", help="From measurement to voltage: 0 or 1.")
-    ] = 1,
-    speed_step: Annotated[
-        float | None, typer.Option(metavar="RAD_S", help="Quantum of the speed sensor.")
-    ] = None,
-    speed_noise: Annotated[
-        float, typer.Option(metavar="RAD_S", help="Noise of the speed sensor, rms.")
-    ] = 0.0,
-    current_sensor: Annotated[
-        bool, typer.Option(help="Whether the controller measures the current.")
-    ] = True,
-    spread: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PCT", help="Spread of each parameter; else as uncertain as the file says."
-        ),
-    ] = None,
+    setpoint: Setpoint = None,
+    voltage_limit: VoltageLimit = None,
+    current_limit: CurrentLimit = None,
+    sample_time: SampleTime = None,
+    max_overshoot: MaxOvershoot = 1.0,
+    max_settling: MaxSettling = None,
+    load_torque: LoadTorque = None,
+    delay: Delay = 1,
+    speed_step: SpeedStep = None,
+    speed_noise: SpeedNoise = 0.0,
+    current_sensor: CurrentSensor = True,
+    spread: Spread = None,
     save: SaveController = None,
     json: Json = None,
     report: Report = None,

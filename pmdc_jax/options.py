@@ -73,6 +73,37 @@ Controller = Annotated[
     str,
     typer.Option(metavar="NAME", help="pi, pid, state-feedback or state-feedback-integral."),
 ]
+Setpoint = Annotated[float | None, typer.Option(metavar="RAD_S", help="Speed to go to.")]
+VoltageLimit = Annotated[
+    float | None, typer.Option(metavar="V", help="Voltage there is, in either direction.")
+]
+CurrentLimit = Annotated[
+    float | None, typer.Option(metavar="A", help="Current that is allowed, none if not given.")
+]
+SampleTime = Annotated[
+    float | None, typer.Option(metavar="S", help="Of the controller. 1 ms, or less if needed.")
+]
+MaxOvershoot = Annotated[
+    float, typer.Option(metavar="PCT", help="Overshoot that is allowed, % of the step.")
+]
+MaxSettling = Annotated[
+    float | None, typer.Option(metavar="S", help="Settling time that is asked for.")
+]
+LoadTorque = Annotated[
+    float | None, typer.Option(metavar="NM", help="Load step that has to be withstood.")
+]
+Delay = Annotated[int, typer.Option(metavar="SAMPLES", help="From measurement to voltage: 0 or 1.")]
+SpeedStep = Annotated[
+    float | None, typer.Option(metavar="RAD_S", help="Quantum of the speed sensor.")
+]
+SpeedNoise = Annotated[float, typer.Option(metavar="RAD_S", help="Noise of the speed sensor, rms.")]
+CurrentSensor = Annotated[bool, typer.Option(help="Whether the controller measures the current.")]
+Spread = Annotated[
+    float | None,
+    typer.Option(
+        metavar="PCT", help="Spread of each parameter; else as uncertain as the file says."
+    ),
+]
 SaveController = Annotated[
     Path | None,
     typer.Option(metavar="CONTROLLER.json", help="Write the controller, for pmdc export."),

@@ -71,13 +71,13 @@ def table_2(paper: Paper) -> tuple[list[str], list[list[str]]]:
     ]
     rows = []
     for kind, printed in TABLE_2.items():
-        ours = paper.tunings[kind].metrics
+        ours, simulated = paper.tunings[kind].metrics, paper.as_printed.get(kind)
         limits = (paper.fastest[ENOUGH], paper.fastest[VOLTAGE])
         rows.append(
             [
                 f"{TITLES[kind]}, settling [s]",
-                significant(printed.settling, 2),
-                significant(printed.simulated_settling, 3),
+                f"{printed.settling:g}",
+                significant(simulated and simulated.settling, 3),
                 significant(ours["SettlingTime"], 3),
                 *(significant(limit, 3) for limit in limits),
             ]
@@ -85,8 +85,8 @@ def table_2(paper: Paper) -> tuple[list[str], list[list[str]]]:
         rows.append(
             [
                 f"{TITLES[kind]}, overshoot [%]",
-                significant(printed.overshoot, 4),
-                printed.simulated_overshoot or significant(None),
+                f"{printed.overshoot:g}",
+                significant(simulated and simulated.overshoot, 3),
                 significant(ours["Overshoot"], 2),
                 "0",
                 "0",
@@ -102,13 +102,20 @@ def remarks(paper: Paper) -> list[str]:
         " controller.",
         f"From rest, flat out, {VOLTAGE:g} V enters the 2 % band after {paper.fastest[VOLTAGE]:.4f} s; the printed"
         f" 0.08 s takes {ENOUGH:g} V ({paper.fastest[ENOUGH]:.4f} s).",
-        "The printed gains, simulated, do not give the printed figures: PI 11.6 % and 0.100 s instead of 37.83 % and"
-        " 0.16 s, PID 6 to 8 % and 0.084 s instead of 11.02 % and 0.18 s. (Quoted: the gains are not part of"
-        " this package.)",
+        *_printed_remarks(paper),
         "Equation (8) prints +R/L where equation (5) gives -R/L, and multiplies the load column by u.",
         "Kt and Kb are one constant in SI; the paper has 0.0501 and 0.0492.",
         "A motor of two poles never oscillates at any gain, so the Ziegler-Nichols rule has nothing to start from on"
         " the ideal loop.",
+    ]
+
+
+def _printed_remarks(paper: Paper) -> list[str]:
+    return [
+        f"The printed gains of the {TITLES[kind]}, simulated on the printed motor without any limit, give"
+        f" {found.overshoot:.1f} % and {found.settling:.3f} s instead of {TABLE_2[kind].overshoot:g} % and"
+        f" {TABLE_2[kind].settling:g} s, and ask for {found.peak_voltage:.0f} V on the way."
+        for kind, found in paper.as_printed.items()
     ]
 
 
@@ -136,10 +143,7 @@ def paper_json(paper: Paper) -> dict[str, Any]:
         "table_2": {
             kind: {
                 "printed": {"Overshoot": printed.overshoot, "SettlingTime": printed.settling},
-                "simulated_as_printed": {
-                    "Overshoot": printed.simulated_overshoot,
-                    "SettlingTime": printed.simulated_settling,
-                },
+                "simulated_as_printed": _as_printed(paper, kind),
                 "ours": dict(paper.tunings[kind].metrics),
             }
             for kind, printed in TABLE_2.items()
@@ -147,6 +151,17 @@ def paper_json(paper: Paper) -> dict[str, Any]:
         "fastest_possible_settling_s": {f"{volts:g} V": s for volts, s in paper.fastest.items()},
         "reach_rad_s": {f"{VOLTAGE:g} V": paper.reach},
         "remarks": remarks(paper),
+    }
+
+
+def _as_printed(paper: Paper, kind: str) -> dict[str, float] | None:
+    if kind not in paper.as_printed:
+        return None
+    found = paper.as_printed[kind]
+    return {
+        "Overshoot": found.overshoot,
+        "SettlingTime": found.settling,
+        "PeakVoltage": found.peak_voltage,
     }
 
 
@@ -214,6 +229,11 @@ def steps_figure(paper: Paper) -> go.Figure:
         voltage = go.Scatter(**shared, y=response.voltage, line=shape, showlegend=False)
         figure.add_trace(speed, row=1, col=1)
         figure.add_trace(voltage, row=2, col=1)
+        if kind in paper.as_printed:
+            printed = paper.as_printed[kind]
+            thin = {"color": colour, "width": 1.2, "dash": "dot"}
+            shared |= {"x": 1e3 * printed.time, "name": f"{TITLES[kind]}, printed gains"}
+            figure.add_trace(go.Scatter(**shared, y=printed.speed, line=thin), row=1, col=1)
     for level in (SETPOINT, LOWER):
         line = {"color": MEASURED, "width": 1, "dash": "dash"}
         # plotly's annotation of `row` knows only "all"
