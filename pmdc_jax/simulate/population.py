@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..effects.base import State
@@ -30,11 +31,8 @@ from .tape import BLOCK, Samples, Tape
 # Samples in a stride of linear motors, a power of two that divides a block: measured, 8 and 32 are slower.
 STRIDE = 16
 
-# The widest vectors, where the processor has them: by default XLA uses half of their width.
-_compiled = partial(jax.jit, compiler_options={"xla_cpu_prefer_vector_width": 512})
-
-# Candidates a thread takes at least: below this, handing them over costs more than it saves.
-SHARE = 64
+# Candidates a thread takes at least, linear and with effects: below this, handing them over costs more than it saves.
+LINEAR_SHARE, SHARE = 256, 32
 
 
 def squared_errors(
@@ -46,23 +44,39 @@ def squared_errors(
     state; unknown loads are taken as zero. A motor whose simulation fails gets infinity, never NaN.
     """
     size = motors.R.shape[0]
-    shares = max(1, min(os.cpu_count() or 1, size // SHARE))
+    least = SHARE if motors.effects else LINEAR_SHARE
+    shares = max(1, min(os.cpu_count() or 1, size // least))
     if shares == 1 or size % shares:  # unequal shares would be compiled once more
-        return _errors(motors, tape)
+        return _errors(motors, tape, 0)
     double = jax.config.read("jax_enable_x64")
 
     def part(k: int):
         with jax.enable_x64(double):  # the setting belongs to the thread
-            mine = slice(k * size // shares, (k + 1) * size // shares)
-            return _errors(jax.tree.map(lambda leaf: leaf[mine], motors), tape)
+            return jax.block_until_ready(_errors(motors, tape, k, shares))
 
     # XLA walks a population on one core; the cores share it out among them
-    with ThreadPoolExecutor(shares) as pool:
-        current, speed = zip(*pool.map(part, range(shares)), strict=True)
-    return jnp.concatenate(current), jnp.concatenate(speed)
+    parts = _threads().map(part, range(shares))
+    current, speed = (jnp.asarray(np.concatenate(errors)) for errors in zip(*parts, strict=True))
+    return current, speed
 
 
-def _errors(motors: Motor, tape: Tape):
+@cache
+def _threads() -> ThreadPoolExecutor:
+    """Kept: in a new thread the first call takes a millisecond longer than the next."""
+    return ThreadPoolExecutor(os.cpu_count() or 1)
+
+
+# The widest vectors, where the processor has them: by default XLA uses half of their width.
+@partial(jax.jit, static_argnames="shares", compiler_options={"xla_cpu_prefer_vector_width": 512})
+def _errors(motors: Motor, tape: Tape, share: int | Int[Array, ""], shares: int = 1):
+    """Of one of the equal shares of a population."""
+    if shares > 1:
+        size = motors.R.shape[0] // shares
+        mine = [
+            jax.lax.dynamic_slice_in_dim(x, share * size, size) for x in jax.tree.leaves(motors)
+        ]
+        # a slice that is merged into the arithmetic costs it its vector instructions
+        motors = jax.tree.unflatten(jax.tree.structure(motors), jax.lax.optimization_barrier(mine))
     return _errors_with_effects(motors, tape) if motors.effects else _errors_of_linear(motors, tape)
 
 
@@ -103,7 +117,6 @@ def _in_strides(samples: Float[Samples, "... samples"]) -> Float[Array, "... str
     return jnp.asarray(samples).reshape(*samples.shape[:-1], -1, STRIDE)
 
 
-@_compiled
 def _errors_of_linear(motors: Motor, tape: Tape):
     """One share of linear motors: its blocks one after another, the whole population in the state.
 
@@ -165,7 +178,6 @@ def _repeated(
     return jnp.broadcast_to(leaf[..., None, :], (*leaf.shape[:-1], rows, leaf.shape[-1]))
 
 
-@_compiled
 def _errors_with_effects(motors: Motor, tape: Tape):
     """One share of motors with effects, from sample to sample."""
     grids, steps = along_grids(motors, tape), steps_in_sample(motors, tape)
