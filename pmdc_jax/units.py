@@ -90,8 +90,8 @@ def _spellings(unit: str) -> Iterator[str]:
 @cache
 def _convert(unit: str, base: str) -> tuple[float, float]:
     """Scale and offset; `LookupError` if the unit is unknown, `ArithmeticError` if incompatible."""
-    if unit in (base, base.replace(" ", "")):
-        return 1.0, 0.0
+    if unit in (base, base.replace(" ", ""), base.replace("/", "_")):
+        return 1.0, 0.0  # pint takes a tenth of a second to wake up
     import pint
 
     try:
