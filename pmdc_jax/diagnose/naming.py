@@ -9,13 +9,14 @@ import numpy as np
 from scipy import stats
 
 from ..effects import EFFECTS
+from ..identify.colour import Whitener, whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Polished
+from ..identify.sharpen import residuals_of, sharpened, squares_of
 from .candidates import Candidate
 from .kinship import CONTAINS, are_rivals, is_within
 from .library import Library
-from .model import Model, ended, rows_of, sharpened, squares_of
-from .noise import Whitener, whitener
+from .model import Model, ended
 from .periodic import Line, line_of
 from .refits import Refits
 from .screen import Screen, Signal, beyond_curves, screen, signals
@@ -229,7 +230,7 @@ class Namer:
     def _left(self, model: Model, white: Whitener) -> Fitted:
         key = frozenset(model.effects), id(white)
         if key not in self.compared:
-            given, polished = sharpened(model, white)
+            given, polished = sharpened(model.given, model.polished, white)
             squares = squares_of(given, polished)
             samples = np.count_nonzero(given.problem.tape.weight)
             price = len(given.problem.parameters.names) * np.log(samples)
@@ -239,7 +240,7 @@ class Namer:
     def _white(self, model: Model) -> Whitener:
         key = frozenset(model.effects)
         if key not in self.filters:
-            self.filters[key] = whitener([fit.residual for fit in rows_of(model)])
+            self.filters[key] = whitener(residuals_of(model.given, model.polished))
         return self.filters[key]
 
     def _without(self, chosen: Model, white: Whitener) -> dict[str, float]:

@@ -71,10 +71,8 @@ def diagnose(
     named = time.perf_counter()
     report("judging the uncertainty", naming.chosen.polished.refined.fitness)
     base = judge(given, solved)
-    final = base
-    if naming.chosen.effects:
-        ended, polished = naming.ended
-        final = judge(ended, solved._replace(polished=polished))
+    ended, polished = naming.ended
+    final = judge(ended, solved._replace(polished=polished))
     verdict = _verdict(naming)
     gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
     seconds = {

@@ -11,15 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..effects import EFFECTS
+from ..identify.colour import Whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Refined, Unknowns, polish
+from ..identify.sharpen import sharpened, squares_of
 from ..identify.solve import POOR
 from ..identify.uncertainty import FLAT
 from .candidates import STARTS, Candidate, Values
 from .kinship import CONTAINS
 from .library import Library
-from .model import Model, settled, sharpened, squares_of
-from .noise import Whitener
+from .model import Model, settled
 from .screen import Screen, Signal
 
 # Share of the gain foretold by the evidence that a refit keeps, or else is tried in another way
@@ -119,11 +120,17 @@ class Refits:
         least squares."""
         given, begun = start
         model = settled(effects, given, begun, white)
-        before, after = (squares_of(*sharpened(m, white)) for m in (current, model))
+        before, after = (
+            squares_of(*sharpened(m.given, m.polished, white)) for m in (current, model)
+        )
         if before - after > KEPT * signal.gain:
             return model
         plainly = settled(effects, given, polish(given.problem, begun).refined, white)
-        return plainly if squares_of(*sharpened(plainly, white)) < after else model
+        return (
+            plainly
+            if squares_of(*sharpened(plainly.given, plainly.polished, white)) < after
+            else model
+        )
 
     def _start(
         self,

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import special, stats
 
+from ..identify.colour import Series, Whitener, plain, whitener
+from ..identify.sharpen import series_of
 from .candidates import Candidate
 from .evidence import Block, Evidence, products
 from .library import Curve, Library, curves_over
-from .model import Fit, Model, rows_of, series_of
-from .noise import Series, Whitener, plain, whitener
+from .model import Fit, Model, rows_of
 
 # How much stronger slow noise may be at the slowest waves than at most of them
 SLOWEST_WAVES = 1.5

@@ -14,6 +14,7 @@ from .identification import Identification
 from .judge import judge
 from .parameters import effects_named
 from .prepare import prepare
+from .sharpen import last_fit
 from .solve import solve
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def identify(
     )
     given, solved = solve(given, search, seed, progress)
     report("judging the uncertainty", solved.polished.refined.fitness)
-    found = judge(given, solved)
+    given, polished = last_fit(given, solved.polished)
+    found = judge(given, solved._replace(polished=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
     return attrs.evolve(found, seconds=seconds)

@@ -20,12 +20,15 @@ CHUNK = 32
 class Whitening(eqx.Module):
     """A filter for every run, r'(t) = S (r(t) - sum_k A_k r(t - k)), that leaves unit variance and no correlation.
 
+    Before a run begins there is no residual: its initial state is fitted, so nothing has added up by then. Without
+    these first samples nothing would tell of that state.
+
     **Source**: Aitken, Proceedings of the Royal Society of Edinburgh 55 (1936); Ljung, "System Identification",
     2nd edition, section 7.4.
     """
 
     bands: Float[Array, "runs white seen"]  # of a chunk's white rows, by the chunk before and by it
-    # one where all that the filter looks back on was measured
+    # one where all that the filter looks back on in the run was measured
     usable: Float[Array, "blocks 2 samples"]
 
     @classmethod
@@ -44,9 +47,9 @@ class Whitening(eqx.Module):
         for index, A in enumerate(filters):
             mine, counts = np.asarray(run) == index, np.any(scales[index], axis=0)
             whole = known[mine].reshape(-1, 2)[:, counts].all(1)
-            usable[mine] = (remembered(whole, len(A))[:, None] * counts).reshape(
-                -1, *known.shape[1:]
-            )
+            before = np.ones(len(A), bool)
+            whole = remembered(np.append(before, whole), len(A))[len(A) :]
+            usable[mine] = (whole[:, None] * counts).reshape(-1, *known.shape[1:])
         return cls(jnp.asarray(bands), jnp.asarray(np.moveaxis(usable, 2, 1)))
 
     def __call__(
@@ -55,11 +58,12 @@ class Whitening(eqx.Module):
         """Columns such as residuals, A and rad/s, made white."""
         blocks, outputs, samples, columns = signal.shape
         in_time = jnp.moveaxis(signal, 1, 2).reshape(-1, CHUNK * outputs, columns)
-        window = jnp.concatenate([jnp.roll(in_time, 1, axis=0), in_time], axis=1)
-        bands = self.bands[
-            jnp.repeat(jnp.asarray(run), samples // CHUNK, total_repeat_length=len(in_time))
-        ]
-        white = jnp.einsum("kij,kjc->kic", bands, window)
+        chunks = samples // CHUNK
+        of_chunk = jnp.repeat(jnp.asarray(run), chunks, total_repeat_length=len(in_time))
+        goes_on = (jnp.roll(of_chunk, 1) == of_chunk).at[0].set(False)
+        before = jnp.where(goes_on[:, None, None], jnp.roll(in_time, 1, axis=0), 0.0)
+        window = jnp.concatenate([before, in_time], axis=1)
+        white = jnp.einsum("kij,kjc->kic", self.bands[of_chunk], window)
         white = jnp.moveaxis(white.reshape(blocks, samples, outputs, columns), 2, 1)
         return white * self.usable[..., None]
 

@@ -1,4 +1,4 @@
-"""The noise of the recordings: an autoregression of the residuals, and what is left when it is taken out.
+"""The colour of the noise: an autoregression of the residuals, and what is left when it is taken out.
 
 Residuals of a free run are coloured even where the sensors are white: a torque that fluctuates is filtered by the
 motor. Tests for white noise would take that for an effect. So residuals, and whatever is regressed on them, are
@@ -16,10 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..identify.whitening import CHUNK, remembered
+from .whitening import CHUNK, remembered
 
 # Orders that are tried, none longer than `CHUNK`; the Bayesian criterion chooses.
 ORDERS = (1, 2, 4, 8, 12, 20, 30)
+# Noise of different runs is alike if its logarithm differs by no more
+ALIKE = 0.2
 # Frequencies of a run, from the lowest on, that are its slowest
 SLOWEST = 15
 
@@ -40,6 +42,15 @@ class Whitener(NamedTuple):
     filters: list[Float[np.ndarray, "order outputs outputs"]]
     scales: list[Float[np.ndarray, "outputs outputs"]]
     slow: list[float]  # by how much what is slow is stronger than the rest, at least one
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the noise is white, and as large in every run."""
+        sizes: dict[tuple[int, ...], list[np.ndarray]] = {}
+        for S in self.scales:
+            sizes.setdefault(S.shape, []).append(np.sqrt(np.diag(np.linalg.inv(S @ S.T))))
+        alike = all(np.ptp(np.log(of_kind), axis=0).max() < ALIKE for of_kind in sizes.values())
+        return alike and not any(len(A) for A in self.filters)
 
     def __call__(self, run: int, series: Series) -> Float[np.ndarray, "rows *columns"]:
         """The rows of a run, white if the series is its noise, those of all outputs one after another."""
@@ -109,7 +120,8 @@ def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order out
     for x in lagged:
         scaled = x / np.tile(units, longest + 1)
         gram += scaled.T @ scaled / (np.mean(np.square(scaled)) + 1e-300)
-    best, chosen = np.inf, np.zeros((0, outputs, outputs))
+    best = rows * np.linalg.slogdet(gram[:outputs, :outputs] / max(rows, 1))[1]
+    chosen = np.zeros((0, outputs, outputs))
     for order in ORDERS:
         if rows < 20 * order * outputs:
             break
