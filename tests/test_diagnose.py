@@ -337,19 +337,35 @@ def test_nothing_is_found_where_nothing_is_missing(noise):
     assert 0 < by_name["coulomb_friction"].amplitude < 0.05
 
 
-def test_a_weight_behind_a_gear_is_something_that_no_library_has():
-    """It comes round once in 11.6 turns, as slowly as the noise of a fluctuating torque."""
-    rng = np.random.default_rng(6)
-    plant = Plant(**PAPER, eccentric_Nm=0.02, eccentric_gear=11.6, eccentric_phase=1.0)
+def recorded_from(plant: Plant, seed: int, noise: vb.Noise) -> list[Recording]:
+    """Three runs of two seconds, in both directions."""
+    rng = np.random.default_rng(seed)
     runs = []
     for name, excitation in {
         "prbs": vb.prbs(rng, 2.0),
         "triangle": vb.slow_triangle(2.0),
         "loaded": vb.loaded(rng, 2.0),
     }.items():
-        columns = record(plant, excitation, rng, NOISE, Bench({}))
+        columns = record(plant, excitation, rng, noise, Bench({}))
         runs.append(Recording(name, *(columns[q] for q in QUANTITIES), load=columns[LOAD]))
-    found = diagnose(runs)
+    return runs
+
+
+def test_a_bearing_that_seizes_is_no_coulomb_friction():
+    """Torque noise is slow too, but does not turn with the direction of motion."""
+    plant = Plant(**PAPER, seizing_Nm=0.04, seizing_from_s=1.0)
+    found = diagnose(recorded_from(plant, 6, SHAKEN))
+    assert found.verdict == "not_in_library"
+    curve = found.curves[0]
+    assert (curve.variable, curve.reverses) == ("time", True)
+    early, late = curve.value[1:3], curve.value[4:6]
+    assert late.mean() - early.mean() == pytest.approx(0.04, rel=0.3)
+
+
+def test_a_weight_behind_a_gear_is_something_that_no_library_has():
+    """It comes round once in 11.6 turns, as slowly as the noise of a fluctuating torque."""
+    plant = Plant(**PAPER, eccentric_Nm=0.02, eccentric_gear=11.6, eccentric_phase=1.0)
+    found = diagnose(recorded_from(plant, 6, NOISE))
     assert found.verdict == "not_in_library"
     assert {curve.variable for curve in found.curves[:1]} == {"angle"}
     turn = found.curves[0].x[-1] / (2 * np.pi)

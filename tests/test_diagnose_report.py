@@ -102,7 +102,7 @@ def ambiguous() -> Diagnosis:
 def not_in_library() -> Diagnosis:
     x = np.array([-100.0, 0.0, 40.0, 100.0])
     value, stderr = np.array([0.0, 0.001, -0.03, 0.0]), np.full(4, 0.002)
-    curve = LearnedCurve("mechanical", "speed", "N m", x, value, stderr, 1e-8)
+    curve = LearnedCurve("mechanical", "speed", "N m", x, value, stderr, 1e-8, reverses=False)
     return named(verdict="not_in_library", effects=(), curves=(curve,))
 
 

@@ -45,6 +45,7 @@ class LearnedCurve:
     value: np.ndarray
     stderr: np.ndarray
     p_value: float
+    reverses: bool  # turns with the direction of motion, as friction does
 
 
 @frozen

@@ -39,6 +39,8 @@ class Curve(NamedTuple):
     own: bool = False  # every run has a curve of its own
     # (knots, columns): the columns at the knots, where they are no hats
     shapes: np.ndarray | None = None
+    # turns with the direction of motion, as a friction that changes does
+    reverses: bool = False
 
     def values(self, coefficients: np.ndarray) -> np.ndarray:
         """The curve at its knots."""
@@ -146,6 +148,9 @@ def curves_over(library: Library, tape: Tape, path: Path, count: int):
             knots = np.linspace(0, 1, KNOTS_IN_TIME) if own else _knots(x, weight)
             hats = jnp.stack([_hat(x, knots, k) for k in range(len(knots))], -1)
             terms.append((push, hats, Curve(equation, variable, knots, own)))
+            if own and equation == "mechanical":
+                turning = _direction(path.speed, tape)[..., None] * hats
+                terms.append((push, turning, Curve(equation, variable, knots, own, reverses=True)))
     for periods in BEHIND_GEAR:
         turned = np.linspace(0, 2 * np.pi / periods, KNOTS_IN_PERIOD)
         curve = Curve("mechanical", "angle", turned, True, np.asarray(_wave(periods * turned)))
@@ -156,6 +161,15 @@ def curves_over(library: Library, tape: Tape, path: Path, count: int):
         count += shape.shape[-1]
     kicked = jnp.concatenate([push[..., None] * shape[:, None] for push, shape, _ in terms], -1)
     return respond(library.bare, tape, path, kicked), [curve for *_, curve in terms], blocks
+
+
+def _direction(speed, tape: Tape) -> jax.Array:
+    """That of motion, less its mean over each run: where it never changes, a friction is but a torque."""
+    direction = jnp.sign(speed)
+    mean = jax.ops.segment_sum(direction.mean(0), tape.run, tape.runs) / jnp.bincount(
+        jnp.asarray(tape.run), length=tape.runs
+    )
+    return direction - mean[tape.run]
 
 
 def _wave(phase) -> jax.Array:

@@ -66,7 +66,7 @@ class Seen(NamedTuple):
     @property
     def unexplained(self) -> float:
         """What the clearest signal would still take away, over what the model takes away already."""
-        return self.clearest.gain / self.explained if self.explained > 0 else np.inf
+        return float(self.clearest.gain / self.explained) if self.explained > 0 else np.inf
 
     def asks_for_more(self) -> bool:
         """Whether more is missing than the formulas of the model's effects leave to be desired."""
@@ -78,7 +78,7 @@ class Seen(NamedTuple):
         """Whether one more effect, after which the evidence is `again`, is more than a way to mend the formula of those
         that were there: then no more than a share is left."""
         clear = self.unexplained > FORMULA or again.left >= ALARM
-        return clear or again.clearest.gain < share * self.clearest.gain
+        return bool(clear or again.clearest.gain < share * self.clearest.gain)
 
     def is_formula(self, model: Model) -> bool:
         """Whether what is left may well be that of the model's effects by formulas of nature's own."""

@@ -193,6 +193,7 @@ def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
                 curve.values(value),
                 curve.errors(error),
                 float(np.exp(chance)),
+                curve.reverses,
             )
         )
     return tuple(sorted(learned, key=lambda c: c.p_value)[:3])

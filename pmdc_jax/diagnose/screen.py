@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import special, stats
 
+from ..effects import EFFECTS
 from ..identify.colour import Series, Whitener, plain, whitener
 from ..identify.sharpen import series_of
 from .candidates import Candidate
@@ -19,9 +20,11 @@ from .model import Fit, Model, rows_of
 
 # How much stronger slow noise may be at the slowest waves than at most of them
 SLOWEST_WAVES = 1.5
-# How much stronger slow noise may be over the few knots of a curve over time than over all the slowest frequencies: of
-# a torque that keeps for 0.2 s, in runs of some seconds
+# How much stronger the noise of a torque may be over the few knots of a curve over time than a filter makes of it,
+# where it keeps for 0.2 s and runs take some seconds
 SLOWER = 4.0
+# What a torque that drifts gains in white noise, over its degrees of freedom, at most: of some forty
+BY_CHANCE = 1.25
 
 
 class Screen(NamedTuple):
@@ -92,25 +95,58 @@ class Signal(NamedTuple):
 def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     """Of every candidate that physics allows, and of every curve; the most significant first."""
     base = found.evidence.regress().squares
+    # rows that no filter has made white all drift
+    drift = _drift(found) if found.evidence is not found.unfiltered else None
 
-    def gain_of(block: Block) -> float:
-        return max(base - found.evidence.regress([block]).squares, 0.0)
-
-    def signal(gain: float, of: Candidate | Curve, block: Block) -> Signal:
+    def signal(of: Candidate | Curve, block: Block, gain: float) -> Signal:
+        if drift is not None and _is_slow_torque(of):
+            gain /= _beside(found, block, drift)
         return Signal(gain, log_chance(gain, found.evidence.freedom(block)), of, block)
 
     of_candidates = []
     for candidate, block in zip(found.candidates, found.of_candidate, strict=True):
         fit = found.evidence.regress([block])
         if found.possible(candidate, fit.coefficients[0]):
-            of_candidates.append(signal(max(base - fit.squares, 0.0), candidate, block))
-    gains = np.array([gain_of(block) for block in found.of_curve])
+            of_candidates.append(signal(candidate, block, max(base - fit.squares, 0.0)))
+    gains = np.array([_gain(found, [block]) for block in found.of_curve])
     waves = np.array([curve.shapes is not None for curve in found.curves])
     gains[waves] /= _dispersion(found, gains[waves], found.of_curve[-1])
-    in_time = np.array([curve.variable == "time" for curve in found.curves])
-    gains[in_time] /= min(1 + SLOWER * (max(found.white.slow) - 1), SLOWER)
-    of_curves = [signal(*one) for one in zip(gains, found.curves, found.of_curve, strict=True)]
+    for k, curve in enumerate(found.curves):
+        if drift is not None and curve.reverses:
+            # a torque that fluctuates slowly is noise; a friction that changes is not, as it turns with the motion
+            gains[k] = _gain(found, [drift, found.of_curve[k]]) - _gain(found, [drift])
+        elif found.of_curve[k] is drift:
+            gains[k] /= SLOWER
+    of_curves = [signal(*one) for one in zip(found.curves, found.of_curve, gains, strict=True)]
     return sorted(of_candidates, key=_log_p), sorted(of_curves, key=_log_p)
+
+
+def _gain(found: Screen, blocks: Sequence[Block]) -> float:
+    return max(found.evidence.regress().squares - found.evidence.regress(blocks).squares, 0.0)
+
+
+def _drift(found: Screen) -> Block | None:
+    """A torque that drifts in every run in its own way; None where encoders are too coarse to tell."""
+    for curve, block in zip(found.curves, found.of_curve, strict=True):
+        if (curve.equation, curve.variable, curve.reverses) == ("mechanical", "time", False):
+            return block
+    return None
+
+
+def _is_slow_torque(of: Candidate | Curve) -> bool:
+    """Whether something is a torque that changes no faster than the motion: slow noise may look like it."""
+    kind = EFFECTS[of.effect] if isinstance(of, Candidate) else of
+    return kind.equation == "mechanical" and kind.variable in ("speed", "current")
+
+
+def _beside(found: Screen, block: Block, drift: Block) -> float:
+    """How much more than by chance a torque gains that drifts beside a block.
+
+    A filter leaves a weak fluctuation of some tenths of a second, hidden beneath the noise of the sensors, and the
+    block takes its share of it.
+    """
+    rest = _gain(found, [block, drift]) - _gain(found, [block])
+    return max(rest / found.evidence.freedom(drift) / BY_CHANCE, 1.0)
 
 
 def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> float:

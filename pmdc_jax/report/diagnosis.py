@@ -192,7 +192,8 @@ def _gave_away(diagnosis: Diagnosis) -> tuple[str, str]:
 
 def _curve(curve: LearnedCurve) -> dict[str, Any]:
     return {
-        "title": f"{curve.equation} equation over {AXES.get(curve.variable, curve.variable)}",
+        "title": f"{'friction' if curve.reverses else curve.equation + ' equation'} over"
+        f" {AXES.get(curve.variable, curve.variable)}",
         "chance": chance(curve.p_value),
         "figure": figure_json(curve_figure(curve)),
     }

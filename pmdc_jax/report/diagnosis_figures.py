@@ -173,7 +173,8 @@ def curve_figure(curve: LearnedCurve) -> go.Figure:
     )
     style(figure, height=300)
     figure.update_xaxes(title_text=AXES.get(curve.variable, curve.variable))
-    kind = "torque [N·m]" if curve.unit == "N m" else f"voltage [{curve.unit}]"
+    torque = "friction [N·m]" if curve.reverses else "torque [N·m]"
+    kind = torque if curve.unit == "N m" else f"voltage [{curve.unit}]"
     figure.update_yaxes(title_text=kind, zeroline=True, zerolinecolor=INK)
     return figure
 

@@ -97,7 +97,8 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
         curve = diagnosis.curves[0]
         known = curve.stderr > 0
         peak = int(np.argmax(np.abs(curve.value) / np.where(known, curve.stderr, np.inf)))
-        kind = "torque opposing motion" if curve.unit == "N m" else "voltage at the terminals"
+        torque = "friction" if curve.reverses else "torque opposing motion"
+        kind = torque if curve.unit == "N m" else "voltage at the terminals"
         sentences.append(
             f"Drawn by the data it looks most like a {kind} over {curve.variable}, clearest"
             f" with {amount(curve.value[peak], curve.unit)} {place(curve.variable, curve.x[peak])}"
