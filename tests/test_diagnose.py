@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import resources
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,7 @@ from pmdc_jax.identify.colour import Series, whitener
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.refine import Refined, Unknowns, polish
 from pmdc_jax.motor import PARAMETERS, Motor
+from pmdc_jax.recording import read_recording
 from pmdc_jax.simulate import Tape, free_run
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
@@ -335,6 +337,20 @@ def test_nothing_is_found_where_nothing_is_missing(noise):
         assert estimate.stderr < 1.2 * found.base.parameters[name].stderr, name
     by_name = {d.effect: d for d in found.detectable}
     assert 0 < by_name["coulomb_friction"].amplitude < 0.05
+
+
+def test_the_packaged_sample_hides_a_dry_friction():
+    """What the tour shows: 12 mN m, in torque noise."""
+    folder = resources.files("pmdc_jax") / "sample"
+    runs = [
+        read_recording(folder / f"{n}.csv") for n in ("staircase", "prbs", "triangle", "loaded")
+    ]
+    found = diagnose(runs, [read_recording(folder / "drive.csv")])
+    assert found.verdict == "named"
+    (effect,) = found.effects
+    assert effect.name == "coulomb_friction"
+    assert effect.parameters["torque_Nm"].value == pytest.approx(0.012, rel=0.04)
+    assert found.closed_fraction > 0.99
 
 
 def recorded_from(plant: Plant, seed: int, noise: vb.Noise) -> list[Recording]:

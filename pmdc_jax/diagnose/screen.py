@@ -99,9 +99,10 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     drift = _drift(found) if found.evidence is not found.unfiltered else None
 
     def signal(of: Candidate | Curve, block: Block, gain: float) -> Signal:
+        noise = 1.0
         if drift is not None and _is_slow_torque(of):
-            gain /= _beside(found, block, drift)
-        return Signal(gain, log_chance(gain, found.evidence.freedom(block)), of, block)
+            noise = _beside(found, block, drift)
+        return Signal(gain, log_chance(gain / noise, found.evidence.freedom(block)), of, block)
 
     of_candidates = []
     for candidate, block in zip(found.candidates, found.of_candidate, strict=True):
