@@ -64,7 +64,7 @@ class Library:
         self.candidates = [
             c for c in candidates(self.scales) if known or not EFFECTS[c.effect].needs_current
         ]
-        # errors that last look like a change in time
+        # errors that last look like a voltage that changes in time
         speeds = [run.speed for run in base.given.training if run.speed is not None]
         self.coarse = any(is_coarse(speed) for speed in speeds)
         self._whole: dict[int, jax.Array] = {}
@@ -142,7 +142,7 @@ def curves_over(library: Library, tape: Tape, path: Path, count: int):
             continue
         push = torque if equation == "mechanical" else volt
         for variable in variables:
-            if variable == "time" and library.coarse:
+            if variable == "time" and library.coarse and equation == "electrical":
                 continue
             own, x = variable == "time", known[variable]
             knots = np.linspace(0, 1, KNOTS_IN_TIME) if own else _knots(x, weight)

@@ -136,8 +136,10 @@ def _drift(found: Screen) -> Block | None:
 
 def _is_slow_torque(of: Candidate | Curve) -> bool:
     """Whether something is a torque that changes no faster than the motion: slow noise may look like it."""
-    kind = EFFECTS[of.effect] if isinstance(of, Candidate) else of
-    return kind.equation == "mechanical" and kind.variable in ("speed", "current")
+    if isinstance(of, Candidate):
+        effect = EFFECTS[of.effect]
+        return effect.equation == "mechanical" and not effect.states
+    return of.equation == "mechanical" and of.variable in ("speed", "current")
 
 
 def _beside(found: Screen, block: Block, drift: Block) -> float:
