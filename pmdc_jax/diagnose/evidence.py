@@ -99,10 +99,10 @@ def _inverse(
 
 
 def products(
-    shared: Sequence[Float[np.ndarray, "rows shared"]],
-    local: Sequence[Float[np.ndarray, "rows local"]],
-    columns: Sequence[Float[np.ndarray, "rows columns"]],
-    residual: Sequence[Float[np.ndarray, " rows"]],
+    shared: Sequence[Float[np.ndarray, "_ shared"]],
+    local: Sequence[Float[np.ndarray, "_ local"]],
+    columns: Sequence[Float[np.ndarray, "_ columns"]],
+    residual: Sequence[Float[np.ndarray, " _"]],
 ) -> Evidence:
     """Gather the evidence from white rows, one array a run of each."""
     gathered = []
