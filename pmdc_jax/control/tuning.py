@@ -175,8 +175,9 @@ def tune(
     motors, judges = _motors(motor, uncertainty, spread, seed)
     if progress:
         progress("tuning from many starts")
-    task = _task(specification, motor, seed)
-    law = Law.of(_tuned(specification, task, motors, seed, starts), task.hardware, motor)
+    white = np.random.default_rng(seed).standard_normal(PARTS * specification.samples)
+    task = _task(specification, motor, white)
+    law = Law.of(_tuned(specification, task, motors, white, seed, starts), task.hardware, motor)
     if progress:
         progress("judging the loop", fraction=0.8)
     result = Tuning(
@@ -204,10 +205,9 @@ def robustness(tuning: Tuning, spread: float, seed: int) -> Robustness | None:
         return judged("tuned", tuning.task, tuning.motor, tuning.controller, judges).robust
 
 
-def _task(specification: Specification, motor: Motor, seed: int) -> Task:
+def _task(specification: Specification, motor: Motor, white: np.ndarray) -> Task:
     """What is simulated and judged; its noise has the size of the sensor's."""
     asked = specification.asked
-    white = np.random.default_rng(seed).standard_normal(PARTS * specification.samples)
     return Task(
         hardware=specification.hardware(),
         setpoint=jnp.asarray(specification.setpoint),
@@ -224,7 +224,12 @@ def _task(specification: Specification, motor: Motor, seed: int) -> Task:
 
 
 def _tuned(
-    specification: Specification, task: Task, motors: Motor, seed: int, starts: int
+    specification: Specification,
+    task: Task,
+    motors: Motor,
+    white: np.ndarray,
+    seed: int,
+    starts: int,
 ) -> AbstractController:
     """The best of many starts, tuned with some noise even where there is none."""
     nominal = jax.tree.map(lambda leaf: leaf[0], motors)
@@ -232,7 +237,6 @@ def _tuned(
     period, kind = task.hardware.sample_time, specification.asked.controller
     space = GainSpace(kind, stiffness, task.limit, period, nominal, task.setpoint)
     least = TUNING_NOISE * abs(specification.setpoint)
-    white = np.random.default_rng(seed).standard_normal(task.noise.size)
     shaken = jnp.asarray(max(specification.asked.speed_noise, least) * white)
     noisy = eqx.tree_at(lambda t: t.noise, task, shaken)
     coordinates, _ = tuned(noisy, space, motors, seed, starts)

@@ -11,7 +11,14 @@ from ..effects import EFFECTS, CoulombFriction
 from ..identify.colour import Series, Whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Polished, Refined, polish
-from ..identify.sharpen import nearer, series_of, sharpened, training_runs, whitened
+from ..identify.sharpen import (
+    nearer,
+    residuals_of,
+    series_of,
+    sharpened,
+    training_runs,
+    whitened,
+)
 from ..identify.solve import settle
 from ..identify.turning import turned
 from ..motor import Motor
@@ -86,9 +93,10 @@ class Fit(NamedTuple):
 def rows_of(model: Model) -> list[Fit]:
     """The fit of every training run, in the order of time."""
     evaluation, tape = model.polished.evaluation, model.given.problem.tape
-    noise = model.polished.noise[:, None]
-    J = np.asarray(evaluation.jacobian) * noise[..., None]
-    r = -np.asarray(evaluation.residuals) * noise
+    J = np.asarray(evaluation.jacobian) * model.polished.noise[:, None, None]
     count = model.given.problem.free.shape[0]
-    parts = (J[..., :count], J[..., count:], r)
-    return [Fit(*(series_of(tape, run, part) for part in parts)) for run in model.training]
+    residuals = residuals_of(model.given, model.polished)
+    return [
+        Fit(series_of(tape, run, J[..., :count]), series_of(tape, run, J[..., count:]), residual)
+        for run, residual in zip(model.training, residuals, strict=True)
+    ]

@@ -109,21 +109,22 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
         fit = found.evidence.regress([block])
         if found.possible(candidate, fit.coefficients[0]):
             of_candidates.append(signal(candidate, block, max(base - fit.squares, 0.0)))
-    gains = np.array([_gain(found, [block]) for block in found.of_curve])
+    gains = np.array([max(base - _left(found, block), 0.0) for block in found.of_curve])
     waves = np.array([curve.shapes is not None for curve in found.curves])
     gains[waves] /= _dispersion(found, gains[waves], found.of_curve[-1])
     for k, curve in enumerate(found.curves):
         if drift is not None and curve.reverses:
             # a torque that fluctuates slowly is noise; a friction that changes is not, as it turns with the motion
-            gains[k] = _gain(found, [drift, found.of_curve[k]]) - _gain(found, [drift])
+            gains[k] = _left(found, drift) - _left(found, drift, found.of_curve[k])
         elif found.of_curve[k] is drift:
             gains[k] /= SLOWER
     of_curves = [signal(*one) for one in zip(found.curves, found.of_curve, gains, strict=True)]
     return sorted(of_candidates, key=_log_p), sorted(of_curves, key=_log_p)
 
 
-def _gain(found: Screen, blocks: Sequence[Block]) -> float:
-    return max(found.evidence.regress().squares - found.evidence.regress(blocks).squares, 0.0)
+def _left(found: Screen, *blocks: Block) -> float:
+    """The squares that some blocks together leave."""
+    return found.evidence.regress(blocks).squares
 
 
 def _drift(found: Screen) -> Block | None:
@@ -148,7 +149,7 @@ def _beside(found: Screen, block: Block, drift: Block) -> float:
     A filter leaves a weak fluctuation of some tenths of a second, hidden beneath the noise of the sensors, and the
     block takes its share of it.
     """
-    rest = _gain(found, [block, drift]) - _gain(found, [block])
+    rest = _left(found, block) - _left(found, block, drift)
     return max(rest / found.evidence.freedom(drift) / BY_CHANCE, 1.0)
 
 

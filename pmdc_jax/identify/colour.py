@@ -41,7 +41,6 @@ class Whitener(NamedTuple):
 
     filters: list[Float[np.ndarray, "order outputs outputs"]]
     scales: list[Float[np.ndarray, "outputs outputs"]]
-    slow: list[float]  # by how much what is slow is stronger than the rest, at least one
 
     @property
     def is_plain(self) -> bool:
@@ -73,13 +72,13 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
         _slow_power(_filtered(series, A) @ S.T)
         for series, A, S in zip(residuals, filters, scales, strict=True)
     ]
-    return Whitener(filters, [S / np.sqrt(s) for S, s in zip(scales, slow, strict=True)], slow)
+    return Whitener(filters, [S / np.sqrt(s) for S, s in zip(scales, slow, strict=True)])
 
 
 def plain(residuals: Sequence[Series]) -> Whitener:
     """No filter at all, only the scale of every run."""
     filters = [np.zeros((0, *2 * s.values.shape[1:2])) for s in residuals]
-    return Whitener(filters, _scales(residuals, filters), [1.0] * len(residuals))
+    return Whitener(filters, _scales(residuals, filters))
 
 
 def _slow_power(white: Rows) -> float:

@@ -1,7 +1,7 @@
 """The last fit: to residuals that a filter makes white, where those of plain least squares are not.
 
 Where a torque fluctuates, plain least squares lets the slow part of the residuals, most of which is noise, outvote
-the rest: in torque noise of 20 ms this fit has a fifth of its scatter in R and L, half of it in Kt and J.
+the rest: in torque noise of 20 ms this fit has a seventh of its scatter in R, a third in L, six tenths in Kt and J.
 
 **Source**: Aitken, Proceedings of the Royal Society of Edinburgh 55 (1936), with a filter estimated from the residuals
 of plain least squares.
