@@ -19,6 +19,7 @@ from scipy.signal import lfilter
 from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, identify
 from pmdc_jax.identify.binary_ga import BinaryGA
+from pmdc_jax.identify.colour import whitener
 from pmdc_jax.identify.identification import Identification
 from pmdc_jax.identify.judge import judge
 from pmdc_jax.identify.noise import is_coarse, quantum, white_noise
@@ -26,7 +27,7 @@ from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.refine import Problem, Unknowns, evaluate, polish, refine
 from pmdc_jax.identify.search import METHODS, Found, search
-from pmdc_jax.identify.sharpen import last_fit
+from pmdc_jax.identify.sharpen import last_fit, residuals_of
 from pmdc_jax.identify.solve import _distinct, solve
 from pmdc_jax.identify.uncertainty import information, long_run_variance
 from pmdc_jax.identify.whitening import Whitening
@@ -325,13 +326,17 @@ def test_whitening_is_its_formula_sample_by_sample():
             np.testing.assert_allclose(found[t], expected, atol=1e-6, err_msg=f"{index} {t}")
 
 
+def _last_fit(given, plainly):
+    return last_fit(given, plainly, plainly.refined, whitener(residuals_of(given, plainly)))
+
+
 def test_torque_noise_is_filtered_out():
     """The last fit is to white residuals: for R it is several times as good as plain least squares."""
     noise = replace(NOISE, torque_Nm=0.05, torque_correlation_s=0.02)
     runs = light_and_loaded(3, noise=noise)
     with jax.enable_x64(True):
         given, solved = solve(prepare(runs, []), "cma_es", 0)
-        sharper, last = last_fit(given, solved.polished)
+        sharper, last = _last_fit(given, solved.polished)
         plain = judge(given, solved).parameters
         sharp = judge(sharper, solved._replace(polished=last)).parameters
     assert last.refined.converged
@@ -348,7 +353,7 @@ def test_torque_noise_is_filtered_out():
 def test_white_noise_asks_for_no_filter(runs):
     with jax.enable_x64(True):
         given, solved = solve(prepare(runs, []), "cma_es", 0)
-        assert last_fit(given, solved.polished)[1] is solved.polished
+        assert _last_fit(given, solved.polished)[1] is solved.polished
 
 
 def test_one_start_has_a_middling_inductance():

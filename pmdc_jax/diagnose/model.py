@@ -12,10 +12,9 @@ from ..identify.colour import Series, Whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Polished, Refined, polish
 from ..identify.sharpen import (
-    nearer,
+    last_fit,
     residuals_of,
     series_of,
-    sharpened,
     training_runs,
     whitened,
 )
@@ -73,12 +72,8 @@ def model_of(effects: tuple[str, ...], given: Prepared, polished: Polished) -> M
 
 
 def ended(model: Model, white: Whitener) -> tuple[Prepared, Polished]:
-    """The last fit of a model: to white residuals, unless that is far from reproducing the runs as they are, as where
-    a formula is not quite nature's."""
-    plainly = settle(model.given, model.polished.refined)
-    if white.is_plain:
-        return plainly
-    return nearer(*plainly, sharpened(model.given, model.polished, white))
+    """The last fit of a model."""
+    return last_fit(*settle(model.given, model.polished.refined), model.polished.refined, white)
 
 
 class Fit(NamedTuple):

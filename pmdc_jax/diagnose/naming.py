@@ -230,7 +230,7 @@ class Namer:
     def _left(self, model: Model, white: Whitener) -> Fitted:
         key = frozenset(model.effects), id(white)
         if key not in self.compared:
-            given, polished = sharpened(model.given, model.polished, white)
+            given, polished = sharpened(model.given, model.polished.refined, white)
             squares = squares_of(given, polished)
             samples = np.count_nonzero(given.problem.tape.weight)
             price = len(given.problem.parameters.names) * np.log(samples)

@@ -121,14 +121,14 @@ class Refits:
         given, begun = start
         model = settled(effects, given, begun, white)
         before, after = (
-            squares_of(*sharpened(m.given, m.polished, white)) for m in (current, model)
+            squares_of(*sharpened(m.given, m.polished.refined, white)) for m in (current, model)
         )
         if before - after > KEPT * signal.gain:
             return model
         plainly = settled(effects, given, polish(given.problem, begun).refined, white)
         return (
             plainly
-            if squares_of(*sharpened(plainly.given, plainly.polished, white)) < after
+            if squares_of(*sharpened(plainly.given, plainly.polished.refined, white)) < after
             else model
         )
 

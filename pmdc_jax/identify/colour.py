@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .whitening import CHUNK, remembered
+from .whitening import band, remembered
 
-# Orders that are tried, none longer than `CHUNK`; the Bayesian criterion chooses.
+# Orders that are tried, none longer than a `CHUNK`; the Bayesian criterion chooses.
 ORDERS = (1, 2, 4, 8, 12, 20, 30)
 # Noise of different runs is alike if its logarithm differs by no more
 ALIKE = 0.2
@@ -144,16 +144,11 @@ def _lagged(series: Series, order: int) -> Float[np.ndarray, "rows lags"]:
 def _filtered(series: Series, filters: Float[np.ndarray, "order outputs outputs"]) -> Rows:
     values, order, outputs = series.values, len(filters), series.values.shape[1]
     flat = np.ascontiguousarray(values).reshape(len(values) * outputs, -1)
-    band = np.zeros((CHUNK, outputs, CHUNK + order, outputs))
-    here = np.arange(CHUNK)
-    band[here, :, here + order] = np.eye(outputs)
-    for k, A in enumerate(filters, start=1):
-        band[here, :, here + order - k] = -A
-    band = band.reshape(CHUNK * outputs, -1)
+    by_chunk = band(filters, np.eye(outputs))
     rest = np.empty(((len(values) - order) * outputs, flat.shape[1]))
-    for first in range(0, len(rest), len(band)):
-        window = flat[first : first + band.shape[1]]
-        part = rest[first : first + len(band)]
-        part[:] = band[: len(part), : len(window)] @ window
+    for first in range(0, len(rest), len(by_chunk)):
+        window = flat[first : first + by_chunk.shape[1]]
+        part = rest[first : first + len(by_chunk)]
+        part[:] = by_chunk[: len(part), : len(window)] @ window
     rest = rest.reshape(len(values) - order, *values.shape[1:])
     return rest[remembered(series.known, order)[order:]]

@@ -10,11 +10,12 @@ import attrs
 
 from ..precision import double_precision
 from ..recording import Recording
+from .colour import whitener
 from .identification import Identification
 from .judge import judge
 from .parameters import effects_named
 from .prepare import prepare
-from .sharpen import last_fit
+from .sharpen import last_fit, residuals_of
 from .solve import solve
 
 if TYPE_CHECKING:
@@ -54,7 +55,9 @@ def identify(
     )
     given, solved = solve(given, search, seed, progress)
     report("judging the uncertainty", solved.polished.refined.fitness)
-    given, polished = last_fit(given, solved.polished)
+    plainly = solved.polished
+    white = whitener(residuals_of(given, plainly))
+    given, polished = last_fit(given, plainly, plainly.refined, white)
     found = judge(given, solved._replace(polished=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
     return attrs.evolve(found, seconds=seconds)

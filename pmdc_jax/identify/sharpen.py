@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from ..simulate import Tape
-from .colour import Series, Whitener, whitener
+from .colour import Series, Whitener
 from .prepare import Prepared
-from .refine import Polished, polish
+from .refine import Polished, Refined, polish
 from .whitening import Whitening
 
 # Gauss-Newton steps from one fit to white residuals to another
@@ -25,30 +25,25 @@ STEPS = 8
 NEAR = 1.1
 
 
-def last_fit(given: Prepared, plainly: Polished) -> tuple[Prepared, Polished]:
-    """The fit to white residuals, if the residuals of plain least squares ask for it.
+def last_fit(
+    given: Prepared, plainly: Polished, near: Refined, white: Whitener
+) -> tuple[Prepared, Polished]:
+    """The fit to residuals that a filter makes white, found from a fit `near` it, if plain least squares asks for it.
 
-    Not where it is far from reproducing the runs as they are, as where the motor has an effect that the model lacks:
-    the filter then takes what is missing for noise.
+    Not where it is far from reproducing the runs as they are, as where the motor has an effect that the model lacks
+    or a formula is not quite nature's: the filter then takes what is missing for noise.
     """
-    white = whitener(residuals_of(given, plainly))
     if white.is_plain:
         return given, plainly
-    return nearer(given, plainly, sharpened(given, plainly, white))
-
-
-def nearer(
-    given: Prepared, plainly: Polished, sharp: tuple[Prepared, Polished]
-) -> tuple[Prepared, Polished]:
-    """A fit to white residuals, or the plain one where that is far better at reproducing the runs."""
+    sharp = sharpened(given, near, white)
     as_it_is = polish(given.problem, sharp[1].refined, steps=0).refined.fitness
     return sharp if as_it_is < NEAR * plainly.refined.fitness else (given, plainly)
 
 
-def sharpened(given: Prepared, fit: Polished, white: Whitener) -> tuple[Prepared, Polished]:
+def sharpened(given: Prepared, near: Refined, white: Whitener) -> tuple[Prepared, Polished]:
     """The problem of fitting to residuals that a filter makes white, and its solution from a fit nearby."""
     given = whitened(given, white)
-    return given, polish(given.problem, fit.refined, STEPS)
+    return given, polish(given.problem, near, STEPS)
 
 
 def squares_of(given: Prepared, polished: Polished) -> float:

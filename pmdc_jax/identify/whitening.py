@@ -41,7 +41,8 @@ class Whitening(eqx.Module):
     ) -> Whitening:
         """By the coefficients A and the scale S of every run; `weight` is zero where nothing was measured, `run` the
         run of each block."""
-        bands = np.stack([_band(A, S) for A, S in zip(filters, scales, strict=True)])
+        longest = [np.append(A, np.zeros((CHUNK - len(A), 2, 2)), axis=0) for A in filters]
+        bands = np.stack([band(A, S) for A, S in zip(longest, scales, strict=True)])
         known = np.moveaxis(np.asarray(weight) > 0, 1, 2)
         usable = np.zeros(known.shape)
         for index, A in enumerate(filters):
@@ -68,12 +69,16 @@ class Whitening(eqx.Module):
         return white * self.usable[..., None]
 
 
-def _band(A: Float[np.ndarray, "order 2 2"], S: Float[np.ndarray, "2 2"]) -> np.ndarray:
-    band = np.zeros((CHUNK, 2, 2 * CHUNK, 2))
+def band(
+    A: Float[np.ndarray, "order outputs outputs"], S: Float[np.ndarray, "outputs outputs"]
+) -> Float[np.ndarray, "white seen"]:
+    """The matrix that filters a chunk: from the samples that it looks back on, and its own, to its white ones."""
+    order, outputs = A.shape[:2]
+    matrix = np.zeros((CHUNK, outputs, order + CHUNK, outputs))
     here = np.arange(CHUNK)
-    for back, coefficients in enumerate([np.eye(2), *(-A)]):
-        band[here, :, CHUNK + here - back] = S @ coefficients
-    return band.reshape(2 * CHUNK, 4 * CHUNK)
+    for back, coefficients in enumerate([np.eye(outputs), *(-A)]):
+        matrix[here, :, order + here - back] = S @ coefficients
+    return matrix.reshape(CHUNK * outputs, -1)
 
 
 def remembered(known, order: int) -> Bool[np.ndarray, " samples"]:
