@@ -173,47 +173,71 @@ def _step(
         slow = _shifted(slow, h / 6, {k: s0[k] + 2 * (s1[k] + s2[k]) + s3[k] for k in slow})
     if motor.sticks:
         now, still = motor.at(state), state._replace(current=0.0 * x[0], speed=0.0 * x[1])
+        begun = _add(n0, _times(linear, x))
         for row, holds, unit in ((1, "speed", 1 / now.J), (0, "current", drive.voltage / now.L)):
-            grips = motor.grip(holds, state), motor.grip(holds, still)
-            moved = _cross(row, grips, x, moved, all_push[:, row] * unit)
+            hold, ahead = motor.grip(holds, still), motor.grip(holds, _state(motor, moved, slow))
+            if hold is not None and ahead is not None:
+                push, decay = all_push[:, row] * unit, -linear[row, row] * h
+                moved = _cross(row, (hold, ahead), x, moved, begun[row] / unit, push, decay)
     return _state(motor, moved, slow)
 
 
 def _cross(
     row: int,
-    grips: tuple[Grip | None, Grip | None],
+    grips: tuple[Grip, Grip],
     before: Vector,
     after: Vector,
+    begun: Scalars,
     push: Float[Array, "n *#batch"],
+    decay: Held,
 ) -> Vector:
-    """Mend a step in which the state that a dry element holds comes to zero.
+    """Mend a step in which the state that a dry element holds comes to zero, or is there.
 
-    For a share of the step the state moved on as it did before; for the rest of it the element takes
+    For a part of the step the state moved on as it did before; for the rest of it the element takes
     whatever, within its limits, ends the step at zero: if it can, the state sticks, at exactly zero.
-    `grips` are those at the start of the step and at zero; `push` is what a unit of driving torque (or
-    voltage) over the whole step adds to the state.
+    `grips` are those at zero and where the step would end; `begun` is the driving torque (or voltage) at the start
+    of the step; `push` is what a unit of it over the whole step adds to the state, which by itself falls by
+    exp(-`decay`).
 
     **Source**: time-stepping with set-valued forces, Moreau (1988), doi:10.1007/978-3-7091-2624-0_1, with the
     response of the exact linear step in place of h / J.
     """
-    grip, hold = grips
-    if grip is None or hold is None:
-        return after
     direction = jnp.sign(before[row])
     crosses = direction * after[row] <= 0
     # the guarded denominator keeps the derivative finite where the branch is not taken
     fall = jnp.where(crosses & (direction != 0), before[row] - after[row], 1.0)
     share = jnp.where(direction == 0, 0.0, before[row] / fall)
-    left = push[row] * jnp.maximum(1.0 - share, 1e-12)
+    # what a push from then on does, over what it does in the whole step: the state moves on an exponential
+    rest = jnp.maximum((1.0 - share) / (1.0 + jnp.expm1(-decay) * share), 1e-12)
     # what already acts against the motion; then the same force, chosen anew, over what is left of the step
-    acting = jnp.where(direction > 0, grip.forward, jnp.where(direction < 0, -grip.backward, 0.0))
-    needed = acting + after[row] / left
-    taken = jnp.clip(needed, -hold.backward, hold.forward)
-    change = jnp.where(crosses, (acting - taken) * jnp.maximum(1.0 - share, 1e-12), 0.0)
+    hold, (backward, forward) = grips[0], jax.tree.map(lambda a, b: (a + b) / 2, *grips)
+    acting = jnp.where(direction > 0, forward, jnp.where(direction < 0, -backward, 0.0))
+    needed = acting + after[row] / (push[row] * rest)
+    taken = jnp.where(needed > hold.forward, forward, needed)
+    taken = jnp.where(needed < -hold.backward, -backward, taken)
+    taken = jnp.where(direction == 0, needed - _loose(hold, begun, needed), taken)
+    change = jnp.where(crosses, (acting - taken) * rest, 0.0)
     sticks = crosses & (taken == needed)
-    mended = [x + push[k] * change for k, x in enumerate(after)]
-    mended[row] = jnp.where(sticks, 0.0, mended[row])
+    # the other states follow this one, so they answer with the square of the time that is left
+    mended = [x + push[k] * change * rest for k, x in enumerate(after)]
+    mended[row] = jnp.where(sticks, 0.0, after[row] + push[row] * change)
     return tuple(mended)
+
+
+def _loose(hold: Grip, begun: Scalars, mean: Scalars) -> Scalars:
+    """What is left over, as a mean over the step, of a force beyond what holds a state at zero.
+
+    The force goes on a straight line from what it has `begun` with, through its `mean` at half the step; where it
+    comes to exceed the limit the state breaks loose, and not before.
+    """
+    end = 2 * mean - begun
+    toward = jnp.sign(end)
+    limit = jnp.where(end > 0, hold.forward, hold.backward)
+    beyond = jnp.maximum(toward * end - limit, 0.0)
+    rise = jnp.where(beyond > 0, toward * (end - begun), 1.0)
+    at_once = jnp.maximum(toward * mean - limit, 0.0)
+    later = beyond**2 / (2 * jnp.where(rise > 0, rise, 1.0))
+    return toward * jnp.where(toward * begun < limit, later, at_once)
 
 
 class Walk(NamedTuple):
