@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from statistics import NormalDist
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,7 +21,6 @@ from .refine import Polished, Problem, Refined, fit_own, polish
 from .solve import SAME, Solved
 from .uncertainty import FLAT, Information, information
 
-REACH = NormalDist().inv_cdf(0.975)  # of a 95 % interval, in standard errors
 TIDYINGS = 3
 
 
@@ -41,9 +39,10 @@ def judge(given: Prepared, solved: Solved) -> Identification:
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
     def interval(k: int, spread: float, centre: float) -> tuple[float, float]:
+        reach = float(info.reach[k])
         if not parameters.logarithmic[k] or spread < QUADRATIC:
-            return centre - REACH * spread, centre + REACH * spread
-        return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], REACH)
+            return centre - reach * spread, centre + reach * spread
+        return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
 
     unknowns, ended = fit_own(problem, best.unknowns)
     fit = _fits(
