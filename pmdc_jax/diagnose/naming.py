@@ -35,8 +35,11 @@ FORMULA, OWN_FORMULA = 0.1, 0.5
 MUCH_OF_IT, MOST_OF_IT = 0.3, 0.7
 # ... and there may then be left no more than this share of it, or the larger one by a richer form of what was there
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.3
-# Effects that no column shows, with the simpler ones in whose place they are tried if those leave something
-HARDER = [("shaft_compliance", "gear_backlash")]
+# Effects that no column shows, by the simpler ones in whose place they are tried if those leave something
+HARDER = {"shaft_compliance": "gear_backlash"}
+# ... and what effects leave of what they explain if nothing more is worth a trial, the larger one for harder ones:
+# chance decides when teeth meet, and no fit of them is exact
+TRACE, TRACE_OF_HARDER = 2e-3, 1e-2
 # Rivals whose criterion is nearer than this, and this share of what neither explains, are not told apart
 MARGIN, OF_UNEXPLAINED = 8.0, 0.1
 
@@ -68,11 +71,20 @@ class Seen(NamedTuple):
         """What the clearest signal would still take away, over what the model takes away already."""
         return float(self.clearest.gain / self.explained) if self.explained > 0 else np.inf
 
-    def asks_for_more(self) -> bool:
-        """Whether more is missing than the formulas of the model's effects leave to be desired."""
+    @property
+    def by_one_more(self) -> float:
+        """The share of that which one of the library's effects would take away."""
         best = max((s.gain for s in self.of_candidates), default=0.0)
+        return float(best / self.clearest.gain)
+
+    def asks_for_more(self) -> bool:
+        """Whether more is missing, and one of the library's effects would take away much of it."""
         share = MUCH_OF_IT if self.unexplained > FORMULA else MOST_OF_IT
-        return bool(self.left < ALARM and best > share * self.clearest.gain)
+        return bool(self.left < ALARM and self.by_one_more > share)
+
+    def is_another(self) -> bool:
+        """Whether what is left is clearly one more effect, and no formula."""
+        return bool(self.unexplained > FORMULA and self.by_one_more > MOST_OF_IT)
 
     def is_settled(self, again: Seen, share: float) -> bool:
         """Whether one more effect, after which the evidence is `again`, is more than a way to mend the formula of those
@@ -124,6 +136,7 @@ class Namer:
     def __init__(self, base: Model, report):
         self.base, self.library = base, Library(base)
         self.refits = Refits(base, self.library, report)
+        self.seen: dict[frozenset[str], Seen] = {}
         self.filters: dict[frozenset[str], Whitener] = {}
         self.compared: dict[tuple[frozenset[str], int], Fitted] = {}
 
@@ -140,7 +153,7 @@ class Namer:
             better = self._spared(best)
             again = self._see(better)
             new = set(better.effects) - set(current.effects)
-            harder = bool(new & {harder for _, harder in HARDER})
+            harder = bool(new & set(HARDER.values()))
             grown = len(better.effects) > len(current.effects)
             if not (harder or found.is_settled(again, NEXT_TO_NOTHING if grown else LITTLE)):
                 break
@@ -161,13 +174,16 @@ class Namer:
 
     def _tried(self, current: Model, found: Seen) -> list[Model]:
         """The current model with one effect more, or with a harder one in place of another."""
-        tried = []
+        tried, here = [], set(current.effects)
+        if found.unexplained < (TRACE_OF_HARDER if here & set(HARDER.values()) else TRACE):
+            return []
         if found.asks_for_more():
             shortlist = self._shortlist(current, found)
             tried += [self.refits.with_signal(current, s, found.screen) for s in shortlist]
-        if found.left < ALARM:
-            simpler = [pair for pair in HARDER if pair[0] in current.effects]
-            tried += [self.refits.in_place(current, found.screen.white, *pair) for pair in simpler]
+        for simpler in here & HARDER.keys() if not found.is_another() else ():
+            tried.append(
+                self.refits.in_place(current, found.screen.white, simpler, HARDER[simpler])
+            )
         return [model for model in tried if model is not None]
 
     def _rivals(self, chosen: Model, found: Seen) -> list[Model]:
@@ -179,6 +195,12 @@ class Namer:
         return [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]
 
     def _see(self, model: Model) -> Seen:
+        key = frozenset(model.effects)
+        if key not in self.seen:
+            self.seen[key] = self._look(model)
+        return self.seen[key]
+
+    def _look(self, model: Model) -> Seen:
         found = screen(model, self.library)
         of_candidates, of_curves = signals(found)
         count = len(found.candidates) + len(found.curves)
@@ -216,12 +238,23 @@ class Namer:
         return [s for e, s in best.items() if s in near and e not in current.effects][:SHORTLIST]
 
     def _spared(self, model: Model) -> Model:
-        """The model without effects that it can do without."""
+        """The model without effects that it can do without, or with simpler forms of them that leave nothing more."""
+        white = self._white(model)
         for effect in model.effects[:-1]:
-            smaller = self.refits.without(model, effect, self._white(model))
-            if self.compare([model, smaller], self._white(model))[0].model is smaller:
+            smaller = self.refits.without(model, effect, white)
+            if self.compare([model, smaller], white)[0].model is smaller:
                 return self._spared(smaller)
+        for effect in model.effects:
+            for simple in sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys()):
+                simpler = self.refits.in_place(model, white, effect, simple)
+                if simpler and self._does_as_well(simpler, model):
+                    return self._spared(simpler)
         return model
+
+    def _does_as_well(self, simpler: Model, model: Model) -> bool:
+        """Whether a simpler form of an effect, chosen while another one was still missing, does as well by now."""
+        ranked = self.compare([model, simpler], self._white(model))
+        return _plainest(ranked) is simpler or self._see(simpler).left >= ALARM
 
     def compare(self, models: Sequence[Model], white: Whitener) -> list[Fitted]:
         """By the squares of what each leaves when fitted to residuals that a filter makes white, the best first."""

@@ -63,13 +63,14 @@ class Refits:
         return self._once(effects, current, refit)
 
     def in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
-        """The current model with an effect in place of a simpler one."""
+        """The current model with an effect in place of another: one that has starts of its own, or was begun before."""
         effects = (*(e for e in current.effects if e != old), new)
-        return self._once(
-            effects,
-            current,
-            lambda: self._best_of(effects, self._starts(current, effects), white),
-        )
+
+        def refit() -> Model:
+            starts = self._starts(current, effects) or [self._start(current, effects, {})]
+            return self._best_of(effects, starts, white)
+
+        return self._once(effects, current, refit)
 
     def without(self, model: Model, effect: str, white: Whitener) -> Model:
         """The model without one of its effects."""
