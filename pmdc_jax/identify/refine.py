@@ -156,10 +156,10 @@ def _compressed_jvp(primals, tangents):
 
 
 def _factor(flat: Float[Array, " columns"], args) -> Float[Array, "columns+1 columns+1"]:
-    problem, scale, size = args
+    problem, begun, scale, size = args
     # optimistix promotes strictly; with the usual promotion what was traced before is found again
     with jax.numpy_dtype_promotion("standard"):
-        evaluation = evaluate(problem, _unflatten(problem, flat * scale))
+        evaluation = evaluate(problem, _unscaled(problem, flat, begun, scale))
         matrix = normal_matrix(evaluation, problem.tape, problem.counts)
     stretch = jnp.append(scale, 1.0)
     matrix = matrix * stretch[:, None] * stretch / size
@@ -175,21 +175,28 @@ def _unflatten(problem: Problem, flat: Float[Array, " columns"]) -> Unknowns:
     return Unknowns(flat[:count], flat[count:].reshape(problem.tape.runs, LOCAL))
 
 
+def _unscaled(problem: Problem, flat, begun, scale) -> Unknowns:
+    """Unknowns of which those without a scale stay where they began: rounding errors would carry them away."""
+    return _unflatten(problem, jnp.where(scale > 0, flat * scale, begun))
+
+
 def _flatten(unknowns: Unknowns) -> Float[Array, " columns"]:
     return jnp.concatenate([unknowns.coordinates, unknowns.local.reshape(-1)])
 
 
 @eqx.filter_jit
 def _levenberg_marquardt(problem: Problem, start: Unknowns, scale, size, tolerance):
+    begun = _flatten(start)
     solution = optx.least_squares(
         compressed,
         optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),
-        _flatten(start) / scale,
-        args=(problem, scale, size),
+        jnp.where(scale > 0, begun / jnp.where(scale > 0, scale, 1.0), 0.0),
+        args=(problem, begun, scale, size),
         max_steps=STEPS,
         throw=False,
     )
-    return _unflatten(problem, solution.value * scale), 2 * solution.state.f_info.as_min() * size
+    ended = _unscaled(problem, solution.value, begun, scale)
+    return ended, 2 * solution.state.f_info.as_min() * size
 
 
 def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-3) -> Refined:
@@ -203,7 +210,7 @@ def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-3) -> Refine
     size = max(matrix[-1, -1], 1e-30)
     # each run's own unknowns are measured in what changes the residual as much as e-fold in a parameter might
     lengths = np.sqrt(np.diag(matrix)[:-1] / size)
-    scale = np.where(lengths > 0, 1 / np.where(lengths > 0, lengths, 1.0), 1.0)
+    scale = np.where(lengths > 0, 1 / np.where(lengths > 0, lengths, 1.0), 0.0)
     scale[: len(low)] = 1.0
     held, unknowns, squares = {}, start, size
     for _ in range(len(low) + 1):
@@ -336,13 +343,15 @@ def gauss_newton(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.nda
         gradient[k] = hessian[k, :] = hessian[:, k] = 0.0
     hessian[np.arange(count), np.arange(count)] += RIDGE
     lengths = np.sqrt(np.diag(hessian))
-    lengths = np.where(lengths > 0, lengths, 1.0)
+    moves = lengths > 0
+    lengths = np.where(moves, lengths, 1.0)
     values, vectors = np.linalg.eigh(hessian / lengths[:, None] / lengths)
     along = vectors.T @ (gradient / lengths)
     visible = values > 1e-12 * values.max(initial=1e-300)
     along = np.where(visible, along, 0.0)
     shrunk = along / np.where(visible, values, 1.0)
-    return -(vectors @ shrunk) / lengths, float(along @ shrunk)
+    # rounding errors would carry away what no residual depends on
+    return -(vectors @ shrunk) / lengths * moves, float(along @ shrunk)
 
 
 def _own_noise(problem: Problem, squares: np.ndarray):
