@@ -219,23 +219,25 @@ class Namer:
     def _shortlist(self, current: Model, found: Seen) -> list[Signal]:
         """The most significant shape of each of the best few effects.
 
-        None, if that is an effect which is there already: its own formula is what is left to be desired. One that
-        contains an effect which is there, and explains most of what is left, needs no other beside it.
+        None, if that is an effect which is there already and little is left: its own formula is what is left to be
+        desired. One that contains an effect which is there, and explains most of what is left, needs no other beside
+        it.
         """
         best: dict[str, Signal] = {}
         for s in found.of_candidates:
             assert s.candidate is not None
             best.setdefault(s.candidate.effect, s)
+        if next(iter(best), None) in current.effects and found.unexplained < FORMULA:
+            return []
         clear = np.log(ALARM / len(found.screen.candidates))
-        ranked = [s for s in best.values() if s.log_p < clear]
-        if not ranked or next(iter(best)) in current.effects:
+        ranked = [s for e, s in best.items() if s.log_p < clear and e not in current.effects]
+        if not ranked:
             return []
         richer = [s for e, s in best.items() if CONTAINS.get(e, set()) & set(current.effects)]
         for s in richer:
             if s.gain > MOST_OF_IT * found.clearest.gain:
                 return [s]
-        near = [s for s in ranked if s.log_p < COMPARABLE * ranked[0].log_p]
-        return [s for e, s in best.items() if s in near and e not in current.effects][:SHORTLIST]
+        return [s for s in ranked if s.log_p < COMPARABLE * ranked[0].log_p][:SHORTLIST]
 
     def _spared(self, model: Model) -> Model:
         """The model without effects that it can do without, or with simpler forms of them that leave nothing more."""
