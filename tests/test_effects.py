@@ -43,7 +43,7 @@ class Case(NamedTuple):
     start: Callable | None = None  # of the effect's own states, for (speed, load, values)
     reported: Callable | None = None  # current and speed of x (states, samples), for (x, values)
     # worst error at 1 ms, relative to the largest value of each output; dry elements start and stop
-    # within a sample, which costs the current a share of what it changes by in one
+    # within a sample
     tolerance: float = 1e-4
     # of the sensitivities, relative to central differences over this step
     slope_tolerance: float = 1e-4
@@ -138,7 +138,7 @@ CASES = {
         {"coulomb_Nm": 0.1, "static_Nm": 0.2, "speed_rad_s": 15.0},
         "coulomb_Nm static_Nm",
         friction=stribeck,
-        tolerance=5e-3,
+        tolerance=1e-3,
     ),
     "asymmetric_friction": Case(
         {"forward_Nm": 0.2, "backward_Nm": 0.1},
@@ -200,7 +200,7 @@ CASES = {
         {"voltage_V": 1.2},
         "voltage_V",
         bench=lambda p: {"brush_drop_V": p["voltage_V"]},
-        tolerance=3e-2,
+        tolerance=1e-3,
     ),
     "resistance_heating": Case(
         {"rise_per_W": 1e-2, "time_constant_s": 0.3},

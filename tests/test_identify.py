@@ -18,7 +18,9 @@ from scipy.signal import lfilter
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, identify
+from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.binary_ga import BinaryGA
+from pmdc_jax.identify.bounds import effect_bounds
 from pmdc_jax.identify.colour import whitener
 from pmdc_jax.identify.identification import Identification
 from pmdc_jax.identify.judge import judge
@@ -33,7 +35,7 @@ from pmdc_jax.identify.uncertainty import information, long_run_variance
 from pmdc_jax.identify.whitening import Whitening
 from pmdc_jax.motor import PARAMETERS
 from pmdc_jax.recording import Recording
-from pmdc_jax.simulate import Tape
+from pmdc_jax.simulate import LOCAL, Tape
 
 PAPER = vb.paper_motor()
 NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
@@ -435,6 +437,15 @@ def test_converged_means_that_nothing_near_is_better(x64, runs):
             assert squares(problem, best.unknowns._replace(coordinates=moved)) > lowest
 
 
+def test_known_loads_stay_known(x64, runs):
+    """No residual depends on the offset of a known load: not even rounding errors may move it."""
+    problem = problem_of(runs)
+    end = refine(problem, start_at(problem, 1.5))
+    polished = polish(problem, end).refined
+    for unknowns in (end.unknowns, polished.unknowns):
+        np.testing.assert_array_equal(np.asarray(unknowns.local)[:, 2:], 0.0)
+
+
 def test_a_refinement_that_is_cut_short_does_not_claim_convergence(x64, runs):
     problem = problem_of(runs)
     there = refine(problem, start_at(problem))
@@ -565,6 +576,65 @@ def test_progress_is_told(runs):
     assert 0 < shares[0] < shares[-1] <= 1
     assert fitness == sorted(fitness, reverse=True)
     assert any("refining" in what for what, _, _ in told)
+
+
+def test_a_search_looks_for_effects_where_they_would_show(runs):
+    """Far narrower than the table's ranges, and wide enough for what a bench of this size can hide."""
+    effects = [EFFECTS[n] for n in ("stribeck_friction", "constant_load", "resistance_heating")]
+    bounds = effect_bounds(effects, runs)
+    torque = PAPER.Kt * max(float(np.abs(r.current).max()) for r in runs)
+    for name in ("stribeck_friction.static_Nm", "constant_load.torque_Nm"):
+        assert 0.1 * torque < bounds[name][1] < 10 * torque, name
+    for effect in effects:
+        for field, given in effect.ranges.items():
+            low, high = bounds[f"{effect.name}.{field}"]
+            assert given.lower <= low < high <= given.upper, (effect.name, field)
+
+
+# ----------------------------------------------------------- information of few moments
+
+
+def test_few_moments_that_decide_widen_the_interval():
+    """One parameter, seen in two stretches of one run only, in noise that is a constant of each stretch."""
+    rng, covered, plain = np.random.default_rng(7), [], []
+    blocks, samples = 20, 128
+    for _ in range(400):
+        jacobian = np.zeros((blocks, 2, samples, 1 + LOCAL))
+        noise = 0.1 * rng.standard_normal((blocks, 2, samples))
+        for block in (3, 8, 12, 17):
+            jacobian[block, 1, :, 0] = 1.0
+            noise[block, 1] += rng.standard_normal()
+        score = (jacobian[..., 0] * noise).sum()
+        estimate = score / (jacobian[..., 0] ** 2).sum()
+        residuals = noise - jacobian[..., 0] * estimate
+        run = np.zeros(blocks, int)
+        info = information(residuals, jacobian, run, np.ones(1, bool), 1)
+        error, spread = abs(estimate), np.sqrt(info.covariance[0, 0])
+        covered.append(error < info.reach[0] * spread)
+        plain.append(error < 1.96 / np.sqrt((jacobian[..., 0] ** 2).sum()))
+    assert np.mean(plain) < 0.3 and np.mean(covered) > 0.85, (np.mean(plain), np.mean(covered))
+
+
+def test_white_noise_leaves_intervals_as_they_are():
+    rng, reaches, inflations, covered = np.random.default_rng(8), [], [], []
+    for _ in range(300):
+        jacobian = np.zeros((20, 2, 128, 2 + LOCAL))
+        jacobian[..., :2] = rng.standard_normal((20, 2, 128, 2))
+        noise = rng.standard_normal((20, 2, 128))
+        J = jacobian[..., :2].reshape(-1, 2)
+        estimate = np.linalg.lstsq(J, noise.reshape(-1), rcond=None)[0]
+        info = information(
+            noise - jacobian[..., :2] @ estimate,
+            jacobian,
+            np.repeat([0, 1], 10),
+            np.ones(2, bool),
+            2,
+        )
+        reaches.append(info.reach), inflations.append(info.inflation)
+        covered.append(np.abs(estimate) < info.reach * np.sqrt(np.diag(info.covariance)))
+    assert np.mean(np.array(reaches) > 2) < 0.1
+    assert 1.0 <= np.median(inflations) < 1.1
+    assert 0.93 < np.mean(covered) < 0.98
 
 
 # ------------------------------------------------------------------------- long-run variance

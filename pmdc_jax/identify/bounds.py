@@ -6,10 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..effects import AbstractEffect
 from ..recording import Recording
 
 # How far a crude estimate may be off, as a factor either way. Wide: the search is cheap.
 CRUDE = 30.0
+# By how much what an effect does may be smaller than what drives the motor, and still show
+DECADES = 1e3
 
 
 def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, float]]:
@@ -31,6 +34,40 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
         "J": (inertia / CRUDE**2, inertia * CRUDE**2),
         "f": (friction / CRUDE**3, friction * CRUDE / 3),
     }
+
+
+def effect_bounds(
+    effects: Sequence[type[AbstractEffect]], recordings: Sequence[Recording]
+) -> dict[str, tuple[float, float]]:
+    """Where to search for the parameters of effects that show, by their units: three decades below the torque, speed,
+    voltage and current of the recordings. What is not measured in those keeps the range of its table."""
+    _, Kb = _armature(recordings)
+    torque, speed, _, step, duration = _motion(recordings, Kb)
+    volts, amperes = (max(_largest(recordings, n), 1e-9) for n in ("voltage", "current"))
+    scales = {
+        "N m": 3 * torque,
+        "N m s^2/rad^2": 3 * torque / speed**2,
+        "rad/s": speed,
+        "V": volts,
+        "A": amperes,
+        "1/W": 1 / (volts * amperes),
+        "1/A^2": 10 / amperes**2,
+    }
+    bounds = {}
+    for effect in effects:
+        for field, given in effect.ranges.items():
+            low, high = given.lower, given.upper
+            if given.unit in scales:
+                high = min(high, scales[given.unit])
+                low = max(low, high / DECADES if given.scale == "log" else -high)
+            elif given.unit == "s":
+                low, high = max(low, step / 5), min(high, 3 * duration)
+            bounds[f"{effect.name}.{field}"] = (low, high)
+    return bounds
+
+
+def _largest(recordings: Sequence[Recording], name: str) -> float:
+    return max(_rms(getattr(run, name)) for run in recordings)
 
 
 def _armature(recordings: Sequence[Recording]) -> tuple[float, float]:

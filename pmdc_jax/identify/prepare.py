@@ -38,11 +38,18 @@ class Prepared(NamedTuple):
         """The runs that are fitted."""
         return [run for run, role in zip(self.runs, self.roles, strict=True) if role == "train"]
 
+    def parameters(
+        self,
+        effects: Sequence[type[AbstractEffect]],
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+    ) -> Parameters:
+        """Those of a motor with these effects, within `bounds` of the latter or those of their tables."""
+        bounds = {**search_bounds(self.training), **(bounds or {})}
+        return Parameters.of(bounds, effects, {**self.untouched, **self.known}, self.ties)
+
     def with_effects(self, effects: Sequence[type[AbstractEffect]]) -> Prepared:
         """The same runs for a motor with other effects."""
-        parameters = Parameters.of(
-            search_bounds(self.training), effects, {**self.untouched, **self.known}, self.ties
-        )
+        parameters = self.parameters(effects)
         problem = Problem(
             parameters,
             self.problem.tape,

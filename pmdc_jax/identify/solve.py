@@ -8,11 +8,13 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..simulate import Tape
+from .bounds import effect_bounds
 from .identification import Search
 from .parameters import Parameters
 from .prepare import Prepared
@@ -55,10 +57,10 @@ def solve(
     began = time.perf_counter()
     report = progress or (lambda *args, **kwargs: None)
     problem, searching = given.problem, Tape.from_recordings(given.training)
-    noise = np.asarray(problem.noise)
+    noise, sought = np.asarray(problem.noise), _where_effects_show(given)
 
     def look(seed: int) -> Found:
-        return global_search(problem.parameters, searching, noise, search, seed, progress=progress)
+        return global_search(sought, searching, noise, search, seed, progress=progress)
 
     middle = (problem.parameters.lower + problem.parameters.upper) / 2
     with ThreadPoolExecutor(1) as beside:
@@ -79,6 +81,13 @@ def solve(
     seconds = {"search": searched - began, "refine": time.perf_counter() - searched}
     record = _search_record(search, found, ends)
     return given, Solved(polished, record, seed, found.interrupted, seconds)
+
+
+def _where_effects_show(given: Prepared) -> Parameters:
+    """The parameters within narrower bounds: a search need not cross where nothing shows."""
+    parameters = given.problem.parameters
+    shown = given.parameters(parameters.effects, effect_bounds(parameters.effects, given.training))
+    return eqx.tree_at(lambda p: (p.lower, p.upper), parameters, (shown.lower, shown.upper))
 
 
 def settle(given: Prepared, end: Refined) -> tuple[Prepared, Polished]:
