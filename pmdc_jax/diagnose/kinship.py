@@ -19,15 +19,16 @@ def is_within(a: set[str], b: set[str]) -> bool:
     return any(a - b and a - b <= CONTAINS.get(e, set()) and b - a == {e} for e in b)
 
 
-def _same_class(a: set[str], b: set[str]) -> bool:
-    """While the motor turns, asymmetric friction and Coulomb friction with a constant load are one torque."""
-    return _spelt_out(a) == _spelt_out(b)
-
-
-def _spelt_out(effects: set[str]) -> set[str]:
+def spelt_out(effects: set[str]) -> set[str]:
+    """The same torque in motion, by effects that one which is richer in another way can be part of."""
     if "asymmetric_friction" in effects:
         return (effects - {"asymmetric_friction"}) | {"coulomb_friction", "constant_load"}
     return effects
+
+
+def _same_class(a: set[str], b: set[str]) -> bool:
+    """While the motor turns, asymmetric friction and Coulomb friction with a constant load are one torque."""
+    return spelt_out(a) == spelt_out(b)
 
 
 def _contains(a: set[str], b: set[str]) -> bool:

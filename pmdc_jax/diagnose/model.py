@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..effects import EFFECTS, CoulombFriction
+from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction
 from ..identify.colour import Series, Whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Polished, Refined, polish
@@ -38,9 +38,23 @@ class Model(NamedTuple):
 
     @property
     def dry(self) -> float:
-        """Coulomb friction, N m."""
-        found = [e.torque_Nm for e in self.motor.effects if isinstance(e, CoulombFriction)]
-        return float(found[0]) if found else 0.0
+        """Coulomb friction, N m, the mean of both directions."""
+        return sum(self._dry) / 2
+
+    @property
+    def slanted(self) -> float:
+        """The constant load in it, N m: half of what friction forward has more than backward."""
+        backward, forward = self._dry
+        return (forward - backward) / 2
+
+    @property
+    def _dry(self) -> tuple[float, float]:
+        for effect in self.motor.effects:
+            if isinstance(effect, CoulombFriction):
+                return float(effect.torque_Nm), float(effect.torque_Nm)
+            if isinstance(effect, AsymmetricFriction):
+                return float(effect.backward_Nm), float(effect.forward_Nm)
+        return 0.0, 0.0
 
     @property
     def path(self) -> Path:

@@ -14,7 +14,7 @@ from ..identify.prepare import Prepared
 from ..identify.refine import Polished
 from ..identify.sharpen import residuals_of, sharpened, squares_of
 from .candidates import Candidate
-from .kinship import CONTAINS, are_rivals, is_within
+from .kinship import CONTAINS, are_rivals, is_within, spelt_out
 from .library import Library
 from .model import Model, ended
 from .periodic import Line, line_of
@@ -225,15 +225,15 @@ class Namer:
         """
         best: dict[str, Signal] = {}
         for s in found.of_candidates:
-            assert s.candidate is not None
-            best.setdefault(s.candidate.effect, s)
+            best.setdefault(_effect(s), s)
         if next(iter(best), None) in current.effects and found.unexplained < FORMULA:
             return []
         clear = np.log(ALARM / len(found.screen.candidates))
         ranked = [s for e, s in best.items() if s.log_p < clear and e not in current.effects]
         if not ranked:
             return []
-        richer = [s for e, s in best.items() if CONTAINS.get(e, set()) & set(current.effects)]
+        here = spelt_out(set(current.effects))
+        richer = [s for s in ranked if CONTAINS.get(_effect(s), set()) & here]
         for s in richer:
             if s.gain > MOST_OF_IT * found.clearest.gain:
                 return [s]
@@ -286,6 +286,11 @@ class Namer:
             gain = both[smaller.effects] - both[chosen.effects]
             chances[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
         return chances
+
+
+def _effect(signal: Signal) -> str:
+    assert signal.candidate is not None
+    return signal.candidate.effect
 
 
 def _plainest(ranked: Sequence[Fitted]) -> Model:

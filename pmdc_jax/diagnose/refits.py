@@ -18,7 +18,7 @@ from ..identify.sharpen import sharpened, squares_of
 from ..identify.solve import POOR
 from ..identify.uncertainty import FLAT
 from .candidates import STARTS, Candidate, Values
-from .kinship import CONTAINS
+from .kinship import CONTAINS, spelt_out
 from .library import Library
 from .model import Model, settled
 from .screen import Screen, Signal
@@ -45,8 +45,12 @@ class Refits:
         """The current model with one more effect, None where its evidence is none that physics allows."""
         candidate = signal.candidate
         assert candidate is not None
-        kept = [e for e in current.effects if e not in CONTAINS.get(candidate.effect, ())]
-        effects = (*kept, candidate.effect)
+        contains, kept = CONTAINS.get(candidate.effect, set()), set(current.effects)
+        if contains & spelt_out(kept):
+            kept = spelt_out(kept) - contains
+        # as they were added, and what is spelt out last
+        order = [*(e for e in current.effects if e in kept), *(kept - set(current.effects))]
+        effects = (*order, candidate.effect)
 
         def refit() -> Model | None:
             fit = found.evidence.regress([signal.block])
@@ -54,7 +58,10 @@ class Refits:
             values, angles = _values(candidate, fit.coefficients[0], current.dry, runs)
             if values is None:
                 return None
-            start = self._start(current, effects, {candidate.effect: values}, fit.moved, angles)
+            added = {candidate.effect: values}
+            if "constant_load" in order and "constant_load" not in current.effects:
+                added["constant_load"] = {"torque_Nm": current.slanted}
+            start = self._start(current, effects, added, fit.moved, angles)
             others = self._starts(current, effects)
             if others:
                 return self._best_of(effects, [start, *others], found.white)
