@@ -591,11 +591,21 @@ def test_a_search_looks_for_effects_where_they_would_show(runs):
             assert given.lower <= low < high <= given.upper, (effect.name, field)
 
 
+def test_a_search_for_what_was_not_recorded_keeps_the_range_of_its_table(runs):
+    """Runs that a torque drives show no voltage."""
+    driven = [
+        Recording(r.name, r.time, None, None, r.speed, torque=PAPER.Kt * r.current) for r in runs
+    ]
+    given = EFFECTS["brush_voltage_drop"].ranges["voltage_V"]
+    bounds = effect_bounds([EFFECTS["brush_voltage_drop"]], driven)
+    assert bounds["brush_voltage_drop.voltage_V"] == (given.lower, given.upper)
+
+
 # ----------------------------------------------------------- information of few moments
 
 
 def test_few_moments_that_decide_widen_the_interval():
-    """One parameter, seen in two stretches of one run only, in noise that is a constant of each stretch."""
+    """One parameter, seen in four stretches of one run only, in noise that is a constant of each."""
     rng, covered, plain = np.random.default_rng(7), [], []
     blocks, samples = 20, 128
     for _ in range(400):
@@ -630,7 +640,8 @@ def test_white_noise_leaves_intervals_as_they_are():
             np.ones(2, bool),
             2,
         )
-        reaches.append(info.reach), inflations.append(info.inflation)
+        reaches.append(info.reach)
+        inflations.append(info.inflation)
         covered.append(np.abs(estimate) < info.reach * np.sqrt(np.diag(info.covariance)))
     assert np.mean(np.array(reaches) > 2) < 0.1
     assert 1.0 <= np.median(inflations) < 1.1

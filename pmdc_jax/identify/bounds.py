@@ -62,7 +62,9 @@ def effect_bounds(
                 low = max(low, high / DECADES if given.scale == "log" else -high)
             elif given.unit == "s":
                 low, high = max(low, step / 5), min(high, 3 * duration)
-            bounds[f"{effect.name}.{field}"] = (low, high)
+            # no run shows a unit that none was recorded in
+            shown = (low, high) if low < high else (given.lower, given.upper)
+            bounds[f"{effect.name}.{field}"] = shown
     return bounds
 
 

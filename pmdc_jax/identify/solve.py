@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -85,9 +84,8 @@ def solve(
 
 def _where_effects_show(given: Prepared) -> Parameters:
     """The parameters within narrower bounds: a search need not cross where nothing shows."""
-    parameters = given.problem.parameters
-    shown = given.parameters(parameters.effects, effect_bounds(parameters.effects, given.training))
-    return eqx.tree_at(lambda p: (p.lower, p.upper), parameters, (shown.lower, shown.upper))
+    effects = given.problem.parameters.effects
+    return given.parameters(effects, effect_bounds(effects, given.training))
 
 
 def settle(given: Prepared, end: Refined) -> tuple[Prepared, Polished]:
