@@ -396,19 +396,32 @@ def test_resampling_loses_no_volt_second(steps, seed):
     for before, after in ((run.voltage, even.voltage), (run.load, even.load)):
         integral = np.append(0.0, np.cumsum(before[:-1] * np.diff(time)))
         kept = np.append(0.0, np.cumsum(after[:-1] * np.diff(even.time)))
-        np.testing.assert_allclose(kept, np.interp(even.time, time, integral), atol=1e-12)
+        expected = np.interp(even.time, time, integral)
+        expected += before[-1] * np.maximum(even.time - time[-1], 0.0)
+        np.testing.assert_allclose(kept, expected, atol=1e-12)
 
 
 def test_outputs_are_interpolated_but_not_across_gaps():
-    """Speed is a straight line in time, which interpolation keeps; ten lost samples stay lost."""
+    """Speed is a straight line in time, which interpolation keeps; ten lost samples stay lost, and nothing is known
+    of a grid point past the last sample."""
     rng = np.random.default_rng(6)
     time = np.delete(1e-3 * (np.arange(100) + rng.uniform(-0.2, 0.2, 100)), np.arange(50, 60))
     even = uniform(Recording("r", time, np.ones(90), current=3 * time, speed=1 + 5 * time))
     inside = (even.time > time[49]) & (even.time < time[50])
     assert 9 <= inside.sum() <= 11
-    assert np.isnan(even.speed[inside]).all()
-    np.testing.assert_allclose(even.speed[~inside], 1 + 5 * even.time[~inside], rtol=1e-12)
+    assert time[-1] <= even.time[-1] < time[-1] + 1e-3
+    lost = inside | (even.time > time[-1])
+    assert np.isnan(even.speed[lost]).all()
+    np.testing.assert_allclose(even.speed[~lost], 1 + 5 * even.time[~lost], rtol=1e-12)
     np.testing.assert_allclose(even.voltage, 1.0, rtol=1e-12)
+
+
+def test_uneven_runs_of_one_clock_share_a_grid():
+    """Of which each costs an exact step of its own."""
+    rng = np.random.default_rng(8)
+    stamps = [1e-3 * (np.arange(200) + rng.uniform(-0.1, 0.1, 200)) for _ in range(3)]
+    runs = [uniform(Recording("r", t, np.ones(200), speed=t)) for t in stamps]
+    assert Tape.from_recordings(runs).sample_time.tolist() == [1e-3]
 
 
 @pytest.mark.parametrize("wrapped", [False, True])

@@ -25,7 +25,7 @@ from .screen import Screen, Signal, beyond_curves, screen, signals
 ALARM = 0.01
 # At most so many effects are named, and so many candidates for one are refitted in full simulation
 MOST, SHORTLIST = 3, 3
-# ... those whose evidence to first order is at least this share of the best one's
+# ... those whose gain to first order is at least this share of the best one's
 COMPARABLE = 0.6
 # What effects may leave of the squares that they explain, by formulas that are not quite nature's: so much, and more
 # if it is a curve over an effect's own variable
@@ -40,6 +40,8 @@ HARDER = {"shaft_compliance": "gear_backlash"}
 # ... and what effects leave of what they explain if nothing more is worth a trial, the larger one for harder ones:
 # chance decides when teeth meet, and no fit of them is exact
 TRACE, TRACE_OF_HARDER = 2e-3, 1e-2
+# A model that leaves so many times the squares of another one is no match for it, whatever a filter makes of either
+FAR = 3.0
 # Rivals whose criterion is nearer than this, and this share of what neither explains, are not told apart
 MARGIN, OF_UNEXPLAINED = 8.0, 0.1
 
@@ -217,7 +219,7 @@ class Namer:
         return _plainest(self.compare(tried, self._white(least)))
 
     def _shortlist(self, current: Model, found: Seen) -> list[Signal]:
-        """The most significant shape of each of the best few effects.
+        """The most significant shape of each of the few effects that explain most.
 
         None, if that is an effect which is there already and little is left: its own formula is what is left to be
         desired. One that contains an effect which is there, and explains most of what is left, needs no other beside
@@ -237,7 +239,9 @@ class Namer:
         for s in richer:
             if s.gain > MOST_OF_IT * found.clearest.gain:
                 return [s]
-        return [s for s in ranked if s.log_p < COMPARABLE * ranked[0].log_p][:SHORTLIST]
+        # what may be slow noise is trusted less, but is tried for what it explains
+        ranked.sort(key=lambda s: -s.gain)
+        return [s for s in ranked if s.gain > COMPARABLE * ranked[0].gain][:SHORTLIST]
 
     def _spared(self, model: Model) -> Model:
         """The model without effects that it can do without, or with simpler forms of them that leave nothing more."""
@@ -259,8 +263,19 @@ class Namer:
         return _plainest(ranked) is simpler or self._see(simpler).left >= ALARM
 
     def compare(self, models: Sequence[Model], white: Whitener) -> list[Fitted]:
-        """By the squares of what each leaves when fitted to residuals that a filter makes white, the best first."""
-        return sorted((self._left(m, white) for m in models), key=lambda f: f.criterion)
+        """By the squares of what each leaves when fitted to residuals that a filter makes white, the best first.
+
+        One that leaves far more than another of what is measured is out of the question: filters pass none of what
+        changes slowly.
+        """
+        least = min(m.polished.refined.fitness for m in models)
+        fitted = [
+            self._left(m, white)
+            if m.polished.refined.fitness < FAR * least
+            else Fitted(m, np.inf, np.inf, white)
+            for m in models
+        ]
+        return sorted(fitted, key=lambda f: f.criterion)
 
     def _left(self, model: Model, white: Whitener) -> Fitted:
         key = frozenset(model.effects), id(white)

@@ -20,7 +20,7 @@ from ..identify.uncertainty import FLAT
 from .candidates import STARTS, Candidate, Values
 from .kinship import CONTAINS, spelt_out
 from .library import Library
-from .model import Model, settled
+from .model import Model, model_of, settled
 from .screen import Screen, Signal
 
 # Share of the gain foretold by the evidence that a refit keeps, or else is tried in another way
@@ -125,7 +125,8 @@ class Refits:
         white: Whitener,
     ) -> Model:
         """Refitted from where the evidence points; if that leads nowhere near what it promises, also by way of plain
-        least squares."""
+        least squares; and as those leave it, if that is far less of what is measured: then what the filter took for
+        noise was what is missing."""
         given, begun = start
         model = settled(effects, given, begun, white)
         before, after = (
@@ -133,7 +134,10 @@ class Refits:
         )
         if before - after > KEPT * signal.gain:
             return model
-        plainly = settled(effects, given, polish(given.problem, begun).refined, white)
+        plain = polish(given.problem, begun)
+        if plain.refined.fitness < KEPT * model.polished.refined.fitness:
+            return model_of(effects, given, plain)
+        plainly = settled(effects, given, plain.refined, white)
         return (
             plainly
             if squares_of(*sharpened(plainly.given, plainly.polished.refined, white)) < after

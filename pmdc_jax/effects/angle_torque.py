@@ -48,7 +48,7 @@ class CoggingTorque(_Angular):
     formula: ClassVar = "T = a sin(n angle + phase)"
     equation: ClassVar = "mechanical"
     ranges: ClassVar = {
-        "amplitude_Nm": ParameterRange("N m", 1e-7, 1e3),
+        "amplitude_Nm": ParameterRange("N m", 1e-10, 1e4),
         "phase_rad": PHASE,
         "periods": PERIODS,
     }

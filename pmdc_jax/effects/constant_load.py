@@ -23,7 +23,7 @@ class ConstantLoad(AbstractEffect):
     formula: ClassVar = "T = T_0"
     equation: ClassVar = "mechanical"
     affine: ClassVar = True
-    ranges: ClassVar = {"torque_Nm": ParameterRange("N m", -1e4, 1e4, "linear")}
+    ranges: ClassVar = {"torque_Nm": ParameterRange("N m", -1e5, 1e5, "linear")}
 
     torque_Nm: Scalars
 

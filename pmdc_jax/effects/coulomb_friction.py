@@ -23,7 +23,7 @@ class CoulombFriction(AbstractEffect):
     variable: ClassVar = "speed"
     holds: ClassVar = "speed"
     affine: ClassVar = True
-    ranges: ClassVar = {"torque_Nm": ParameterRange("N m", 1e-7, 1e4)}
+    ranges: ClassVar = {"torque_Nm": ParameterRange("N m", 1e-10, 1e5)}
 
     torque_Nm: Scalars
 
@@ -53,8 +53,8 @@ class AsymmetricFriction(AbstractEffect):
     holds: ClassVar = "speed"
     affine: ClassVar = True
     ranges: ClassVar = {
-        "forward_Nm": ParameterRange("N m", 1e-7, 1e4),
-        "backward_Nm": ParameterRange("N m", 1e-7, 1e4),
+        "forward_Nm": ParameterRange("N m", 1e-10, 1e5),
+        "backward_Nm": ParameterRange("N m", 1e-10, 1e5),
     }
 
     forward_Nm: Scalars

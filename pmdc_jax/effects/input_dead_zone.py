@@ -24,7 +24,7 @@ class InputDeadZone(AbstractEffect):
     equation: ClassVar = "input"
     variable: ClassVar = "voltage"
     affine: ClassVar = True
-    ranges: ClassVar = {"width_V": ParameterRange("V", 1e-5, 1e2)}
+    ranges: ClassVar = {"width_V": ParameterRange("V", 1e-5, 1e3)}
 
     width_V: Scalars
 

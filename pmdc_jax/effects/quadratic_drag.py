@@ -23,7 +23,7 @@ class QuadraticDrag(AbstractEffect):
     formula: ClassVar = "T_d = c w |w|"
     equation: ClassVar = "mechanical"
     variable: ClassVar = "speed"
-    ranges: ClassVar = {"drag_Nms2_rad2": ParameterRange("N m s^2/rad^2", 1e-12, 1e-2)}
+    ranges: ClassVar = {"drag_Nms2_rad2": ParameterRange("N m s^2/rad^2", 1e-18, 1e4)}
 
     drag_Nms2_rad2: Scalars
 

@@ -31,7 +31,7 @@ class ResistanceHeating(AbstractEffect):
     needs_current: ClassVar = True
     states: ClassVar = ("resistance_rise",)
     ranges: ClassVar = {
-        "rise_per_W": ParameterRange("1/W", 1e-7, 1.0),
+        "rise_per_W": ParameterRange("1/W", 1e-9, 1e3),
         "time_constant_s": ParameterRange("s", 0.1, 1e4),
     }
 

@@ -29,7 +29,7 @@ class TorqueConstantSaturation(AbstractEffect):
     equation: ClassVar = "mechanical"
     needs_current: ClassVar = True
     variable: ClassVar = "current"
-    ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 10.0)}
+    ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 1e4)}
 
     per_A2: Scalars
 
@@ -54,7 +54,7 @@ class InductanceSaturation(AbstractEffect):
     needs_current: ClassVar = True
     variable: ClassVar = "current"
     longest_step: ClassVar = 2.5e-4
-    ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 10.0)}
+    ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 1e4)}
 
     per_A2: Scalars
 

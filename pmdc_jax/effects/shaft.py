@@ -45,8 +45,8 @@ class ShaftCompliance(AbstractEffect):
     states: ClassVar = ("load_speed", "twist")
     affine: ClassVar = True
     ranges: ClassVar = {
-        "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-3, 1e6),
-        "damping_Nms_rad": ParameterRange("N m s/rad", 1e-7, 1e3),
+        "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
+        "damping_Nms_rad": ParameterRange("N m s/rad", 1e-11, 1e6),
         "load_share": ParameterRange("", 1e-2, 0.99),
     }
 
@@ -109,8 +109,8 @@ class GearBacklash(AbstractEffect):
     longest_step: ClassVar = 2.5e-4
     ranges: ClassVar = {
         "gap_rad": ParameterRange("rad", 1e-6, 1.0),
-        "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-3, 1e6),
-        "damping_Nms_rad": ParameterRange("N m s/rad", 1e-7, 1e3),
+        "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
+        "damping_Nms_rad": ParameterRange("N m s/rad", 1e-11, 1e6),
         "load_share": ParameterRange("", 1e-2, 0.99),
     }
 

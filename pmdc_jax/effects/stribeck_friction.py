@@ -26,9 +26,9 @@ class StribeckFriction(AbstractEffect):
     variable: ClassVar = "speed"
     holds: ClassVar = "speed"
     ranges: ClassVar = {
-        "coulomb_Nm": ParameterRange("N m", 1e-7, 1e4),
-        "static_Nm": ParameterRange("N m", 1e-7, 1e4),
-        "speed_rad_s": ParameterRange("rad/s", 1e-2, 1e3),
+        "coulomb_Nm": ParameterRange("N m", 1e-10, 1e5),
+        "static_Nm": ParameterRange("N m", 1e-10, 1e5),
+        "speed_rad_s": ParameterRange("rad/s", 1e-4, 1e3),
     }
 
     coulomb_Nm: Scalars

@@ -18,7 +18,7 @@ def uniform(recording: Recording) -> Recording:
 
     Evenly sampled recordings keep their samples. Otherwise whatever drives and the load, which hold between
     samples, are averaged over each interval of the grid, so that no volt-second is lost, and the outputs are
-    interpolated linearly; inside gaps they are missing (NaN).
+    interpolated linearly; inside gaps, and past the end, they are missing (NaN).
     """
     if recording.speed is None and recording.angle is not None:
         recording = attrs.evolve(recording, speed=_speed_of(recording.angle, recording.time))
@@ -27,8 +27,9 @@ def uniform(recording: Recording) -> Recording:
     step = (time[-1] - time[0]) / (len(time) - 1)
     if np.max(np.abs(time - (time[0] + steps * step))) <= ROUNDING * step:
         return attrs.evolve(recording, time=time[0] + steps * step)
-    step = float(np.median(np.diff(time)))
-    grid = time[0] + step * np.arange(int((time[-1] - time[0]) / step + 1e-9) + 1)
+    # rounded, so that runs of one clock share a grid
+    step = float(f"{np.median(np.diff(time)):.3g}")
+    grid = time[0] + step * np.arange(np.ceil((time[-1] - time[0]) / step - 1e-9) + 1)
     held = {"voltage": recording.voltage, "load": recording.load, "torque": recording.torque}
     seen = {"current": recording.current, "speed": recording.speed}
     return attrs.evolve(
@@ -54,7 +55,8 @@ def _interpolate(time: np.ndarray, samples: np.ndarray, grid: np.ndarray) -> np.
     # the known samples on either side of each grid point must not be too far apart
     right = np.clip(np.searchsorted(time[known], grid), 1, known.sum() - 1)
     apart = time[known][right] - time[known][right - 1]
-    values[apart > GAP * (grid[1] - grid[0])] = np.nan
+    step = grid[1] - grid[0]
+    values[(apart > GAP * step) | (grid > time[-1] + 1e-9 * step)] = np.nan
     return values
 
 
