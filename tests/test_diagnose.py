@@ -57,6 +57,12 @@ def test_candidates_are_within_the_ranges(name):
 # ------------------------------------------------------------------------------- the evidence
 
 
+def evidence_of(J, own, X, r):
+    """By rows given in two parts."""
+    runs = (np.hstack([j, x, y[:, None], o]) for j, o, x, y in zip(J, own, X, r, strict=True))
+    return products(((rows[:150], rows[150:]) for rows in runs), J[0].shape[1], own[0].shape[1])
+
+
 def random_evidence(seed: int, runs: int = 3, rows: int = 400):
     rng = np.random.default_rng(seed)
     J, own, X = ([rng.normal(size=(rows, n)) for _ in range(runs)] for n in (4, 2, 5))
@@ -68,7 +74,7 @@ def random_evidence(seed: int, runs: int = 3, rows: int = 400):
 def test_regression_is_plain_least_squares(own_phase):
     """Against numpy on the whole matrix, with every run's own columns written out."""
     J, own, X, r = random_evidence(0)
-    evidence = products(J, own, X, r)
+    evidence = evidence_of(J, own, X, r)
     fit = evidence.regress([Block((4, 6), own_phase)])
     chosen = [x[:, [0, 2]] for x in X]
     locals_of = [np.hstack([o, x]) for o, x in zip(own, chosen, strict=True)] if own_phase else own
@@ -95,7 +101,7 @@ def test_regression_is_plain_least_squares(own_phase):
 def test_a_column_that_says_nothing_new_changes_nothing():
     J, own, X, r = random_evidence(1)
     X = [np.hstack([x, j[:, :1]]) for x, j in zip(X, J, strict=True)]
-    evidence = products(J, own, X, r)
+    evidence = evidence_of(J, own, X, r)
     with_it = evidence.regress([Block((4 + 5,))])
     assert with_it.squares == pytest.approx(evidence.regress().squares, rel=1e-9)
 

@@ -6,7 +6,7 @@ inner products for every run.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,15 @@ class Block(NamedTuple):
 
     columns: tuple[int, ...]
     own: bool = False
+
+
+def blocks_of(orders: Iterable[tuple[int, bool]], first: int) -> list[Block]:
+    """Blocks of so many columns each, of every run's own or not, one after another from the `first` column on."""
+    blocks = []
+    for order, own in orders:
+        blocks.append(Block(tuple(range(first, first + order)), own))
+        first += order
+    return blocks
 
 
 class Regression(NamedTuple):
@@ -99,15 +108,20 @@ def _inverse(
 
 
 def products(
-    shared: Sequence[Float[np.ndarray, "_ shared"]],
-    local: Sequence[Float[np.ndarray, "_ local"]],
-    columns: Sequence[Float[np.ndarray, "_ columns"]],
-    residual: Sequence[Float[np.ndarray, " _"]],
+    runs: Iterable[Iterable[Float[np.ndarray, "rows _"]]], parameters: int, own: int
 ) -> Evidence:
-    """Gather the evidence from white rows, one array a run of each."""
-    gathered = []
-    for J, own, X, r in zip(shared, local, columns, residual, strict=True):
-        everything = np.concatenate([J, X, r[:, None]], 1)
-        everything = everything - own @ (_inverse(own.T @ own) @ (own.T @ everything))
-        gathered.append(everything.T @ everything)
-    return Evidence(np.array(gathered), shared[0].shape[1], sum(len(r) for r in residual))
+    """Gather the evidence from white rows, of every run some at a time.
+
+    **Arguments**: the rows, whose first columns are those of the motor's `parameters`, then what may be missing, the
+    residual, and last the run's `own`.
+    """
+    gathered, rows = [], 0
+    for pieces in runs:
+        total = np.zeros(())
+        for piece in pieces:
+            total = total + piece.T @ piece
+            rows += len(piece)
+        kept, alone = slice(0, -own), slice(-own, None)
+        across = total[alone, kept]
+        gathered.append(total[kept, kept] - across.T @ _inverse(total[alone, alone]) @ across)
+    return Evidence(np.array(gathered), parameters, rows)

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..effects import EFFECTS, AbstractEffect
 from ..identify.noise import is_coarse
 from ..motor import Motor
 from ..simulate import Tape, free_run
-from .candidates import Candidate, Scales, Values, candidates
-from .evidence import Block
+from .candidates import Candidate, Scales, candidates
 from .model import Model
-from .response import Path, kicks, pushes, respond, sensed
+from .response import Path, kicks, pushes, sensed
 
 OVER = {
     "mechanical": ("speed", "current", "time"),
@@ -28,6 +29,17 @@ KNOTS, KNOTS_IN_TIME = 9, 7
 # Periods a turn of a torque that comes round behind a gear; two neighbours differ by half a period in some 500 rad
 BEHIND_GEAR = np.arange(0.02, 0.25, 0.006)
 KNOTS_IN_PERIOD = 25
+
+
+# Settings of an effect that are tried side by side
+TOGETHER = 32
+
+
+class Change(NamedTuple):
+    """What a few candidates or curves change along a path, in current and speed: (samples, 2, blocks, columns)."""
+
+    kicks: np.ndarray  # where one sample leads to the next
+    seen: np.ndarray  # ... and what is seen on top of it
 
 
 class Curve(NamedTuple):
@@ -41,6 +53,11 @@ class Curve(NamedTuple):
     shapes: np.ndarray | None = None
     # turns with the direction of motion, as a friction that changes does
     reverses: bool = False
+
+    @property
+    def order(self) -> int:
+        """How many coefficients it has (in one run, with `own`)."""
+        return len(self.knots) if self.shapes is None else self.shapes.shape[1]
 
     def values(self, coefficients: np.ndarray) -> np.ndarray:
         """The curve at its knots."""
@@ -67,75 +84,70 @@ class Library:
         # errors that last look like a voltage that changes in time
         speeds = [run.speed for run in base.given.training if run.speed is not None]
         self.coarse = any(is_coarse(speed) for speed in speeds)
-        self._whole: dict[int, jax.Array] = {}
+        self._whole: dict[int, np.ndarray] = {}
         self._base = base
 
-    def columns(self, tape: Tape, path: Path) -> tuple[jax.Array, list[Block]]:
-        """Responses (samples, 2, blocks, columns) along a path, and the columns of every candidate."""
-        kicked, seen, blocks, count = [], [], [], 0
+    def changes(self, tape: Tape, path: Path) -> Iterator[Change]:
+        """What every candidate changes along a path, in their order, some of one effect at a time."""
         for name in EFFECTS:
             shapes = [c for c in self.candidates if c.effect == name]
-            if not shapes:
-                continue
-            if shapes[0].whole:
-                parts = [self._response(c, tape) for c in shapes]
-                kick, direct = jnp.zeros((*parts[0].shape, len(parts))), jnp.stack(parts, -1)
-            else:
+            if shapes and shapes[0].whole:
+                seen = np.stack([self._response(c, tape) for c in shapes], -1)
+                yield Change(np.zeros_like(seen), seen)
+            elif shapes:
                 settings = [values for c in shapes for values in c.columns]
-                units = jnp.asarray([unit for c in shapes for unit in c.units])
-                kick, direct = (x / units for x in self._small(name, settings, tape, path))
-            kicked.append(kick)
-            seen.append(direct)
-            for shape in shapes:
-                blocks.append(Block(tuple(range(count, count + shape.order)), shape.own_phase))
-                count += shape.order
-        response = respond(self.bare, tape, path, jnp.concatenate(kicked, -1))
-        response = response + jnp.concatenate(seen, -1)
-        # a setting that cannot be simulated says nothing
-        return jnp.where(jnp.all(jnp.isfinite(response), (0, 1, 2)), response, 0.0), blocks
+                units = np.array([unit for c in shapes for unit in c.units])
+                for part in np.array_split(np.arange(len(settings)), -(-len(settings) // TOGETHER)):
+                    values = {f: np.array([settings[k][f] for k in part]) for f in settings[0]}
+                    small = _small(EFFECTS[name], values, self.bare, tape, path)
+                    yield Change(*(np.asarray(x) / units[part] for x in small))
 
-    def _small(self, name: str, settings: Sequence[Values], tape: Tape, path: Path):
-        """Kicks and sensor errors for small settings of one effect, settings last."""
-        effect = EFFECTS[name]
-        stacked = {field: jnp.asarray([s[field] for s in settings]) for field in settings[0]}
-
-        if effect.equation == "sensor":
-
-            def look(values):
-                return sensed(self._with(effect, values), tape, path)
-
-            direct = jax.vmap(look, out_axes=-1)(stacked)
-            return jnp.zeros_like(direct), direct
-
-        def kick(values):
-            return kicks(self._with(effect, values), self.bare, tape, path)
-
-        found = jax.vmap(kick, out_axes=-1)(stacked)
-        return found, jnp.zeros_like(found)
-
-    def _with(self, effect: type[AbstractEffect], values: dict[str, Any]) -> Motor:
-        return eqx.tree_at(lambda m: m.effects, self.bare, (effect(**values),))
-
-    def _response(self, candidate: Candidate, tape: Tape) -> jax.Array:
+    def _response(self, candidate: Candidate, tape: Tape) -> np.ndarray:
         """The response to a whole setting, simulated once."""
         key = id(candidate)
         if key not in self._whole:
             values = {field: jnp.asarray(x) for field, x in candidate.columns[0].items()}
             local = self._base.polished.refined.unknowns.local
-            motor = self._with(EFFECTS[candidate.effect], values)
+            motor = _with(self.bare, EFFECTS[candidate.effect], values)
             seen = free_run(motor, tape, local[:, :2], local[:, 2])
-            self._whole[key] = (seen - self._base.polished.evaluation.seen).transpose(2, 1, 0)
+            change = np.asarray(seen) - np.asarray(self._base.polished.evaluation.seen)
+            self._whole[key] = change.transpose(2, 1, 0)
         return self._whole[key]
 
 
-def curves_over(library: Library, tape: Tape, path: Path, count: int):
-    """Responses to curves over every variable in every equation, and to torques that a gear brings round."""
-    volt, torque = pushes(library.bare, tape)
-    value = jnp.asarray(tape.value).T
-    known = {"speed": path.speed, "current": path.current, "voltage": value}
+@eqx.filter_jit
+def _small(
+    effect: type[AbstractEffect],
+    settings: Mapping[str, Array | np.ndarray],
+    bare: Motor,
+    tape: Tape,
+    path: Path,
+) -> tuple[Array, Array]:
+    """Kicks, and what is seen on top of them, by small settings of one effect; settings last."""
+
+    def change(values):
+        motor = _with(bare, effect, values)
+        if effect.equation == "sensor":
+            seen = sensed(motor, tape, path)
+            return jnp.zeros_like(seen), seen
+        kicked = kicks(motor, bare, tape, path)
+        return kicked, jnp.zeros_like(kicked)
+
+    return jax.vmap(change, out_axes=-1)(settings)
+
+
+def _with(bare: Motor, effect: type[AbstractEffect], values: dict[str, Any]) -> Motor:
+    return eqx.tree_at(lambda m: m.effects, bare, (effect(**values),))
+
+
+def curves_over(library: Library, tape: Tape, path: Path) -> tuple[list[Curve], Iterator[Change]]:
+    """Curves over every variable in every equation, and torques that a gear brings round; what each changes."""
+    volt, torque = (np.asarray(push) for push in pushes(library.bare, tape))
+    value = np.asarray(tape.value).T
+    known = {"speed": np.asarray(path.speed), "current": np.asarray(path.current), "voltage": value}
     known["time"] = _share_of_run(tape)
-    weight = jnp.asarray(tape.weight).any(1).T
-    terms: list[tuple[jax.Array, jax.Array, Curve]] = []
+    weight = np.any(np.asarray(tape.weight), axis=1).T
+    terms: list[tuple[Curve, np.ndarray, Callable[[], np.ndarray]]] = []
     voltage_driven = bool(np.any(np.asarray(tape.drive.voltage) > 0))
     for equation, variables in OVER.items():
         if equation == "electrical" and not voltage_driven:
@@ -146,47 +158,41 @@ def curves_over(library: Library, tape: Tape, path: Path, count: int):
                 continue
             own, x = variable == "time", known[variable]
             knots = np.linspace(0, 1, KNOTS_IN_TIME) if own else _knots(x, weight)
-            hats = jnp.stack([_hat(x, knots, k) for k in range(len(knots))], -1)
-            terms.append((push, hats, Curve(equation, variable, knots, own)))
+            hats = partial(_hats, x, knots)
+            terms.append((Curve(equation, variable, knots, own), push, hats))
             if own and equation == "mechanical":
-                turning = _direction(path.speed, tape)[..., None] * hats
-                terms.append((push, turning, Curve(equation, variable, knots, own, reverses=True)))
+                turning = partial(_hats, x, knots, _direction(known["speed"], tape))
+                terms.append((Curve(equation, variable, knots, own, reverses=True), push, turning))
     for periods in BEHIND_GEAR:
         turned = np.linspace(0, 2 * np.pi / periods, KNOTS_IN_PERIOD)
-        curve = Curve("mechanical", "angle", turned, True, np.asarray(_wave(periods * turned)))
-        terms.append((torque, _wave(periods * path.angle), curve))
-    blocks = []
-    for _, shape, curve in terms:
-        blocks.append(Block(tuple(range(count, count + shape.shape[-1])), curve.own))
-        count += shape.shape[-1]
-    kicked = jnp.concatenate([push[..., None] * shape[:, None] for push, shape, _ in terms], -1)
-    return respond(library.bare, tape, path, kicked), [curve for *_, curve in terms], blocks
+        curve = Curve("mechanical", "angle", turned, True, _wave(periods * turned))
+        terms.append((curve, torque, partial(_wave, periods * np.asarray(path.angle))))
+    kicks = (push[..., None] * shape()[:, None] for _, push, shape in terms)
+    return [curve for curve, *_ in terms], (Change(kick, np.zeros_like(kick)) for kick in kicks)
 
 
-def _direction(speed, tape: Tape) -> jax.Array:
+def _direction(speed: np.ndarray, tape: Tape) -> np.ndarray:
     """That of motion, less its mean over each run: where it never changes, a friction is but a torque."""
-    direction = jnp.sign(speed)
-    mean = jax.ops.segment_sum(direction.mean(0), tape.run, tape.runs) / jnp.bincount(
-        jnp.asarray(tape.run), length=tape.runs
-    )
-    return direction - mean[tape.run]
+    direction, run = np.sign(speed), np.asarray(tape.run)
+    mean = np.bincount(run, direction.mean(0), tape.runs) / np.bincount(run, minlength=tape.runs)
+    return direction - mean[run]
 
 
-def _wave(phase) -> jax.Array:
-    return jnp.stack([jnp.cos(phase), jnp.sin(phase)], -1)
+def _wave(phase: np.ndarray) -> np.ndarray:
+    return np.stack([np.cos(phase), np.sin(phase)], -1)
 
 
-def _share_of_run(tape: Tape) -> jax.Array:
+def _share_of_run(tape: Tape) -> np.ndarray:
     """The time as a share of each run's, (samples, blocks)."""
     run, samples = np.asarray(tape.run), tape.value.shape[1]
     block = np.arange(len(run)) - np.searchsorted(run, run)
     time = block * samples + np.arange(samples)[:, None]
-    return jnp.asarray(time / (np.bincount(run, minlength=tape.runs) * samples)[run])
+    return time / (np.bincount(run, minlength=tape.runs) * samples)[run]
 
 
-def _knots(x, weight) -> np.ndarray:
+def _knots(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Knots over the range of a variable, denser where it often is and about zero."""
-    values = np.asarray(x)[np.asarray(weight)]
+    values = x[weight]
     low, high = np.quantile(values, [0.001, 0.999])
     spread = max(high - low, 1e-9)
     inner = np.quantile(values, np.linspace(0, 1, KNOTS)[1:-1])
@@ -196,8 +202,9 @@ def _knots(x, weight) -> np.ndarray:
     return knots[np.append(True, np.diff(knots) > 0.01 * spread)]
 
 
-def _hat(x, knots: np.ndarray, k: int):
-    return jnp.interp(x, knots, np.eye(len(knots))[k])
+def _hats(x: np.ndarray, knots: np.ndarray, times: np.ndarray | None = None) -> np.ndarray:
+    hats = np.stack([np.interp(x, knots, hat) for hat in np.eye(len(knots))], -1)
+    return hats if times is None else times[..., None] * hats
 
 
 def _scales(base: Model) -> Scales:

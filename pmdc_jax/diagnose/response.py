@@ -12,6 +12,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..effects import State
@@ -83,7 +84,7 @@ def respond(
     motor: Motor,
     tape: Tape,
     path: Path,
-    kicks: Float[Array, "samples 2 blocks columns"],
+    kicks: Float[Array | np.ndarray, "samples 2 blocks columns"],
 ) -> Float[Array, "samples 2 blocks columns"]:
     """What the kicks of every column grow into, in current and speed, along the linear `motor`.
 

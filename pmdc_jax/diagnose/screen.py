@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import special, stats
 
 from ..effects import EFFECTS
 from ..identify.colour import Series, Whitener, plain, whitener
-from ..identify.sharpen import series_of
+from ..simulate import LOCAL
 from .candidates import Candidate
-from .evidence import Block, Evidence, products
+from .evidence import Block, Evidence, blocks_of, products
 from .library import Curve, Library, curves_over
-from .model import Fit, Model, rows_of
+from .model import Model
+from .rows import Rows, gathered
 
 # How much stronger slow noise may be at the slowest waves than at most of them
 SLOWEST_WAVES = 1.5
@@ -51,25 +51,27 @@ def screen(model: Model, library: Library) -> Screen:
     for noise what is missing, a constant offset above all, and leave nothing of it to be seen.
     """
     tape, path = model.given.problem.tape, model.path
-    shown, of_candidate = library.columns(tape, path)
-    curved, curves, of_curve = curves_over(library, tape, path, shown.shape[-1])
-    of_candidate, of_curve = (_behind(model, blocks) for blocks in (of_candidate, of_curve))
-    fitted, X = rows_of(model), _series(model, jnp.concatenate([shown, curved], -1))
-    residuals = [fit.residual for fit in fitted]
-    as_they_are = plain(residuals)
-    unfiltered = _products(fitted, as_they_are, X)
+    curves, of_curves = curves_over(library, tape, path)
+    parameters = model.given.problem.free.shape[0]
+    orders = [(c.order, c.own_phase) for c in library.candidates]
+    orders += [(c.order, c.own) for c in curves]
+    blocks, count = blocks_of(orders, parameters), sum(order for order, _ in orders)
+    changes = chain(library.changes(tape, path), of_curves)
+    rows = gathered(model, library.bare, path, changes, count)
+    as_they_are = plain([run.fit.residual for run in rows])
+    unfiltered = _evidence(rows, as_they_are)
     found = Screen(
         evidence=unfiltered,
         white=as_they_are,
         unfiltered=unfiltered,
         candidates=library.candidates,
-        of_candidate=of_candidate,
+        of_candidate=blocks[: len(library.candidates)],
         curves=curves,
-        of_curve=of_curve,
+        of_curve=blocks[len(library.candidates) :],
         dry=model.dry,
     )
-    white = whitener(_without_clearest(found, fitted, X))
-    return found._replace(evidence=_products(fitted, white, X), white=white)
+    white = whitener(_without_clearest(found, rows))
+    return found._replace(evidence=_evidence(rows, white), white=white)
 
 
 def beyond_curves(found: Screen) -> float:
@@ -174,33 +176,13 @@ def log_chance(gain: float, freedom: int) -> float:
     return float(-gain / 2 + (half - 1) * np.log(gain / 2) - special.gammaln(half))
 
 
-def _series(model: Model, columns: jax.Array) -> list[Series]:
-    """Responses (samples, 2, blocks, columns) of every training run in the order of time."""
-    tape = model.given.problem.tape
-    there = np.asarray(columns).transpose(2, 1, 0, 3) * np.asarray(tape.weight)[..., None]
-    return [series_of(tape, run, there) for run in model.training]
-
-
-def _behind(model: Model, blocks: Sequence[Block]) -> list[Block]:
-    """The blocks' columns, counted on behind the motor's own parameters."""
-    count = model.given.problem.free.shape[0]
-    return [Block(tuple(c + count for c in block.columns), block.own) for block in blocks]
-
-
-def _products(fitted: Sequence[Fit], whiten: Whitener, X: Sequence[Series] | None) -> Evidence:
+def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
     """Inner products of all rows, made white by one filter."""
-
-    def white(series: Sequence[Series]) -> list[np.ndarray]:
-        return [whiten(k, s) for k, s in enumerate(series)]
-
-    r = white([fit.residual for fit in fitted])
-    columns = white(X) if X is not None else [np.zeros((len(x), 0)) for x in r]
-    return products(
-        white([fit.shared for fit in fitted]), white([fit.own for fit in fitted]), columns, r
-    )
+    white = (run.white(k, whiten) for k, run in enumerate(rows))
+    return products(white, rows[0].fit.shared.values.shape[-1], LOCAL)
 
 
-def _without_clearest(found: Screen, fitted: Sequence[Fit], X: Sequence[Series]) -> list[Series]:
+def _without_clearest(found: Screen, rows: Sequence[Rows]) -> list[Series]:
     """What the clearest candidate or shared curve leaves of the residuals."""
     of_candidates, of_curves = signals(found)
     clearest = min(
@@ -210,11 +192,11 @@ def _without_clearest(found: Screen, fitted: Sequence[Fit], X: Sequence[Series])
     best = found.evidence.regress([clearest])
     columns = np.array(clearest.columns) - found.evidence.parameters
     left = []
-    for k, (fit, x) in enumerate(zip(fitted, X, strict=True)):
+    for k, (fit, X) in enumerate(rows):
         coefficients = best.coefficients[0][k] if clearest.own else best.coefficients[0]
         known = fit.residual.known
         rest = fit.residual.values - fit.shared.values @ best.moved
-        rest = rest - x.values[..., columns] @ coefficients
+        rest = rest - X[..., columns] @ coefficients
         own = fit.own.values
         local = np.linalg.lstsq(own[known].reshape(-1, own.shape[-1]), rest[known].ravel())[0]
         left.append(fit.residual._replace(values=rest - own @ local))

@@ -52,10 +52,9 @@ class Whitener(NamedTuple):
         return alike and not any(len(A) for A in self.filters)
 
     def __call__(self, run: int, series: Series) -> Float[np.ndarray, "rows *columns"]:
-        """The rows of a run, white if the series is its noise, those of all outputs one after another."""
-        rest = _filtered(series, self.filters[run])
-        rows = np.einsum("oi,si...->so...", self.scales[run], rest)
-        return rows.reshape(-1, *rows.shape[2:])
+        """The rows of a run, white if the series is its noise, those of all outputs side by side in time."""
+        rest = _filtered(series, self.filters[run], self.scales[run])
+        return rest.reshape(-1, *rest.shape[2:])
 
 
 def whitener(residuals: Sequence[Series]) -> Whitener:
@@ -141,14 +140,19 @@ def _lagged(series: Series, order: int) -> Float[np.ndarray, "rows lags"]:
     return whole[remembered(series.known, order)[order:]]
 
 
-def _filtered(series: Series, filters: Float[np.ndarray, "order outputs outputs"]) -> Rows:
+def _filtered(
+    series: Series,
+    filters: Float[np.ndarray, "order outputs outputs"],
+    scale: Float[np.ndarray, "outputs outputs"] | None = None,
+) -> Rows:
     values, order, outputs = series.values, len(filters), series.values.shape[1]
     flat = np.ascontiguousarray(values).reshape(len(values) * outputs, -1)
-    by_chunk = band(filters, np.eye(outputs))
+    by_chunk = band(filters, np.eye(outputs) if scale is None else scale)
     rest = np.empty(((len(values) - order) * outputs, flat.shape[1]))
     for first in range(0, len(rest), len(by_chunk)):
         window = flat[first : first + by_chunk.shape[1]]
         part = rest[first : first + len(by_chunk)]
-        part[:] = by_chunk[: len(part), : len(window)] @ window
+        np.matmul(by_chunk[: len(part), : len(window)], window, out=part)
     rest = rest.reshape(len(values) - order, *values.shape[1:])
-    return rest[remembered(series.known, order)[order:]]
+    whole = remembered(series.known, order)[order:]
+    return rest if whole.all() else rest[whole]

@@ -263,6 +263,8 @@ def polish(problem: Problem, end: Refined, steps: int = POLISH) -> Polished:
     for _ in range(steps):
         if len(costs) > PATIENCE and costs[-1 - PATIENCE] - costs[-1] < IDLE:
             break
+        if not np.isfinite(best.cost):
+            break  # what cannot be simulated has no slope to follow
         if reached.cost > best.cost + 1e-9 and share > 1e-3:
             share /= 4  # the last step was too long
         elif reached.cost <= best.cost + 1e-9:

@@ -1,0 +1,89 @@
+"""The rows of the regression: in every training run what the motor's parameters, and whatever may be missing, change.
+
+The columns are kept in single precision, and made white and multiplied some rows at a time in double: a log of a
+million samples has to fit into memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float32
+
+from ..identify.colour import Series, Whitener
+from ..identify.sharpen import series_of
+from ..motor import Motor
+from ..simulate import Tape
+from .library import Change
+from .model import Fit, Model, rows_of
+from .response import Path, respond
+
+# Columns whose response is simulated side by side, and samples that are made white at once
+WIDTH, STRETCH = 32, 2048
+
+
+class Rows(NamedTuple):
+    """Of one training run its fit, and what every candidate and curve changes in A and rad/s."""
+
+    fit: Fit
+    columns: Float[np.ndarray, "samples outputs columns"]
+
+    def white(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
+        """Rows made white, some at a time: of the motor's parameters, the columns, the residual, and the run's own."""
+        shared, own, residual = self.fit
+        back = len(whiten.filters[run])
+        for first in range(back, len(residual.values), STRETCH):
+            part = slice(first - back, first + STRETCH)
+            everything = (
+                shared.values[part],
+                self.columns[part],
+                residual.values[part, :, None],
+                own.values[part],
+            )
+            values = np.concatenate(everything, axis=-1)
+            yield whiten(run, Series(values, residual.known[part], residual.kind))
+
+
+def gathered(
+    model: Model, bare: Motor, path: Path, changes: Iterable[Change], count: int
+) -> list[Rows]:
+    """The rows of every training run, of `count` columns; `bare`, the motor without effects, carries changes on."""
+    tape, fits = model.given.problem.tape, rows_of(model)
+    rows = [Rows(f, np.empty((*f.residual.values.shape, count), np.float32)) for f in fits]
+    first = 0
+    for change, width in _side_by_side(changes):
+        response = np.asarray(_response(bare, tape, path, change))[..., :width]
+        for run, of_run in zip(model.training, rows, strict=True):
+            signal = response.transpose(2, 1, 0, 3)
+            of_run.columns[..., first : first + width] = series_of(tape, run, signal).values
+        first += width
+    return rows
+
+
+@eqx.filter_jit
+def _response(bare: Motor, tape: Tape, path: Path, change: Change) -> Float32[Array, "..."]:
+    response = respond(bare, tape, path, change.kicks) + change.seen
+    # a setting that cannot be simulated says nothing
+    sound = jnp.all(jnp.isfinite(response), (0, 1, 2))
+    return jnp.where(sound, response, 0.0).astype(jnp.float32)
+
+
+def _side_by_side(changes: Iterable[Change]) -> Iterator[tuple[Change, int]]:
+    """The changes in parts of one width, for which the response is compiled once; how many columns each is of."""
+    waiting: Change | None = None
+    for change in changes:
+        waiting = change if waiting is None else _joined(waiting, change)
+        while waiting.kicks.shape[-1] >= WIDTH:
+            yield Change(*(x[..., :WIDTH] for x in waiting)), WIDTH
+            waiting = Change(*(x[..., WIDTH:] for x in waiting))
+    if waiting is not None and (count := waiting.kicks.shape[-1]):
+        nothing = [(0, 0)] * 3 + [(0, WIDTH - count)]
+        yield Change(*(np.pad(x, nothing) for x in waiting)), count
+
+
+def _joined(one: Change, other: Change) -> Change:
+    return Change(*(np.concatenate(both, -1) for both in zip(one, other, strict=True)))
