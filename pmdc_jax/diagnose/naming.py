@@ -144,8 +144,7 @@ class Namer:
 
     def name(self) -> Naming:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
-        current, first = self.base, self._see(self.base)
-        found = first
+        current, found = self.base, self._see(self.base)
         while len(current.effects) < MOST and (tried := self._tried(current, found)):
             best = self._best(tried, found.screen.white)
             # judged by the noise that the clearest signal leaves: a filter of what a poorer model leaves takes
@@ -160,6 +159,15 @@ class Namer:
             if not (harder or found.is_settled(again, NEXT_TO_NOTHING if grown else LITTLE)):
                 break
             current, found = better, again
+        return self._naming(current)
+
+    def without(self, named: Naming, effect: str) -> Naming:
+        """The set without one of its effects."""
+        white = self._white(named.chosen)
+        return self._naming(self.refits.without(named.chosen, effect, white))
+
+    def _naming(self, current: Model) -> Naming:
+        first, found = self._see(self.base), self._see(current)
         return Naming(
             chosen=current,
             rivals=self._rivals(current, found),

@@ -14,7 +14,7 @@ from ..effects import EFFECTS
 from ..identify.identification import Identification, Role
 from ..identify.judge import judge
 from ..identify.prepare import prepare
-from ..identify.solve import solve
+from ..identify.solve import Solved, solve
 from ..precision import double_precision
 from ..recording import Recording
 from .diagnosis import (
@@ -28,6 +28,7 @@ from .diagnosis import (
 )
 from .evidence import Block
 from .experiment import next_experiment
+from .library import Library
 from .model import model_of
 from .naming import ALARM, Namer, Naming
 from .screen import Screen, log_chance
@@ -67,12 +68,15 @@ def diagnose(
     given, solved = solve(given, search, seed, progress)
     identified = time.perf_counter()
     report("gathering evidence", solved.polished.refined.fitness)
-    naming = Namer(model_of((), given, solved.polished), report).name()
+    namer = Namer(model_of((), given, solved.polished), report)
+    naming = namer.name()
     named = time.perf_counter()
     report("judging the uncertainty", naming.chosen.polished.refined.fitness)
     base = judge(given, solved)
-    ended, polished = naming.ended
-    final = judge(ended, solved._replace(polished=polished))
+    final = _judged(naming, solved)
+    while (idle := _idle(naming, final, namer.library)) is not None:
+        naming = namer.without(naming, idle)
+        final = _judged(naming, solved)
     verdict = _verdict(naming)
     gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
     seconds = {
@@ -97,6 +101,34 @@ def diagnose(
         p_nothing=naming.nothing,
         seconds=seconds,
     )
+
+
+def _judged(naming: Naming, solved: Solved) -> Identification:
+    ended, polished = naming.ended
+    return judge(ended, solved._replace(polished=polished))
+
+
+def _idle(naming: Naming, final: Identification, library: Library) -> str | None:
+    """One of several effects that the others do without: by its chance, or as its interval reaches to nothing."""
+    if len(naming.without) < 2:
+        return None
+    amplitude = {c.effect: c.amplitude for c in library.candidates if c.amplitude}
+    idle = {
+        effect: chance
+        for effect, chance in naming.without.items()
+        if chance > ALARM
+        or (effect in amplitude and _may_be_none(final, effect, amplitude[effect]))
+    }
+    return max(idle, key=lambda effect: idle[effect], default=None)
+
+
+def _may_be_none(final: Identification, effect: str, amplitude: str) -> bool:
+    interval, about = (
+        final.parameters[f"{effect}.{amplitude}"].ci95,
+        EFFECTS[effect].ranges[amplitude],
+    )
+    nothing = about.lower * (1 + 1e-6) if about.scale == "log" else 0.0
+    return interval is not None and interval[0] <= nothing <= interval[1]
 
 
 def _verdict(naming: Naming) -> Verdict:

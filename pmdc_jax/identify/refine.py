@@ -13,6 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from ..simulate import LOCAL, Tape, sensitivities
+from .noise import FLOOR
 from .parameters import Parameters
 from .whitening import Whitening
 
@@ -310,7 +311,7 @@ def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
         jacobian=evaluation.jacobian * stretch[:, None, None],
     )
     matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
-    cost = float(np.log(np.maximum(noise, 1e-300)).sum())
+    cost = float(np.log(np.maximum(noise, 1e-300)).sum() + _over(problem, squares * stretch**2) / 2)
     if problem.whitening is not None:
         cost = float(np.log(np.maximum(squares.sum(), 1e-300)))
     cost = cost if np.isfinite(cost) else np.inf
@@ -357,13 +358,25 @@ def gauss_newton(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.nda
 
 
 def _own_noise(problem: Problem, squares: np.ndarray):
-    """Standard deviation of the residuals of each output, and the old scale over the new; white ones keep theirs."""
+    """Standard deviation of the residuals of each output, and the old scale over the new; white ones keep theirs.
+
+    At least the share `FLOOR` of what is measured: where there is no noise, the likelihood is greatest if one output
+    is met exactly, whatever becomes of the other.
+    """
     if problem.whitening is not None:
         return np.asarray(problem.noise), np.ones(2)
-    weight = np.asarray(problem.tape.weight)[problem.counted].sum((0, 2))
-    ratio = np.sqrt(squares / np.maximum(weight, 1.0))
+    noise, tape = np.asarray(problem.noise), problem.tape
+    weight = np.asarray(tape.weight)[problem.counted].sum((0, 2))
+    seen = np.square(np.asarray(tape.measured)[problem.counted]).sum((0, 2))
+    ratio = np.sqrt(np.maximum(squares, FLOOR**2 * seen / noise**2) / np.maximum(weight, 1.0))
     ratio = np.where(ratio == 0, 1.0, ratio)
-    return np.asarray(problem.noise) * ratio, 1 / ratio
+    return noise * ratio, 1 / ratio
+
+
+def _over(problem: Problem, squares: np.ndarray) -> float:
+    """The sum over both outputs of their mean squares."""
+    weight = np.asarray(problem.tape.weight)[problem.counted].sum((0, 2))
+    return float((squares / np.maximum(weight, 1.0)).sum())
 
 
 def _samples(problem: Problem) -> float:
