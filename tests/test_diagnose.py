@@ -310,6 +310,15 @@ NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
 SHAKEN = vb.Noise(current_A=0.1, speed_rad_s=0.5, torque_Nm=0.01, torque_correlation_s=0.02)
 
 
+def test_a_simulation_without_noise_lacks_nothing():
+    """Two simulators differ by far less than any sensor, and by far more than nothing."""
+    held_out, *training = recorded(vb.BenchMotor(**PAPER), 4, vb.Noise(0.0, 0.0))
+    found = diagnose(training, [held_out])
+    assert found.verdict == "none_detected"
+    for name in ("R", "L", "Kb", "Kt", "J", "f"):
+        assert found.final.parameters[name].value == pytest.approx(PAPER[name], rel=1e-3)
+
+
 @pytest.mark.parametrize("noise", [NOISE, SHAKEN], ids=["white", "coloured"])
 def test_hidden_friction_is_named_and_closes_the_gap(noise):
     truth = vb.BenchMotor(**PAPER, coulomb_Nm=0.08)

@@ -63,6 +63,17 @@ class Model(NamedTuple):
         return path_of(self.polished.evaluation.seen, self.given.problem.tape, held)
 
     @property
+    def misses(self) -> float:
+        """By which share of an output it misses what was measured, of the output that it misses more."""
+        problem = self.given.problem
+        measured = np.asarray(problem.tape.measured)[problem.counted]
+        left = np.asarray(self.polished.evaluation.residuals)[problem.counted]
+        sizes = np.square(measured).sum((0, 2))
+        there = sizes > 0
+        squares = np.square(left * self.polished.noise[:, None]).sum((0, 2))
+        return float(np.sqrt(np.max(squares[there] / sizes[there], initial=0.0)))
+
+    @property
     def training(self) -> list[int]:
         """The runs that it was fitted to."""
         return training_runs(self.given)

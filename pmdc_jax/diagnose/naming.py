@@ -23,6 +23,8 @@ from .screen import Screen, Signal, beyond_curves, screen, signals
 
 # Chance that anything at all is called missing from a motor that lacks nothing
 ALARM = 0.01
+# What is missed by a smaller share of what is measured is nothing: one simulation meets another no closer
+CLOSE = 1e-4
 # At most so many effects are named, and so many candidates for one are refitted in full simulation
 MOST, SHORTLIST = 3, 3
 # ... those whose gain to first order is at least this share of the best one's
@@ -214,7 +216,7 @@ class Namer:
         found = screen(model, self.library)
         of_candidates, of_curves = signals(found)
         count = len(found.candidates) + len(found.curves)
-        left = chance_of_nothing(of_candidates, of_curves, count)
+        left = 1.0 if model.misses < CLOSE else chance_of_nothing(of_candidates, of_curves, count)
         explained = 0.0
         if model.effects:
             base, mine = (self._left(m, found.white) for m in (self.base, model))
@@ -266,9 +268,12 @@ class Namer:
         return model
 
     def _does_as_well(self, simpler: Model, model: Model) -> bool:
-        """Whether a simpler form of an effect, chosen while another one was still missing, does as well by now."""
-        ranked = self.compare([model, simpler], self._white(model))
-        return _plainest(ranked) is simpler or self._see(simpler).left >= ALARM
+        """Whether a simpler form of an effect, chosen while another one was still missing, does as well by now: but for
+        less than what neither explains."""
+        rich, plain = (self._left(m, self._white(model)).criterion for m in (model, simpler))
+        rest = self._see(model)
+        margin = MARGIN + (rest.clearest.gain if rest.left < ALARM else 0.0)
+        return plain < rich + margin or self._see(simpler).left >= ALARM
 
     def compare(self, models: Sequence[Model], white: Whitener) -> list[Fitted]:
         """By the squares of what each leaves when fitted to residuals that a filter makes white, the best first.
