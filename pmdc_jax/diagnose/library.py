@@ -29,9 +29,7 @@ KNOTS, KNOTS_IN_TIME = 9, 7
 # Periods a turn of a torque that comes round behind a gear; two neighbours differ by half a period in some 500 rad
 BEHIND_GEAR = np.arange(0.02, 0.25, 0.006)
 KNOTS_IN_PERIOD = 25
-
-
-# Settings of an effect that are tried side by side
+# Columns that are simulated side by side: the more, the more memory they take
 TOGETHER = 32
 
 

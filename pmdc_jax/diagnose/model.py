@@ -65,13 +65,9 @@ class Model(NamedTuple):
     @property
     def misses(self) -> float:
         """By which share of an output it misses what was measured, of the output that it misses more."""
-        problem = self.given.problem
-        measured = np.asarray(problem.tape.measured)[problem.counted]
-        left = np.asarray(self.polished.evaluation.residuals)[problem.counted]
-        sizes = np.square(measured).sum((0, 2))
+        sizes = self.given.problem.sizes
         there = sizes > 0
-        squares = np.square(left * self.polished.noise[:, None]).sum((0, 2))
-        return float(np.sqrt(np.max(squares[there] / sizes[there], initial=0.0)))
+        return float(np.max(self.polished.noise[there] / sizes[there], initial=0.0))
 
     @property
     def training(self) -> list[int]:

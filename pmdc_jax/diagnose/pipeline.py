@@ -123,10 +123,8 @@ def _idle(naming: Naming, final: Identification, library: Library) -> str | None
 
 
 def _may_be_none(final: Identification, effect: str, amplitude: str) -> bool:
-    interval, about = (
-        final.parameters[f"{effect}.{amplitude}"].ci95,
-        EFFECTS[effect].ranges[amplitude],
-    )
+    interval = final.parameters[f"{effect}.{amplitude}"].ci95
+    about = EFFECTS[effect].ranges[amplitude]
     nothing = about.lower * (1 + 1e-6) if about.scale == "log" else 0.0
     return interval is not None and interval[0] <= nothing <= interval[1]
 

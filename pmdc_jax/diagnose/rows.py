@@ -18,12 +18,12 @@ from ..identify.colour import Series, Whitener
 from ..identify.sharpen import series_of
 from ..motor import Motor
 from ..simulate import Tape
-from .library import Change
+from .library import TOGETHER, Change
 from .model import Fit, Model, rows_of
 from .response import Path, respond
 
-# Columns whose response is simulated side by side, and samples that are made white at once
-WIDTH, STRETCH = 32, 2048
+# Samples that are made white at once
+STRETCH = 2048
 
 
 class Rows(NamedTuple):
@@ -77,11 +77,11 @@ def _side_by_side(changes: Iterable[Change]) -> Iterator[tuple[Change, int]]:
     waiting: Change | None = None
     for change in changes:
         waiting = change if waiting is None else _joined(waiting, change)
-        while waiting.kicks.shape[-1] >= WIDTH:
-            yield Change(*(x[..., :WIDTH] for x in waiting)), WIDTH
-            waiting = Change(*(x[..., WIDTH:] for x in waiting))
+        while waiting.kicks.shape[-1] >= TOGETHER:
+            yield Change(*(x[..., :TOGETHER] for x in waiting)), TOGETHER
+            waiting = Change(*(x[..., TOGETHER:] for x in waiting))
     if waiting is not None and (count := waiting.kicks.shape[-1]):
-        nothing = [(0, 0)] * 3 + [(0, WIDTH - count)]
+        nothing = [(0, 0)] * 3 + [(0, TOGETHER - count)]
         yield Change(*(np.pad(x, nothing) for x in waiting)), count
 
 

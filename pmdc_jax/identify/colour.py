@@ -68,7 +68,7 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
     filters = [of_kind[series.kind] for series in residuals]
     scales = _scales(residuals, filters)
     slow = [
-        _slow_power(_filtered(series, A) @ S.T)
+        _slow_power(_filtered(series, A, S))
         for series, A, S in zip(residuals, filters, scales, strict=True)
     ]
     return Whitener(filters, [S / np.sqrt(s) for S, s in zip(scales, slow, strict=True)])

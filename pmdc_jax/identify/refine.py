@@ -62,6 +62,17 @@ class Problem(eqx.Module):
         return np.asarray(self.counts)[np.asarray(self.tape.run)]
 
     @property
+    def samples(self) -> Float[np.ndarray, "2"]:
+        """How many samples of each output count."""
+        return np.asarray(self.tape.weight)[self.counted].sum((0, 2))
+
+    @property
+    def sizes(self) -> Float[np.ndarray, "2"]:
+        """Root mean square of each output as measured in the runs that count; zero where it was not."""
+        squares = np.square(np.asarray(self.tape.measured)[self.counted]).sum((0, 2))
+        return np.sqrt(squares / np.maximum(self.samples, 1.0))
+
+    @property
     def angular(self) -> bool:
         """Whether a torque depends on the rotor's angle."""
         return any("angle" in effect.states for effect in self.parameters.effects)
@@ -311,9 +322,11 @@ def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
         jacobian=evaluation.jacobian * stretch[:, None, None],
     )
     matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
-    cost = float(np.log(np.maximum(noise, 1e-300)).sum() + _over(problem, squares * stretch**2) / 2)
     if problem.whitening is not None:
         cost = float(np.log(np.maximum(squares.sum(), 1e-300)))
+    else:
+        over = squares * stretch**2 / np.maximum(problem.samples, 1.0)
+        cost = float(np.log(np.maximum(noise, 1e-300)).sum() + over.sum() / 2)
     cost = cost if np.isfinite(cost) else np.inf
     return _Weighed(unknowns, scaled, noise, matrix, cost, float(squares.sum()) / _samples(problem))
 
@@ -365,22 +378,15 @@ def _own_noise(problem: Problem, squares: np.ndarray):
     """
     if problem.whitening is not None:
         return np.asarray(problem.noise), np.ones(2)
-    noise, tape = np.asarray(problem.noise), problem.tape
-    weight = np.asarray(tape.weight)[problem.counted].sum((0, 2))
-    seen = np.square(np.asarray(tape.measured)[problem.counted]).sum((0, 2))
-    ratio = np.sqrt(np.maximum(squares, FLOOR**2 * seen / noise**2) / np.maximum(weight, 1.0))
+    noise = np.asarray(problem.noise)
+    ratio = np.sqrt(squares / np.maximum(problem.samples, 1.0))
+    ratio = np.maximum(ratio, FLOOR * problem.sizes / noise)
     ratio = np.where(ratio == 0, 1.0, ratio)
     return noise * ratio, 1 / ratio
 
 
-def _over(problem: Problem, squares: np.ndarray) -> float:
-    """The sum over both outputs of their mean squares."""
-    weight = np.asarray(problem.tape.weight)[problem.counted].sum((0, 2))
-    return float((squares / np.maximum(weight, 1.0)).sum())
-
-
 def _samples(problem: Problem) -> float:
-    return max(float(np.asarray(problem.tape.weight)[problem.counted].sum((0, 2)).max()), 1.0)
+    return max(float(problem.samples.max()), 1.0)
 
 
 def _without(free, held) -> Bool[Array, " parameters"]:
