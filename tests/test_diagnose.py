@@ -23,6 +23,7 @@ from pmdc_jax.diagnose.kinship import are_rivals, is_within
 from pmdc_jax.diagnose.library import Library
 from pmdc_jax.diagnose.model import model_of
 from pmdc_jax.diagnose.periodic import common_line, spectrum
+from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
 from pmdc_jax.diagnose.screen import log_chance
 from pmdc_jax.effects import EFFECTS
@@ -270,6 +271,30 @@ def test_a_simpler_form_is_within_a_richer_one():
     assert is_within({"coulomb_friction"} | drag, {"stribeck_friction"} | drag)
     assert not is_within({"stribeck_friction"} | drag, {"coulomb_friction"} | drag)
     assert not is_within({"coulomb_friction"}, {"stribeck_friction"} | drag)
+
+
+@pytest.mark.parametrize("periods", [4.0, 9.0, 14.0])
+def test_a_second_torque_over_the_angle_leaves_the_first_in_place(periods):
+    """Runs begin where a cogging of six periods put them, each off by some of its periods; the second torque has one
+    phase in all of them once these are undone."""
+    rng = np.random.default_rng(5)
+    whole = 2 * np.pi * np.arange(6) / 6
+    off = np.append(0.0, rng.choice(whole, 7))
+    phases = 0.8 + periods * off + 0.05 * rng.normal(size=8)
+    sizes = rng.uniform(0.5, 2.0, 8)
+    both = sizes[:, None] * np.stack([np.cos(phases), np.sin(phases)], 1)
+    phase, turned = common_phase(both, [np.zeros(1), *[whole] * 7], periods)
+    assert phase == pytest.approx(0.8, abs=0.1)
+    np.testing.assert_allclose(np.cos(periods * (turned - off)), 1.0, atol=1e-6)
+    assert all(np.min(np.abs(whole - angle)) == 0 for angle in turned)
+
+
+def test_runs_that_may_begin_turned_by_any_angle_are_turned_to_the_first():
+    phases = np.array([0.3, 2.0, -3.0, 1.0])
+    both = np.stack([np.cos(phases), np.sin(phases)], 1)
+    phase, turned = common_phase(both, [np.zeros(1), None, None, None], 7.0)
+    assert phase == pytest.approx(0.3, abs=0.03)  # as finely as it is looked for
+    np.testing.assert_allclose(np.cos(phases - phase - 7.0 * turned), 1.0, atol=1e-3)
 
 
 def test_sizes_in_amperes_are_not_tried_where_no_current_was_measured(x64):

@@ -574,6 +574,13 @@ def steady(name: str, values: Values, voltage: float, load: float = 0.0) -> np.n
     return simulated(with_effect(name, values), recordings(voltage=voltage, load=load))[2]
 
 
+def test_friction_that_rises_from_standstill_is_no_stribeck_friction():
+    one = {"coulomb_Nm": np.float64(0.2), "static_Nm": np.float64(0.3), "speed_rad_s": 5.0}
+    other = {**one, "coulomb_Nm": np.float64(0.4)}
+    assert EFFECTS["stribeck_friction"](**one).is_possible()
+    assert not EFFECTS["stribeck_friction"](**other).is_possible()
+
+
 @pytest.mark.parametrize("direction", [1, -1])
 def test_friction_sticks_below_break_away_and_slips_above(x64, direction):
     """Locked, the torque is Kt v / R; below the friction torque nothing moves, not even a little."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+import attrs
 import numpy as np
 
 from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction
@@ -24,8 +25,9 @@ from ..motor import Motor
 from .response import Path, path_of
 
 
-class Model(NamedTuple):
-    """A motor with some effects, fitted to the recordings."""
+@attrs.frozen(eq=False)
+class Model:
+    """A motor with some effects, fitted to the recordings; each fit is one of its own."""
 
     effects: tuple[str, ...]
     given: Prepared
@@ -35,6 +37,12 @@ class Model(NamedTuple):
     def motor(self) -> Motor:
         """The fitted motor."""
         return self.given.problem.parameters(self.polished.refined.unknowns.coordinates)
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether it can be simulated, and nature allows what its effects were fitted to be."""
+        simulated = np.isfinite(self.polished.refined.fitness)
+        return bool(simulated) and all(effect.is_possible() for effect in self.motor.effects)
 
     @property
     def dry(self) -> float:

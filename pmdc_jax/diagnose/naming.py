@@ -13,7 +13,7 @@ from ..identify.colour import Whitener, whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Polished
 from ..identify.sharpen import residuals_of, sharpened, squares_of
-from .candidates import Candidate
+from .candidates import STARTS, Candidate
 from .kinship import CONTAINS, are_rivals, is_within, spelt_out
 from .library import Library
 from .model import Model, ended
@@ -83,8 +83,7 @@ class Seen(NamedTuple):
 
     def asks_for_more(self) -> bool:
         """Whether more is missing, and one of the library's effects would take away much of it."""
-        share = MUCH_OF_IT if self.unexplained > FORMULA else MOST_OF_IT
-        return bool(self.left < ALARM and self.by_one_more > share)
+        return bool(self.left < ALARM and self.by_one_more > MUCH_OF_IT)
 
     def is_another(self) -> bool:
         """Whether what is left is clearly one more effect, and no formula."""
@@ -140,28 +139,44 @@ class Namer:
     def __init__(self, base: Model, report):
         self.base, self.library = base, Library(base)
         self.refits = Refits(base, self.library, report)
-        self.seen: dict[frozenset[str], Seen] = {}
-        self.filters: dict[frozenset[str], Whitener] = {}
-        self.compared: dict[tuple[frozenset[str], int], Fitted] = {}
+        self.seen: dict[Model, Seen] = {}
+        self.filters: dict[Model, Whitener] = {}
+        self.compared: dict[tuple[Model, int], Fitted] = {}
 
     def name(self) -> Naming:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
         current, found = self.base, self._see(self.base)
-        while len(current.effects) < MOST and (tried := self._tried(current, found)):
-            best = self._best(tried, found.screen.white)
-            # judged by the noise that the clearest signal leaves: a filter of what a poorer model leaves takes
-            # for noise what is missing
-            if _plainest(self.compare([current, best], found.screen.white)) is current:
-                break
-            better = self._spared(best)
+        while better := self._better(current, found, self._tried(current, found)):
             again = self._see(better)
-            new = set(better.effects) - set(current.effects)
-            harder = bool(new & set(HARDER.values()))
-            grown = len(better.effects) > len(current.effects)
-            if not (harder or found.is_settled(again, NEXT_TO_NOTHING if grown else LITTLE)):
-                break
-            current, found = better, again
+            if not self._is_settled(current, found, better):
+                # a simple form may be but a step to the one that is there
+                tried = self._in_other_form(
+                    better, again, set(better.effects) - set(current.effects)
+                )
+                better = self._better(better, again, tried)
+                if better is None or not self._is_settled(current, found, better):
+                    break
+            current, found = better, self._see(better)
         return self._naming(current)
+
+    def _better(self, current: Model, found: Seen, tried: Sequence[Model | None]) -> Model | None:
+        """The best of some models in place of the current one, if it is better, without what it can do without."""
+        possible = [model for model in tried if model is not None and model.is_possible]
+        if not possible:
+            return None
+        best = self._best(possible, found.screen.white)
+        # judged by the noise that the clearest signal leaves: a filter of what a poorer model leaves takes
+        # for noise what is missing
+        if _plainest(self.compare([current, best], found.screen.white)) is current:
+            return None
+        return self._spared(best)
+
+    def _is_settled(self, current: Model, found: Seen, better: Model) -> bool:
+        """Whether a better model explains enough of what the current one leaves to be named."""
+        if (set(better.effects) - set(current.effects)) & set(HARDER.values()):
+            return True
+        grown = len(better.effects) > len(current.effects)
+        return found.is_settled(self._see(better), NEXT_TO_NOTHING if grown else LITTLE)
 
     def without(self, named: Naming, effect: str) -> Naming:
         """The set without one of its effects."""
@@ -184,33 +199,47 @@ class Namer:
             line=line_of(current),
         )
 
-    def _tried(self, current: Model, found: Seen) -> list[Model]:
-        """The current model with one effect more, or with a harder one in place of another."""
-        tried, here = [], set(current.effects)
-        if found.unexplained < (TRACE_OF_HARDER if here & set(HARDER.values()) else TRACE):
+    def _tried(self, current: Model, found: Seen) -> list[Model | None]:
+        """The current model with one effect more, or with a richer or a harder one in place of another."""
+        here = set(current.effects)
+        if len(here) == MOST:
             return []
+        if found.unexplained < (TRACE_OF_HARDER if here & set(HARDER.values()) else TRACE):
+            return self._with(current, found, self._richer(current, found))
+        tried = []
         if found.asks_for_more():
-            shortlist = self._shortlist(current, found)
-            tried += [self.refits.with_signal(current, s, found.screen) for s in shortlist]
-        for simpler in here & HARDER.keys() if not found.is_another() else ():
-            tried.append(
-                self.refits.in_place(current, found.screen.white, simpler, HARDER[simpler])
-            )
-        return [model for model in tried if model is not None]
+            tried += self._with(current, found, self._shortlist(current, found))
+        if not found.is_another():
+            tried += self._in_harder_form(current, found, here)
+        return tried
+
+    def _in_other_form(self, model: Model, found: Seen, added: set[str]) -> list[Model | None]:
+        """The model with what was added to it in a richer or a harder form."""
+        richer = [s for s in self._richer(model, found) if CONTAINS[_effect(s)] & added]
+        return self._with(model, found, richer) + self._in_harder_form(model, found, added)
+
+    def _with(self, current: Model, found: Seen, signals: Sequence[Signal]) -> list[Model | None]:
+        return [self.refits.with_signal(current, s, found.screen) for s in signals]
+
+    def _in_harder_form(self, current: Model, found: Seen, effects: set[str]) -> list[Model | None]:
+        return [
+            self.refits.in_place(current, found.screen.white, simpler, HARDER[simpler])
+            for simpler in sorted(effects & HARDER.keys())
+        ]
 
     def _rivals(self, chosen: Model, found: Seen) -> list[Model]:
         """Other sets that explain the runs as well, the best first."""
-        ranked = self.compare(list(self.refits.models.values()), found.screen.white)
+        possible = [model for model in self.refits.models.values() if model.is_possible]
+        ranked = self.compare(possible, found.screen.white)
         least = next(f.criterion for f in ranked if f.model.effects == chosen.effects)
         margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.left < ALARM else 0.0)
         near = [f.model for f in ranked if f.criterion < least + margin]
         return [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]
 
     def _see(self, model: Model) -> Seen:
-        key = frozenset(model.effects)
-        if key not in self.seen:
-            self.seen[key] = self._look(model)
-        return self.seen[key]
+        if model not in self.seen:
+            self.seen[model] = self._look(model)
+        return self.seen[model]
 
     def _look(self, model: Model) -> Seen:
         found = screen(model, self.library)
@@ -231,34 +260,46 @@ class Namer:
     def _shortlist(self, current: Model, found: Seen) -> list[Signal]:
         """The most significant shape of each of the few effects that explain most.
 
-        None, if that is an effect which is there already and little is left: its own formula is what is left to be
-        desired. One that contains an effect which is there, and explains most of what is left, needs no other beside
-        it.
+        If that is an effect which is there already and little is left, its own formula is what is left to be desired,
+        or else an effect that does more than its columns show. One that contains an effect which is there, and explains
+        most of what is left, needs no other beside it.
         """
-        best: dict[str, Signal] = {}
-        for s in found.of_candidates:
-            best.setdefault(_effect(s), s)
-        if next(iter(best), None) in current.effects and found.unexplained < FORMULA:
-            return []
-        clear = np.log(ALARM / len(found.screen.candidates))
-        ranked = [s for e, s in best.items() if s.log_p < clear and e not in current.effects]
-        if not ranked:
-            return []
-        here = spelt_out(set(current.effects))
-        richer = [s for s in ranked if CONTAINS.get(_effect(s), set()) & here]
-        for s in richer:
-            if s.gain > MOST_OF_IT * found.clearest.gain:
-                return [s]
+        clear = self._clear(found)
+        ranked = [s for s in clear if _effect(s) not in current.effects]
+        if clear and _effect(clear[0]) in current.effects and found.unexplained < FORMULA:
+            ranked = [s for s in ranked if _effect(s) in STARTS]
+        elif richer := self._richer(current, found):
+            return richer
         # what may be slow noise is trusted less, but is tried for what it explains
         ranked.sort(key=lambda s: -s.gain)
         return [s for s in ranked if s.gain > COMPARABLE * ranked[0].gain][:SHORTLIST]
+
+    def _clear(self, found: Seen) -> list[Signal]:
+        """The most significant shape of every effect that chance would not bring about."""
+        best: dict[str, Signal] = {}
+        for s in found.of_candidates:
+            best.setdefault(_effect(s), s)
+        enough = np.log(ALARM / len(found.screen.candidates))
+        return [s for s in best.values() if s.log_p < enough]
+
+    def _richer(self, current: Model, found: Seen) -> list[Signal]:
+        """An effect that contains one which is there, and explains most of what is left; if there is one."""
+        here = spelt_out(set(current.effects))
+        enough = MOST_OF_IT * found.clearest.gain
+        return [
+            s
+            for s in self._clear(found)
+            if CONTAINS.get(_effect(s), set()) & here
+            and _effect(s) not in current.effects
+            and s.gain > enough
+        ][:1]
 
     def _spared(self, model: Model) -> Model:
         """The model without effects that it can do without, or with simpler forms of them that leave nothing more."""
         white = self._white(model)
         for effect in model.effects[:-1]:
             smaller = self.refits.without(model, effect, white)
-            if self.compare([model, smaller], white)[0].model is smaller:
+            if smaller.is_possible and self.compare([model, smaller], white)[0].model is smaller:
                 return self._spared(smaller)
         for effect in model.effects:
             for simple in sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys()):
@@ -291,7 +332,7 @@ class Namer:
         return sorted(fitted, key=lambda f: f.criterion)
 
     def _left(self, model: Model, white: Whitener) -> Fitted:
-        key = frozenset(model.effects), id(white)
+        key = model, id(white)
         if key not in self.compared:
             given, polished = sharpened(model.given, model.polished.refined, white)
             squares = squares_of(given, polished)
@@ -301,10 +342,9 @@ class Namer:
         return self.compared[key]
 
     def _white(self, model: Model) -> Whitener:
-        key = frozenset(model.effects)
-        if key not in self.filters:
-            self.filters[key] = whitener(residuals_of(model.given, model.polished))
-        return self.filters[key]
+        if model not in self.filters:
+            self.filters[model] = whitener(residuals_of(model.given, model.polished))
+        return self.filters[model]
 
     def _without(self, chosen: Model, white: Whitener) -> dict[str, float]:
         chances = {}

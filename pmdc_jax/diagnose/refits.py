@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ..effects import EFFECTS
 from ..identify.colour import Whitener
@@ -17,7 +18,7 @@ from ..identify.refine import Refined, Unknowns, polish
 from ..identify.sharpen import sharpened, squares_of
 from ..identify.solve import POOR
 from ..identify.uncertainty import FLAT
-from .candidates import STARTS, Candidate, Values
+from .candidates import STARTS, Values
 from .kinship import CONTAINS, spelt_out
 from .library import Library
 from .model import Model, model_of, settled
@@ -29,6 +30,8 @@ KEPT = 0.5
 ROUGHLY = 8
 # ... and of which two have ended alike if their misfits differ by no more
 AGREED = 1.05
+# How finely a phase is looked for that all runs have in common
+PHASES = 120
 
 Start = tuple[Prepared, Refined]
 
@@ -53,15 +56,12 @@ class Refits:
         effects = (*order, candidate.effect)
 
         def refit() -> Model | None:
-            fit = found.evidence.regress([signal.block])
-            runs = len(current.given.roles)
-            values, angles = _values(candidate, fit.coefficients[0], current.dry, runs)
-            if values is None:
-                return None
-            added = {candidate.effect: values}
+            added: dict[str, Values] = {}
             if "constant_load" in order and "constant_load" not in current.effects:
                 added["constant_load"] = {"torque_Nm": current.slanted}
-            start = self._start(current, effects, added, fit.moved, angles)
+            start = self._pointed_at(current, effects, added, signal, found)
+            if start is None:
+                return None
             others = self._starts(current, effects)
             if others:
                 return self._best_of(effects, [start, *others], found.white)
@@ -144,6 +144,30 @@ class Refits:
             else model
         )
 
+    def _pointed_at(
+        self,
+        current: Model,
+        effects: tuple[str, ...],
+        values: dict[str, Values],
+        signal: Signal,
+        found: Screen,
+    ) -> Start | None:
+        """Where to begin by the evidence for a signal, None where that is none that physics allows."""
+        candidate, fit = signal.candidate, found.evidence.regress([signal.block])
+        assert candidate is not None
+        coefficients, angles = fit.coefficients[0], np.zeros(len(current.given.roles))
+        if candidate.own_phase:
+            assert candidate.amplitude is not None
+            periods = candidate.columns[0]["periods"]
+            turns = _turns(current, candidate.effect)
+            phase, angles[current.training] = common_phase(coefficients, turns, periods)
+            size = np.median(np.hypot(*coefficients.T))
+            coefficients = size * np.array([np.cos(phase), np.sin(phase)])
+        its = candidate.build(coefficients, current.dry)
+        if its is None:
+            return None
+        return self._start(current, effects, {**values, candidate.effect: its}, fit.moved, angles)
+
     def _start(
         self,
         current: Model,
@@ -192,15 +216,35 @@ def _roughly(start: Start) -> Refined:
         return polish(given.problem, begun, ROUGHLY).refined
 
 
-def _values(candidate: Candidate, coefficients: np.ndarray, dry: float, runs: int):
-    """An effect's parameters by the coefficients of its columns, and how far each run starts turned."""
-    angles = np.zeros(runs)
-    if not candidate.own_phase:
-        return candidate.build(coefficients, dry), angles
+def _turns(model: Model, effect: str) -> list[np.ndarray | None]:
+    """By which angles, in rad, each training run may begin turned to suit an effect; None, by any.
+
+    By none, where its angle is known or counts as zero; by whole periods of another effect that the model has.
+    """
+    others = [e for e in model.motor.effects if "angle" in e.states and e.name != effect]
+    count = round(float(others[0].recurrence()["angle"]) ** -1 * 2 * np.pi) if others else 0
+    whole = 2 * np.pi * np.arange(count) / count if count else None
+    problem = model.given.problem
+    known = np.asarray(problem.tape.angle_known)
+    fixed = known if known.any() else np.arange(len(known)) == 0
+    return [np.zeros(1) if fixed[run] else whole for run in model.training]
+
+
+def common_phase(
+    coefficients: Float[np.ndarray, "runs 2"], turns: Sequence[np.ndarray | None], periods: float
+) -> tuple[float, np.ndarray]:
+    """The phase that some runs have in common, by the cosine and sine of each, if each begins turned as it may:
+    by one of its `turns` in rad, or by any angle; and by which it does."""
     sizes = np.hypot(*coefficients.T)
     phases = np.arctan2(coefficients[:, 1], coefficients[:, 0])
-    values = candidate.build(coefficients[0], dry)
-    assert values is not None and candidate.amplitude is not None
-    values = {**values, candidate.amplitude: float(np.median(sizes))}
-    angles[: len(phases)] = (phases - phases[0]) / values["periods"]
-    return values, angles
+    common = np.linspace(-np.pi, np.pi, PHASES, endpoint=False)
+    angles, fits = np.zeros((len(phases), PHASES)), np.zeros((len(phases), PHASES))
+    for run, allowed in enumerate(turns):
+        apart = np.angle(np.exp(1j * (phases[run] - common)))
+        trials = apart[None] / periods if allowed is None else allowed[:, None] + 0 * apart
+        together = np.cos(apart - periods * trials)
+        best = np.argmax(together, axis=0)[None]
+        angles[run] = np.take_along_axis(trials, best, 0)[0]
+        fits[run] = np.take_along_axis(together, best, 0)[0]
+    chosen = int(np.argmax(sizes**2 @ fits))
+    return float(common[chosen]), angles[:, chosen]

@@ -3,6 +3,7 @@
 An effect is an Equinox module whose fields are its parameters. It plugs into the motor at named places,
 each of which does nothing unless the effect overrides it:
 
+- `is_possible`: what its parameters together may be
 - `terminal_voltage`: the voltage that reaches the winding, V
 - `parameters`: the motor's own parameters at a state, R(temperature), Kt(current), ...
 - `voltage_drop` and `torque`: smooth terms of the electrical and the mechanical equation
@@ -79,6 +80,10 @@ class AbstractEffect(eqx.Module):
     affine: ClassVar[bool] = False
     # the longest step in s that follows the effect well, or finds the changes of direction
     longest_step: ClassVar[float] = 1e-3
+
+    def is_possible(self) -> bool:
+        """Whether nature allows its parameters together; each for itself is within its range."""
+        return True
 
     def terminal_voltage(self, voltage: Scalars) -> Scalars:
         """Voltage at the winding, V."""

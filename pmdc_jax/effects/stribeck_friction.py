@@ -35,6 +35,9 @@ class StribeckFriction(AbstractEffect):
     static_Nm: Scalars
     speed_rad_s: Scalars
 
+    def is_possible(self) -> bool:
+        return bool(self.static_Nm >= self.coulomb_Nm)
+
     def grip(self, state: State) -> Grip:
         slow = jnp.exp(-((state.speed * (1 / self.speed_rad_s)) ** 2))
         torque = self.coulomb_Nm + (self.static_Nm - self.coulomb_Nm) * slow
