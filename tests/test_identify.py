@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.integrate import cumulative_simpson
+from scipy.signal import lfilter, lsim
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, identify
@@ -31,6 +32,7 @@ from pmdc_jax.identify.refine import Problem, Unknowns, evaluate, polish, refine
 from pmdc_jax.identify.search import METHODS, Found, search
 from pmdc_jax.identify.sharpen import last_fit, residuals_of
 from pmdc_jax.identify.solve import _distinct, solve
+from pmdc_jax.identify.turning import turned
 from pmdc_jax.identify.uncertainty import information, long_run_variance
 from pmdc_jax.identify.whitening import Whitening
 from pmdc_jax.motor import PARAMETERS
@@ -444,6 +446,46 @@ def test_known_loads_stay_known(x64, runs):
     polished = polish(problem, end).refined
     for unknowns in (end.unknowns, polished.unknowns):
         np.testing.assert_array_equal(np.asarray(unknowns.local)[:, 2:], 0.0)
+
+
+def test_friction_that_had_all_but_vanished_is_found_again(x64, runs):
+    """Its logarithm would have to fall by a thousandfold of what a straight line says, and then rise."""
+    problem = problem_of(runs)
+    there = polish(problem, refine(problem, start_at(problem))).refined
+    start = start_at(problem)
+    lost = start._replace(coordinates=start.coordinates.at[5].add(np.log(0.011)))
+    again = polish(problem, there._replace(unknowns=lost)).refined
+    assert again.converged
+    assert again.fitness == pytest.approx(there.fitness, rel=1e-6)
+
+
+def test_the_rotor_turns_by_its_own_speed_and_not_by_that_of_a_slow_sensor(x64):
+    """The sensor's lag by scipy; the angle by Simpson's rule over the speed itself."""
+    rng, lag = np.random.default_rng(4), 5e-3
+    truth = vb.record(PAPER, vb.slow_triangle(2.0), rng, vb.Noise(0.0, 0.0), load_known=True)
+    time, speed = truth["time_s"], truth["speed_rad_s"]
+    late = lsim(([1.0], [lag, 1.0]), speed - speed[0], time)[1] + speed[0]
+    run = attrs.evolve(recording("slow", truth), speed=late)
+    kinds = [EFFECTS["speed_sensor_lag"], EFFECTS["cogging_torque"]]
+    given = prepare([run], []).with_effects(kinds)
+    parameters = given.problem.parameters
+    values = {n: getattr(PAPER, n) for n in PARAMETERS} | {
+        "speed_sensor_lag.time_constant_s": lag,
+        "cogging_torque.amplitude_Nm": 1e-9,
+        "cogging_torque.phase_rad": 0.0,
+        "cogging_torque.periods": 5.0,
+    }
+    logs = zip(parameters.names, parameters.logarithmic, strict=True)
+    coordinates = [np.log(values[n]) if log else values[n] for n, log in logs]
+    local = np.array([[truth["current_A"][0], speed[0], 0.0, 0.0]])
+    unknowns = Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
+    seen = evaluate(given.problem, unknowns).seen
+    turn = np.asarray(turned(given.problem, unknowns, seen).tape.turn).reshape(-1)
+    angle = cumulative_simpson(speed, x=time, initial=0.0)
+    by = np.concatenate([[0.0], np.cumsum(turn)])[: len(angle)]
+    assert np.max(np.abs(by - angle)) < 0.01
+    # ... where the sensor's own speed would be off by as much as this
+    assert lag * np.ptp(speed) > 0.5
 
 
 def test_a_refinement_that_is_cut_short_does_not_claim_convergence(x64, runs):

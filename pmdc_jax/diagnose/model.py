@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import attrs
+import jax.numpy as jnp
 import numpy as np
 
 from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction
@@ -20,7 +21,7 @@ from ..identify.sharpen import (
     whitened,
 )
 from ..identify.solve import settle
-from ..identify.turning import turned
+from ..identify.turning import of_rotor, turned
 from ..motor import Motor
 from .response import Path, path_of
 
@@ -66,9 +67,11 @@ class Model:
 
     @property
     def path(self) -> Path:
-        """The free run along which it was fitted."""
+        """The free run along which it was fitted, of the rotor itself."""
         held = "speed" in {EFFECTS[name].holds for name in self.effects}
-        return path_of(self.polished.evaluation.seen, self.given.problem.tape, held)
+        problem, polished = self.given.problem, self.polished
+        rotor = of_rotor(problem, polished.refined.unknowns, polished.evaluation.seen)
+        return path_of(jnp.asarray(rotor), problem.tape, held)
 
     @property
     def misses(self) -> float:
@@ -96,7 +99,8 @@ def settled(effects: tuple[str, ...], given: Prepared, start: Refined, white: Wh
 def model_of(effects: tuple[str, ...], given: Prepared, polished: Polished) -> Model:
     """A fitted model, its rotor turned as the fit says."""
     if not given.problem.angular:  # or else it was fitted so
-        given = given._replace(problem=turned(given.problem, polished.evaluation.seen))
+        turning = polished.refined.unknowns, polished.evaluation.seen
+        given = given._replace(problem=turned(given.problem, *turning))
     return Model(effects, given, polished)
 
 

@@ -288,7 +288,7 @@ def polish(problem: Problem, end: Refined, steps: int = POLISH) -> Polished:
                 break
         else:
             break
-        moved = np.asarray(_flatten(best.unknowns)) + share * step
+        moved = np.asarray(_flatten(best.unknowns)) + _straight(problem.parameters, share * step)
         inside = np.clip(moved[: len(low)], low, high)
         held |= set(np.flatnonzero(inside != moved[: len(low)]).tolist())
         moved[: len(low)] = inside
@@ -297,6 +297,14 @@ def polish(problem: Problem, end: Refined, steps: int = POLISH) -> Polished:
     converged = converged or gain <= AT_KINK * best.matrix[-1, -1] / _samples(problem)
     refined = Refined(best.unknowns, best.fitness, tuple(sorted(held)), bool(converged))
     return Polished(refined, best.evaluation, best.noise)
+
+
+def _straight(parameters: Parameters, step: np.ndarray) -> np.ndarray:
+    """A step along which a positive parameter rises on a straight line, and not as an exponential: what is nearly zero,
+    as friction that something else hid, would rise to infinity."""
+    rises = np.zeros(len(step), bool)
+    rises[: len(parameters.names)] = parameters.logarithmic
+    return np.where(rises & (step > 0), np.log1p(np.maximum(step, 0.0)), step)
 
 
 class _Weighed(NamedTuple):

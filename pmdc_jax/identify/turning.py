@@ -9,7 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy import fft, ndimage
 
-from .refine import Problem
+from ..simulate import free_run
+from .refine import Problem, Unknowns
+
+Outputs = jax.Array | Float[np.ndarray, "blocks 2 samples"]
 
 # Neighbouring frequencies over which the power of a misfit is averaged
 NEIGHBOURS = 33
@@ -17,16 +20,27 @@ NEIGHBOURS = 33
 MEDIAN = 0.4549
 
 
-def turned(problem: Problem, seen: jax.Array | Float[np.ndarray, "blocks 2 samples"]) -> Problem:
+def of_rotor(problem: Problem, unknowns: Unknowns, seen: Outputs) -> Outputs:
+    """Current and speed of the rotor itself, A and rad/s, where its sensors make something else of them: a free run."""
+    effects = problem.parameters.effects
+    if all(effect.equation != "sensor" for effect in effects):
+        return seen
+    motor, local = problem.parameters(unknowns.coordinates), jnp.asarray(unknowns.local)
+    kept = tuple(effect for effect in motor.effects if effect.equation != "sensor")
+    bare = eqx.tree_at(lambda m: m.effects, motor, kept)
+    return free_run(bare, problem.tape, local[:, :2], local[:, 2], local[:, 3])
+
+
+def turned(problem: Problem, unknowns: Unknowns, seen: Outputs) -> Problem:
     """The problem with its rotor turned as well as recordings and simulation together tell.
 
     The angle is the integral of the speed. That of the measured one strays by the sensor's noise, that of the
-    simulated one by whatever torque disturbs the motor: the speed is the simulated one and that part of the
-    misfit that is motion.
+    simulated one by whatever torque disturbs the motor: the speed is the simulated one, of the rotor itself, and that
+    part of the misfit that is motion.
 
-    **Arguments**: `seen`, the free run, A and rad/s.
+    **Arguments**: `seen`, the free run as the sensors report it, A and rad/s.
     """
-    tape = problem.tape
+    tape, rotor = problem.tape, np.asarray(of_rotor(problem, unknowns, seen))
     turn, run = np.array(tape.turn), np.asarray(tape.run)
     length = np.asarray(tape.sample_time)[np.asarray(tape.grid)]
     for index in range(tape.runs):
@@ -40,7 +54,7 @@ def turned(problem: Problem, seen: jax.Array | Float[np.ndarray, "blocks 2 sampl
             continue
         end = known[-1] + 1
         error = np.where(weight[:end] > 0, measured[:end] - simulated[:end], 0.0)
-        speed = simulated.copy()
+        speed = rotor[mine, 1].reshape(-1).copy()
         speed[:end] += motion(error)
         ahead = np.append(speed[1:], speed[-1])
         turn[mine] = ((speed + ahead) / 2).reshape(turn[mine].shape) * length[mine, None]
