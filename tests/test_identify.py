@@ -223,6 +223,15 @@ def test_without_any_current_the_constants_are_not_claimed(runs):
     assert float(m.Kt * m.Kb / m.R + m.f) == pytest.approx(braking, rel=0.01)
 
 
+def test_voltage_and_speed_alone_do_not_tell_back_emf_from_friction():
+    """Unloaded, any share of the volts may be friction's, and the fit is the same; with next to none it is Kb alone."""
+    motor = replace(PAPER, f=20 * PAPER.f)
+    runs = [attrs.evolve(run, current=None) for run in unloaded(3, motor)]
+    result = identify(runs, unloaded=True)
+    assert {p.status for p in result.parameters.values()} == {"not_identifiable"}
+    assert any({"Kb", "f"} <= set(d.parameters) for d in result.unidentified_directions)
+
+
 def test_current_and_speed_tell_the_mechanical_half():
     """Without voltage: sampled fast enough for the current to be a straight line between samples.
 

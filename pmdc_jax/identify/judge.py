@@ -22,6 +22,10 @@ from .solve import SAME, Solved
 from .uncertainty import FLAT, Information, information
 
 TIDYINGS = 3
+# A parameter is alone in an unseen direction of unit length if it has so much of it
+ALONE = 0.99
+# ... and large enough to show if it changes the outputs by this share of what the strongest one does
+TO_SHOW = 0.3
 
 
 def judge(given: Prepared, solved: Solved) -> Identification:
@@ -29,12 +33,11 @@ def judge(given: Prepared, solved: Solved) -> Identification:
     polished = solved.polished
     problem, training = given.problem, given.training
     parameters = problem.parameters
-    free = np.array([k not in polished.refined.at_bound for k in range(len(parameters.names))])
-    evaluation = polished.evaluation
-    info = information(
-        evaluation.residuals, evaluation.jacobian, problem.tape.run, free, len(training)
-    )
+    info = _information(problem, polished, len(training))
     chosen = _tidy(problem, polished, info)
+    for k in _vanished(parameters, info):
+        if (lifted := _lifted(problem, chosen, k)) is not None:
+            info = _information(problem, lifted, len(training))
     best = chosen.refined
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
@@ -63,6 +66,39 @@ def judge(given: Prepared, solved: Solved) -> Identification:
         covariance_names=parameters.names,
         messages=_messages(solved, best, chosen is not polished),
     )
+
+
+def _information(problem: Problem, polished: Polished, runs: int) -> Information:
+    evaluation, count = polished.evaluation, len(problem.parameters.names)
+    free = np.array([k not in polished.refined.at_bound for k in range(count)])
+    return information(evaluation.residuals, evaluation.jacobian, problem.tape.run, free, runs)
+
+
+def _vanished(parameters: Parameters, info: Information) -> list[int]:
+    """Positive parameters that alone change nothing, as where one is next to nothing."""
+    alone = [int(np.argmax(np.abs(d))) for d in info.unseen if np.max(np.abs(d)) > ALONE]
+    return [k for k in alone if parameters.logarithmic[k]]
+
+
+def _lifted(problem: Problem, polished: Polished, k: int) -> Polished | None:
+    """A fit as good with a parameter as large as to show, if there is one: only there it shows what it trades with.
+
+    Where voltage and speed alone are measured, friction may be nothing, and then Kb is what turns a volt into speed;
+    or friction takes its share of the volt, and Kb is less.
+    """
+    jacobian = np.asarray(polished.evaluation.jacobian)[problem.counted]
+    lengths = np.sqrt(np.square(jacobian[..., : len(problem.free)]).sum((0, 1, 2)))
+    coordinates = np.array(polished.refined.unknowns.coordinates)
+    coordinates[k] += np.log(TO_SHOW * lengths.max() / max(lengths[k], 1e-300))
+    coordinates[k] = np.clip(
+        coordinates[k], problem.parameters.lower[k], problem.parameters.upper[k]
+    )
+    unknowns = polished.refined.unknowns._replace(coordinates=jnp.asarray(coordinates))
+    held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
+    lifted = polish(held, polished.refined._replace(unknowns=unknowns))
+    if lifted.refined.fitness > polished.refined.fitness * (1 + SAME):
+        return None
+    return polish(problem, lifted.refined._replace(at_bound=()), steps=0)
 
 
 def _tidy(problem: Problem, polished: Polished, info: Information) -> Polished:
