@@ -12,6 +12,7 @@ each of which does nothing unless the effect overrides it:
 - `states`, `rest` and `derivative`: states of its own, how they begin and how they move
 - `recurrence`: after how much of a state everything is as before
 - `linear`: the linear effect that it is, or nearly is, whose states then join the exact step
+- `stiffens`: how much faster it makes the motor
 - `sensors` and `speed_delay`: how current and speed are seen
 
 New effects are one class here and one row in the table `EFFECTS` of this package.
@@ -128,6 +129,11 @@ class AbstractEffect(eqx.Module):
 
     def linear(self) -> AbstractEffect | None:
         """An effect with the same states and only linear terms, near enough to step stiff ones by."""
+        return None
+
+    def stiffens(self, motor: Motor, current: Scalars) -> Scalars | None:
+        """How much faster, in 1/s, the motor becomes at a current in A; None where `longest_step` is always enough."""
+        del motor, current
         return None
 
     def sensors(self, state: State, current: Scalars, speed: Scalars) -> tuple[Scalars, Scalars]:

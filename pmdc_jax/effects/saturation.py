@@ -62,3 +62,6 @@ class InductanceSaturation(AbstractEffect):
         return eqx.tree_at(
             lambda m: m.L, motor, motor.L * (1 / (1 + self.per_A2 * state.current**2))
         )
+
+    def stiffens(self, motor: Motor, current: Scalars) -> Scalars:
+        return motor.R * (1 / motor.L) * self.per_A2 * current**2

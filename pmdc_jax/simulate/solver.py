@@ -26,6 +26,8 @@ Vector = tuple[Scalars, ...]  # current, speed, and the states of linear effects
 
 # Steps into which a sample is divided at most
 FINEST = 32
+# Over one step what is not in the linear part lets a state fall by no more than exp(-1)
+STIFF = 1.0
 
 
 class Stages(NamedTuple):
@@ -104,12 +106,19 @@ def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 
     return A, jnp.concatenate([B, jnp.zeros_like(A[2:, :2])])
 
 
-def steps_in_sample(motor: Motor, tape: Tape) -> int:
+def steps_in_sample(motor: Motor, tape: Tape) -> int | Int[Array, ""]:
     """Into how many equal steps a sample is divided, so that none is longer than the effects allow."""
     allowed = [e.longest_step for e in motor.effects if e.holds or not e.affine]
     if not allowed:
         return 1
-    return min(max(round(tape.longest / min(allowed)), 1), FINEST)
+    least = min(max(round(tape.longest / min(allowed)), 1), FINEST)
+    current = jnp.max(jnp.abs(jnp.asarray(tape.measured)[:, 0]))
+    rates = [rate for e in motor.effects if (rate := e.stiffens(motor, current)) is not None]
+    if not rates:
+        return least
+    # of a population, as most of it needs: what a wild one needs would hold up all
+    needed = jnp.ceil(jnp.median(reduce(jnp.maximum, rates)) * tape.longest / STIFF)
+    return jnp.clip(jnp.nan_to_num(needed, nan=FINEST), least, FINEST).astype(int)
 
 
 def held_step(
@@ -119,7 +128,7 @@ def held_step(
     state: State,
     value: Scalars,
     load: Scalars,
-    steps: int = 1,
+    steps: int | Int[Array, ""] = 1,
 ) -> State:
     """The state one held sample later, in `steps` equal steps, for one of which `along` is made.
 
@@ -133,7 +142,7 @@ def held_step(
         # the state last: two fused multiply-adds, where a sum of sums would take an addition more
         current, speed = _times(whole, (state.current, state.speed), _times(inputs, (value, load)))
         return State(current, speed, state.extra)
-    if steps == 1:
+    if isinstance(steps, int) and steps == 1:
         return _step(motor, whole, weights, drive, state, value, load)
     return jax.lax.fori_loop(
         0, steps, lambda _, now: _step(motor, whole, weights, drive, now, value, load), state
