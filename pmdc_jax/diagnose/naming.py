@@ -272,7 +272,9 @@ class Namer:
             return richer
         # what may be slow noise is trusted less, but is tried for what it explains
         ranked.sort(key=lambda s: -s.gain)
-        return [s for s in ranked if s.gain > COMPARABLE * ranked[0].gain][:SHORTLIST]
+        # where little is left one has to settle nearly all of it, so those that promise less do no harm
+        share = 0.0 if found.unexplained < FORMULA else COMPARABLE
+        return [s for s in ranked if s.gain > share * ranked[0].gain][:SHORTLIST]
 
     def _clear(self, found: Seen) -> list[Signal]:
         """The most significant shape of every effect that chance would not bring about."""
