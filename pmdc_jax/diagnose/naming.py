@@ -32,8 +32,8 @@ COMPARABLE = 0.6
 # What effects may leave of the squares that they explain, by formulas that are not quite nature's: so much, and more
 # if it is a curve over an effect's own variable
 FORMULA, OWN_FORMULA = 0.1, 0.5
-# An effect is added if it takes away this share of what the clearest signal would, and the larger one where a formula
-# may be all that is left to be desired
+# An effect is tried if the best one would take away this share of what the clearest signal would; with the larger one
+# what is left is clearly another effect, or a richer form of one
 MUCH_OF_IT, MOST_OF_IT = 0.3, 0.7
 # ... and there may then be left no more than this share of it, or the larger one by a richer form of what was there
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.3
@@ -229,8 +229,8 @@ class Namer:
 
     def _rivals(self, chosen: Model, found: Seen) -> list[Model]:
         """Other sets that explain the runs as well, the best first."""
-        possible = [model for model in self.refits.models.values() if model.is_possible]
-        ranked = self.compare(possible, found.screen.white)
+        models = [m for m in self.refits.models.values() if m.is_possible or m is chosen]
+        ranked = self.compare(models, found.screen.white)
         least = next(f.criterion for f in ranked if f.model.effects == chosen.effects)
         margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.left < ALARM else 0.0)
         near = [f.model for f in ranked if f.criterion < least + margin]
