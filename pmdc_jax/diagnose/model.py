@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import attrs
-import jax.numpy as jnp
 import numpy as np
 
 from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction
@@ -69,9 +68,8 @@ class Model:
     def path(self) -> Path:
         """The free run along which it was fitted, of the rotor itself."""
         held = "speed" in {EFFECTS[name].holds for name in self.effects}
-        problem, polished = self.given.problem, self.polished
-        rotor = of_rotor(problem, polished.refined.unknowns, polished.evaluation.seen)
-        return path_of(jnp.asarray(rotor), problem.tape, held)
+        problem = self.given.problem
+        return path_of(of_rotor(problem, self.polished), problem.tape, held)
 
     @property
     def misses(self) -> float:
@@ -99,8 +97,7 @@ def settled(effects: tuple[str, ...], given: Prepared, start: Refined, white: Wh
 def model_of(effects: tuple[str, ...], given: Prepared, polished: Polished) -> Model:
     """A fitted model, its rotor turned as the fit says."""
     if not given.problem.angular:  # or else it was fitted so
-        turning = polished.refined.unknowns, polished.evaluation.seen
-        given = given._replace(problem=turned(given.problem, *turning))
+        given = given._replace(problem=turned(given.problem, polished))
     return Model(effects, given, polished)
 
 

@@ -222,12 +222,10 @@ def _turns(model: Model, effect: str) -> list[np.ndarray | None]:
     By none, where its angle is known or counts as zero; by whole periods of another effect that the model has.
     """
     others = [e for e in model.motor.effects if "angle" in e.states and e.name != effect]
-    count = round(float(others[0].recurrence()["angle"]) ** -1 * 2 * np.pi) if others else 0
+    count = round(2 * np.pi / float(others[0].recurrence()["angle"])) if others else 0
     whole = 2 * np.pi * np.arange(count) / count if count else None
-    problem = model.given.problem
-    known = np.asarray(problem.tape.angle_known)
-    fixed = known if known.any() else np.arange(len(known)) == 0
-    return [np.zeros(1) if fixed[run] else whole for run in model.training]
+    turnable = np.asarray(model.given.problem.turnable)
+    return [whole if turnable[run] else np.zeros(1) for run in model.training]
 
 
 def common_phase(

@@ -77,15 +77,20 @@ class Problem(eqx.Module):
         """Whether a torque depends on the rotor's angle."""
         return any("angle" in effect.states for effect in self.parameters.effects)
 
+    @property
+    def turnable(self) -> Bool[Array, " runs"]:
+        """Which runs may begin at any angle."""
+        known = jnp.asarray(self.tape.angle_known)
+        # where nobody knows an angle, that of the first run is the zero from which phases count
+        zero = ~jnp.any(known) & (jnp.arange(self.tape.runs) == 0)
+        return ~known & ~zero
+
     def moves(self) -> Bool[Array, "runs columns"]:
         """Which coordinates and which of its own unknowns each run may tell of."""
         tape = self.tape
         first = jnp.argmax(jnp.asarray(tape.run)[None, :] == jnp.arange(tape.runs)[:, None], axis=1)
         voltage = jnp.asarray(tape.drive.voltage)[jnp.asarray(tape.grid)[first]] > 0
-        known = jnp.asarray(tape.angle_known)
-        # where nobody knows an angle, that of the first run is the zero from which phases count
-        zero = ~jnp.any(known) & (jnp.arange(tape.runs) == 0)
-        angle = ~known & ~zero & self.angular
+        angle = self.turnable & self.angular
         load = jnp.asarray(tape.load_unknown)
         own = jnp.stack([voltage, jnp.ones_like(voltage), load, angle], 1)
         return jnp.concatenate([self.free[None, :] & self.counts[:, None], own], 1)

@@ -92,8 +92,7 @@ def settle(given: Prepared, end: Refined) -> tuple[Prepared, Polished]:
     """Polish; again, as long as it helps, where a torque depends on how the better motor turns."""
     polished = polish(given.problem, end)
     for _ in range(TURNINGS if given.problem.angular else 0):
-        turning = polished.refined.unknowns, polished.evaluation.seen
-        again = given._replace(problem=turned(given.problem, *turning))
+        again = given._replace(problem=turned(given.problem, polished))
         better = polish(again.problem, polished.refined)
         if not better.refined.fitness < polished.refined.fitness:
             break

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy import fft, ndimage
 
 from ..simulate import free_run
-from .refine import Problem, Unknowns
-
-Outputs = jax.Array | Float[np.ndarray, "blocks 2 samples"]
+from .refine import Polished, Problem
 
 # Neighbouring frequencies over which the power of a misfit is averaged
 NEIGHBOURS = 33
@@ -20,27 +17,27 @@ NEIGHBOURS = 33
 MEDIAN = 0.4549
 
 
-def of_rotor(problem: Problem, unknowns: Unknowns, seen: Outputs) -> Outputs:
+def of_rotor(problem: Problem, fit: Polished) -> Float[Array, "blocks 2 samples"]:
     """Current and speed of the rotor itself, A and rad/s, where its sensors make something else of them: a free run."""
     effects = problem.parameters.effects
     if all(effect.equation != "sensor" for effect in effects):
-        return seen
+        return fit.evaluation.seen
+    unknowns = fit.refined.unknowns
     motor, local = problem.parameters(unknowns.coordinates), jnp.asarray(unknowns.local)
     kept = tuple(effect for effect in motor.effects if effect.equation != "sensor")
     bare = eqx.tree_at(lambda m: m.effects, motor, kept)
     return free_run(bare, problem.tape, local[:, :2], local[:, 2], local[:, 3])
 
 
-def turned(problem: Problem, unknowns: Unknowns, seen: Outputs) -> Problem:
+def turned(problem: Problem, fit: Polished) -> Problem:
     """The problem with its rotor turned as well as recordings and simulation together tell.
 
     The angle is the integral of the speed. That of the measured one strays by the sensor's noise, that of the
     simulated one by whatever torque disturbs the motor: the speed is the simulated one, of the rotor itself, and that
     part of the misfit that is motion.
-
-    **Arguments**: `seen`, the free run as the sensors report it, A and rad/s.
     """
-    tape, rotor = problem.tape, np.asarray(of_rotor(problem, unknowns, seen))
+    tape, seen = problem.tape, np.asarray(fit.evaluation.seen)
+    rotor = np.asarray(of_rotor(problem, fit))
     turn, run = np.array(tape.turn), np.asarray(tape.run)
     length = np.asarray(tape.sample_time)[np.asarray(tape.grid)]
     for index in range(tape.runs):
@@ -48,7 +45,7 @@ def turned(problem: Problem, unknowns: Unknowns, seen: Outputs) -> Problem:
         measured, weight = (
             np.asarray(x)[mine, 1].reshape(-1) for x in (tape.measured, tape.weight)
         )
-        simulated = np.asarray(seen)[mine, 1].reshape(-1)
+        simulated = seen[mine, 1].reshape(-1)
         known = np.flatnonzero(weight)
         if not len(known) or not np.all(np.isfinite(simulated)):
             continue
