@@ -45,7 +45,8 @@ def squared_errors(
     """
     size = motors.R.shape[0]
     least = SHARE if motors.effects else LINEAR_SHARE
-    shares = max(1, min(os.cpu_count() or 1, size // least))
+    cores = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
+    shares = max(1, min(cores, size // least))
     if shares == 1 or size % shares:  # unequal shares would be compiled once more
         return _errors(motors, tape, 0)
     double = jax.config.read("jax_enable_x64")
