@@ -17,7 +17,7 @@ from benchmarks.naming.cases import Bench, record
 from benchmarks.naming.plant import Plant
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import diagnose
-from pmdc_jax.diagnose.candidates import TABLE, Scales
+from pmdc_jax.diagnose.candidates import FULLER, TABLE, Scales
 from pmdc_jax.diagnose.evidence import Block, products
 from pmdc_jax.diagnose.kinship import are_rivals, is_within
 from pmdc_jax.diagnose.library import Library
@@ -53,6 +53,21 @@ def test_candidates_are_within_the_ranges(name):
         assert built is not None
         for field, r in EFFECTS[name].ranges.items():
             assert r.scale == "linear" or built[field] > 0
+
+
+@pytest.mark.parametrize("simple", FULLER)
+def test_a_fuller_form_begins_as_the_simple_one_with_more_to_it(simple):
+    """Possible, within its ranges, and as large as the simple one."""
+    about = EFFECTS[simple].ranges
+    effect = EFFECTS[simple](**{field: np.asarray(0.3) for field in about})
+    fuller = FULLER[simple]
+    values = fuller.begun(effect, SCALES)
+    full = EFFECTS[fuller.effect](**{field: np.asarray(x) for field, x in values.items()})
+    assert full.is_possible()
+    assert set(fuller.extra) < set(values) == set(full.ranges)
+    for field, r in full.ranges.items():
+        assert r.lower < values[field] < r.upper
+    assert [values[field] for field in values if field not in fuller.extra] == [0.3] * len(about)
 
 
 # ------------------------------------------------------------------------------- the evidence
@@ -405,6 +420,25 @@ def recorded_from(plant: Plant, seed: int, noise: vb.Noise) -> list[Recording]:
         columns = record(plant, excitation, rng, noise, Bench({}))
         runs.append(Recording(name, *(columns[q] for q in QUANTITIES), load=columns[LOAD]))
     return runs
+
+
+@pytest.mark.parametrize("peak", [1.0, 3.0], ids=["coulomb", "stribeck"])
+def test_where_a_peak_of_friction_would_not_show_it_is_not_ruled_out(peak):
+    """Friction so faint that it is hardly seen, with and without a peak of three times as much at rest."""
+    faint = 0.0008
+    plant = Plant(
+        **PAPER,
+        friction_forward_Nm=faint,
+        friction_backward_Nm=faint,
+        friction_excess_Nm=(peak - 1) * faint,
+        stribeck_speed_rad_s=8.0,
+    )
+    held_out, *training = recorded_from(plant, 9, NOISE)
+    found = diagnose(training, [held_out])
+    assert found.verdict == "ambiguous"
+    (effect,) = found.effects
+    assert (effect.name, effect.also_possible) == ("coulomb_friction", ("stribeck_friction",))
+    assert found.next_experiment is not None
 
 
 def test_a_bearing_that_seizes_is_no_coulomb_friction():

@@ -7,11 +7,11 @@ grid that the recordings set. Effects that are no small change (a lag, a shaft) 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..effects import EFFECTS
+from ..effects import EFFECTS, CoulombFriction, ShaftCompliance
 
 Values = dict[str, float]
 
@@ -202,6 +202,36 @@ def _backlash_starts(scales: Scales) -> list[Values]:
 STARTS: Mapping[str, Callable[[Scales], list[Values]]] = {
     "shaft_compliance": _shaft_starts,
     "gear_backlash": _backlash_starts,
+}
+
+
+# A peak of dry friction that is clearly one: as high again, within this share of the speeds that occur
+PEAK, SLOW = 2.0, 0.05
+# ... and play: this share of what the largest torque twists a shaft by
+PLAY = 0.3
+
+
+class Fuller(NamedTuple):
+    """A fuller form of an effect."""
+
+    effect: str
+    begun: Callable[[Any, Scales], Values]  # by the simple form, what makes it fuller clearly there
+    extra: tuple[str, ...]  # the fields that make it so
+
+
+def _with_peak(friction: CoulombFriction, scales: Scales) -> Values:
+    dry = float(friction.torque_Nm)
+    return {"coulomb_Nm": dry, "static_Nm": PEAK * dry, "speed_rad_s": SLOW * scales.speed}
+
+
+def _with_play(shaft: ShaftCompliance, scales: Scales) -> Values:
+    same = {field: float(getattr(shaft, field)) for field in shaft.ranges}
+    return {"gap_rad": PLAY * scales.torque / same["stiffness_Nm_rad"], **same}
+
+
+FULLER: Mapping[str, Fuller] = {
+    "coulomb_friction": Fuller("stribeck_friction", _with_peak, ("static_Nm", "speed_rad_s")),
+    "shaft_compliance": Fuller("gear_backlash", _with_play, ("gap_rad",)),
 }
 
 

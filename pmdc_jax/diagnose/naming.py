@@ -13,7 +13,7 @@ from ..identify.colour import Whitener, whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Polished
 from ..identify.sharpen import residuals_of, sharpened, squares_of
-from .candidates import STARTS, Candidate
+from .candidates import FULLER, STARTS, Candidate
 from .kinship import CONTAINS, are_rivals, is_within, spelt_out
 from .library import Library
 from .model import Model, ended
@@ -21,7 +21,8 @@ from .periodic import Line, line_of
 from .refits import Refits
 from .screen import Screen, Signal, beyond_curves, screen, signals
 
-# Chance that anything at all is called missing from a motor that lacks nothing
+# Chance that anything at all is called missing from a motor that lacks nothing, or that anything more is in all looks
+# after the first
 ALARM = 0.01
 # What is missed by a smaller share of what is measured is nothing: one simulation meets another no closer
 CLOSE = 1e-4
@@ -44,6 +45,8 @@ HARDER = {"shaft_compliance": "gear_backlash"}
 TRACE, TRACE_OF_HARDER = 2e-3, 1e-2
 # A model that leaves so many times the squares of another one is no match for it, whatever a filter makes of either
 FAR = 3.0
+# A fuller form of an effect is ruled out if it leaves so many squares more: two standard errors
+RULED_OUT = 4.0
 # Rivals whose criterion is nearer than this, and this share of what neither explains, are not told apart
 MARGIN, OF_UNEXPLAINED = 8.0, 0.1
 
@@ -234,7 +237,15 @@ class Namer:
         least = next(f.criterion for f in ranked if f.model.effects == chosen.effects)
         margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.left < ALARM else 0.0)
         near = [f.model for f in ranked if f.criterion < least + margin]
-        return [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]
+        rivals = [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]
+        return rivals + self._not_ruled_out(chosen, found.screen.white)
+
+    def _not_ruled_out(self, chosen: Model, white: Whitener) -> list[Model]:
+        """The set with an effect in a fuller form, clearly so, where the runs show too little of it to tell."""
+        simple = [effect for effect in chosen.effects if effect in FULLER]
+        fuller = [self.refits.clearly_in_full(chosen, white, effect) for effect in simple]
+        least = self._left(chosen, white).squares
+        return [model for model in fuller if self._left(model, white).squares < least + RULED_OUT]
 
     def _see(self, model: Model) -> Seen:
         if model not in self.seen:
@@ -245,6 +256,7 @@ class Namer:
         found = screen(model, self.library)
         of_candidates, of_curves = signals(found)
         count = len(found.candidates) + len(found.curves)
+        count *= MOST if model.effects else 1
         left = 1.0 if model.misses < CLOSE else chance_of_nothing(of_candidates, of_curves, count)
         explained = 0.0
         if model.effects:
@@ -258,7 +270,7 @@ class Namer:
         return _plainest(self.compare(tried, self._white(least)))
 
     def _shortlist(self, current: Model, found: Seen) -> list[Signal]:
-        """The most significant shape of each of the few effects that explain most.
+        """The most significant shape of each of the few effects that explain most, and of simpler forms of them.
 
         If that is an effect which is there already and little is left, its own formula is what is left to be desired,
         or else an effect that does more than its columns show. One that contains an effect which is there, and explains
@@ -274,7 +286,9 @@ class Namer:
         ranked.sort(key=lambda s: -s.gain)
         # where little is left one has to settle nearly all of it, so those that promise less do no harm
         share = 0.0 if found.unexplained < FORMULA else COMPARABLE
-        return [s for s in ranked if s.gain > share * ranked[0].gain][:SHORTLIST]
+        short = [s for s in ranked if s.gain > share * ranked[0].gain][:SHORTLIST]
+        simpler = set().union(*(CONTAINS.get(_effect(s), set()) for s in short))
+        return short + [s for s in ranked if s not in short and _effect(s) in simpler]
 
     def _clear(self, found: Seen) -> list[Signal]:
         """The most significant shape of every effect that chance would not bring about."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from ..identify.refine import Refined, Unknowns, polish
 from ..identify.sharpen import sharpened, squares_of
 from ..identify.solve import POOR
 from ..identify.uncertainty import FLAT
-from .candidates import STARTS, Values
+from .candidates import FULLER, STARTS, Values
 from .kinship import CONTAINS, spelt_out
 from .library import Library
 from .model import Model, model_of, settled
@@ -70,14 +71,34 @@ class Refits:
         return self._once(effects, current, refit)
 
     def in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
-        """The current model with an effect in place of another: one that has starts of its own, or was begun before."""
+        """The current model with an effect in place of another: a fuller form of it, or one that has starts of its own,
+        or was begun before."""
         effects = (*(e for e in current.effects if e != old), new)
 
         def refit() -> Model:
             starts = self._starts(current, effects) or [self._start(current, effects, {})]
+            if old in FULLER and FULLER[old].effect == new:
+                starts = [self._in_full(current, old, effects), *starts]
             return self._best_of(effects, starts, white)
 
         return self._once(effects, current, refit)
+
+    def clearly_in_full(self, current: Model, white: Whitener, effect: str) -> Model:
+        """The current model with a fuller form of an effect, where what makes it fuller stays clearly there."""
+        fuller = FULLER[effect]
+        effects = (*(e for e in current.effects if e != effect), fuller.effect)
+        given, begun = self._in_full(current, effect, effects)
+        extra = {f"{fuller.effect}.{field}" for field in fuller.extra}
+        free = jnp.asarray([name not in extra for name in given.problem.parameters.names])
+        given = given._replace(problem=replace(given.problem, free=free))
+        return settled(effects, given, begun, white)
+
+    def _in_full(self, current: Model, effect: str, effects: tuple[str, ...]) -> Start:
+        """Where to begin refitting with the fuller form of an effect, by the fit of the simple one."""
+        fuller = FULLER[effect]
+        simple = next(e for e in current.motor.effects if e.name == effect)
+        values = fuller.begun(simple, self.library.scales)
+        return self._start(current, effects, {fuller.effect: values})
 
     def without(self, model: Model, effect: str, white: Whitener) -> Model:
         """The model without one of its effects."""
