@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -41,19 +44,13 @@ def judge(given: Prepared, solved: Solved) -> Identification:
     best = chosen.refined
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
-    def interval(k: int, spread: float, centre: float) -> tuple[float, float]:
-        reach = float(info.reach[k])
-        if not parameters.logarithmic[k] or spread < QUADRATIC:
-            return centre - reach * spread, centre + reach * spread
-        return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
-
     unknowns, ended = fit_own(problem, best.unknowns)
     fit = _fits(
         given.runs, given.roles, problem.tape, np.asarray(ended.seen), np.asarray(unknowns.local)
     )
     return Identification(
         motor=_plain(parameters(best.unknowns.coordinates)),
-        parameters=_estimates(parameters, best, info, given.untouched, given.known, interval),
+        parameters=_estimates(parameters, best, info, given, _intervals(problem, best, info)),
         unidentified_directions=explain(info.unseen, parameters, training),
         fit=fit,
         noise=_noise_of(fit),
@@ -66,6 +63,24 @@ def judge(given: Prepared, solved: Solved) -> Identification:
         covariance_names=parameters.names,
         messages=_messages(solved, best, chosen is not polished),
     )
+
+
+def _intervals(
+    problem: Problem, best: Refined, info: Information
+) -> dict[int, tuple[float, float]]:
+    """The 95 % intervals of the coordinates that have one, as many at a time as there are cores."""
+    coordinates = np.asarray(best.unknowns.coordinates)
+
+    def interval(k: int) -> tuple[float, float]:
+        spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.reach[k])
+        if not problem.parameters.logarithmic[k] or spread < QUADRATIC:
+            return coordinates[k] - reach * spread, coordinates[k] + reach * spread
+        with jax.enable_x64(True):  # the setting belongs to the thread
+            return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
+
+    identified = [k for k in range(len(coordinates)) if _status(k, best, info) == "identified"]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return dict(zip(identified, pool.map(interval, identified), strict=True))
 
 
 def _information(problem: Problem, polished: Polished, runs: int) -> Information:
@@ -137,47 +152,46 @@ def _estimates(
     parameters: Parameters,
     best: Refined,
     info: Information,
-    untouched: Mapping[str, float],
-    known: Mapping[str, float],
-    interval: Callable[[int, float, float], tuple[float, float]],
+    given: Prepared,
+    intervals: Mapping[int, tuple[float, float]],
 ) -> dict[str, Estimate]:
-    """What to say of each parameter; `interval` gives the 95 % interval of a coordinate from its spread."""
+    """What to say of each parameter, by the 95 % intervals of the coordinates that have one."""
     coordinates = np.asarray(best.unknowns.coordinates)
     ties = dict(parameters.ties)
     names = [*PARAMETERS, *(n for n in parameters.names if n not in PARAMETERS)]
     estimates = {}
     for name in names:
         unit, source = unit_of(name), ties.get(name, name)
-        if source in untouched and source not in known:
+        if source in given.untouched and source not in given.known:
             estimates[name] = Estimate(None, None, None, unit, "not_identifiable")
             continue
         value = parameters.value(name, coordinates)
-        if source in known:
+        if source in given.known:
             estimates[name] = Estimate(value, 0.0, (value, value), unit, "known")
             continue
         k = parameters.names.index(source)
-        status = _status(k, best, info, name in ties)
-        if status in ("at_bound", "not_identifiable"):
+        status = _status(k, best, info)
+        if status != "identified":
             estimates[name] = Estimate(value, None, None, unit, status)
             continue
         spread = float(np.sqrt(info.covariance[k, k]))
-        low, high = interval(k, spread, coordinates[k])
+        low, high = intervals[k]
         if parameters.logarithmic[k]:
             stderr, low, high = value * spread, np.exp(low), np.exp(high)
         else:
             stderr = spread
         ends = (float(low), float(high))
-        estimates[name] = Estimate(value, stderr, ends, unit, status)
+        estimates[name] = Estimate(value, stderr, ends, unit, "tied" if name in ties else status)
     return estimates
 
 
-def _status(k: int, best: Refined, info: Information, tied: bool) -> Status:
+def _status(k: int, best: Refined, info: Information) -> Status:
     if k in best.at_bound:
         return "at_bound"
     unseen = any(abs(direction[k]) > 0.05 for direction in info.unseen)
     if unseen or np.sqrt(info.covariance[k, k]) > FLAT:
         return "not_identifiable"
-    return "tied" if tied else "identified"
+    return "identified"
 
 
 def _fits(
