@@ -270,7 +270,7 @@ class Namer:
         return _plainest(self.compare(tried, self._white(least)))
 
     def _shortlist(self, current: Model, found: Seen) -> list[Signal]:
-        """The most significant shape of each of the few effects that explain most, and of simpler forms of them.
+        """The most significant shape of each of the few effects that explain most.
 
         If that is an effect which is there already and little is left, its own formula is what is left to be desired,
         or else an effect that does more than its columns show. One that contains an effect which is there, and explains
@@ -286,9 +286,7 @@ class Namer:
         ranked.sort(key=lambda s: -s.gain)
         # where little is left one has to settle nearly all of it, so those that promise less do no harm
         share = 0.0 if found.unexplained < FORMULA else COMPARABLE
-        short = [s for s in ranked if s.gain > share * ranked[0].gain][:SHORTLIST]
-        simpler = set().union(*(CONTAINS.get(_effect(s), set()) for s in short))
-        return short + [s for s in ranked if s not in short and _effect(s) in simpler]
+        return [s for s in ranked if s.gain > share * ranked[0].gain][:SHORTLIST]
 
     def _clear(self, found: Seen) -> list[Signal]:
         """The most significant shape of every effect that chance would not bring about."""
