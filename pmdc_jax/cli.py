@@ -385,7 +385,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _collect_rarely() -> None:
-    """Spare a command a fifth of its time: what it imports and traces, millions of objects, lives as long as it does,
+    """Spare a command an eighth of its time: what it imports and traces, millions of objects, lives as long as it does,
     and the garbage collector would look through it again and again, at last when it ends."""
     gc.set_threshold(100_000, 50, 50)
     atexit.register(gc.freeze)

@@ -38,8 +38,8 @@ FORMULA, OWN_FORMULA = 0.1, 0.5
 MUCH_OF_IT, MOST_OF_IT = 0.3, 0.7
 # ... and there may then be left no more than this share of it, or the larger one by a richer form of what was there
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.3
-# Effects that no column shows, by the simpler ones in whose place they are tried if those leave something
-HARDER = {"shaft_compliance": "gear_backlash"}
+# Fuller forms that no column shows, by the simpler ones in whose place they are tried if those leave something
+HARDER = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}
 # ... and what effects leave of what they explain if nothing more is worth a trial, the larger one for harder ones:
 # chance decides when teeth meet, and no fit of them is exact
 TRACE, TRACE_OF_HARDER = 2e-3, 1e-2
