@@ -94,9 +94,14 @@ class Motor(eqx.Module):
         return all(effect.affine for effect in self.effects)
 
     @property
-    def sticks(self) -> bool:
-        """Whether there are dry elements."""
-        return any(effect.holds for effect in self.effects)
+    def switches(self) -> bool:
+        """Whether there are dry elements, or teeth that touch and part."""
+        return any(effect.holds or effect.twists for effect in self.effects)
+
+    @property
+    def toothed(self) -> AbstractEffect | None:
+        """The effect that has teeth."""
+        return next((effect for effect in self.effects if effect.twists), None)
 
     def rest(
         self,

@@ -29,13 +29,13 @@ from pmdc_jax.control import (
 )
 from pmdc_jax.control.classical import ackermann, state_feedback, ultimate_gain, ziegler_nichols
 from pmdc_jax.control.continuous import continuous_loop
-from pmdc_jax.control.loop import steps_in_sample
 from pmdc_jax.control.margins import linear_loop, loop_gain, margins, sensitivity_peak
 from pmdc_jax.control.metrics import smooth_overshoot, smooth_settling
 from pmdc_jax.control.spread import drawn_motors, even_spread
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.motor_file import Uncertainty
+from pmdc_jax.simulate.solver import steps_within
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 MOTOR = Motor(**PAPER)
@@ -350,6 +350,7 @@ def test_friction_that_sticks_and_a_warming_winding_close_the_loop_too():
         ("speed_sensor_delay", {"delay_s": 0.0025}),
         ("speed_sensor_lag", {"time_constant_s": 0.002}),
         ("gear_backlash", {"gap_rad": 1e-3, "stiffness_Nm_rad": 30.0, "load_share": 0.1}),
+        ("gear_backlash", {"gap_rad": 1e-2, "stiffness_Nm_rad": 2800.0, "load_share": 0.7}),
     ],
 )
 def test_a_loop_through_slow_sensors_and_loose_gears_comes_to_its_set_point(name, parameters):
@@ -358,7 +359,7 @@ def test_a_loop_through_slow_sensors_and_loose_gears_comes_to_its_set_point(name
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
     gentle = PID(0.2, 8.0, 2e-4, 5e-4, 1.0, 0.02)
     law = Law.of(gentle, Hardware(1e-3, 30.0, 100.0, None, 1), motor)
-    response = run(motor, law, course(400), steps_in_sample(motor, 1e-3))
+    response = run(motor, law, course(400), int(steps_within(motor, 1e-3, jnp.asarray(100.0))))
     assert float(response.speed[-1]) == pytest.approx(SETPOINT, abs=0.01)
     assert float(response.voltage[-1]) == pytest.approx(
         float(steady_state(motor, SETPOINT)[1]), abs=1e-3

@@ -88,12 +88,6 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
 closed_loop_jit = eqx.filter_jit(closed_loop)
 
 
-def steps_in_sample(motor: Motor, sample_time: float) -> int:
-    """Instants a sample that the motor's effects need to be followed well."""
-    longest = [e.longest_step for e in motor.effects if e.holds or not e.affine]
-    return max(1, round(sample_time / min(longest))) if longest else 1
-
-
 def _earlier(past: Float[Array, " remembered"], samples: Number) -> Float[Array, ""]:
     """What was so many samples ago, latest first; interpolated linearly."""
     place = jnp.clip(samples, 0.0, REMEMBERED - 1.001)

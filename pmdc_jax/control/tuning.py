@@ -16,6 +16,7 @@ from attrs import field, frozen
 from ..motor import Motor
 from ..motor_file import Uncertainty
 from ..precision import double_precision
+from ..simulate.solver import steps_within
 from .classical import ziegler_nichols
 from .controllers import AbstractController
 from .descent import STARTS, tuned
@@ -23,7 +24,7 @@ from .gains import GainSpace
 from .hardware import Hardware
 from .judge import Candidate, Robustness, judged, simulated, speeds
 from .law import Law
-from .loop import Response, steps_in_sample
+from .loop import Response
 from .margins import Margins, margins
 from .objective import PARTS, Task
 from .specification import MAX_SENSITIVITY, Asked, Specification
@@ -208,6 +209,8 @@ def robustness(tuning: Tuning, spread: float, seed: int) -> Robustness | None:
 def _task(specification: Specification, motor: Motor, white: np.ndarray) -> Task:
     """What is simulated and judged; its noise has the size of the sensor's."""
     asked = specification.asked
+    stall = float(specification.voltage_limit / motor.R)
+    most = min(stall, asked.current_limit or stall)
     return Task(
         hardware=specification.hardware(),
         setpoint=jnp.asarray(specification.setpoint),
@@ -219,7 +222,7 @@ def _task(specification: Specification, motor: Motor, white: np.ndarray) -> Task
         else jnp.asarray(asked.max_sensitivity),
         noise=jnp.asarray(asked.speed_noise * white),
         step_samples=specification.samples,
-        substeps=steps_in_sample(motor, specification.sample_time),
+        substeps=int(steps_within(motor, specification.sample_time, jnp.asarray(most))),
     )
 
 

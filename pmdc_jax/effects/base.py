@@ -9,6 +9,7 @@ each of which does nothing unless the effect overrides it:
 - `voltage_drop` and `torque`: smooth terms of the electrical and the mechanical equation
 - `load_at_rotor`: what of the load torque acts on the rotor itself
 - `grip`: a dry, set-valued term that can hold a state at exactly zero (stiction, brush contact)
+- `teeth`, `while_begun` and `loose`: flanks that touch and part (a gear)
 - `states`, `rest` and `derivative`: states of its own, how they begin and how they move
 - `recurrence`: after how much of a state everything is as before
 - `linear`: the linear effect that it is, or nearly is, whose states then join the exact step
@@ -24,7 +25,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 if TYPE_CHECKING:
     from ..motor import Motor
@@ -46,6 +47,19 @@ class Grip(NamedTuple):
 
     backward: Scalars
     forward: Scalars
+
+
+class Teeth(NamedTuple):
+    """Two flanks that touch, or do not: on which side (+-1), how far in rad they overlap, and by what twist in rad the
+    torque is that they would pass if they stuck together. They push and never pull."""
+
+    side: Scalars
+    bite: Scalars
+    push: Scalars
+
+    @property
+    def touch(self) -> Bool[Array | np.ndarray, "*#batch"]:
+        return (self.bite > 0) & (self.push > 0)
 
 
 class ParameterRange(NamedTuple):
@@ -77,7 +91,10 @@ class AbstractEffect(eqx.Module):
     needs_current: ClassVar[bool] = False
     # which state a dry element holds at zero
     holds: ClassVar[Literal["speed", "current"] | None] = None
-    # with it the motor is still a linear system with inputs, as long as no dry element changes direction
+    # the state by which its teeth come to touch and part
+    twists: ClassVar[str | None] = None
+    # with it the motor is still a linear system with inputs, as long as no dry element changes direction and no teeth
+    # come to touch or part
     affine: ClassVar[bool] = False
     # the longest step in s that follows the effect well, or finds the changes of direction
     longest_step: ClassVar[float] = 1e-3
@@ -130,6 +147,19 @@ class AbstractEffect(eqx.Module):
     def linear(self) -> AbstractEffect | None:
         """An effect with the same states and only linear terms, near enough to step stiff ones by."""
         return None
+
+    def teeth(self, state: State, side: Scalars | None = None) -> Teeth:
+        """How its teeth stand, on the side where they are nearer or the one given; needs `twists`."""
+        raise NotImplementedError(f"{self.name} has no teeth")
+
+    def while_begun(self, state: State) -> AbstractEffect:
+        """The effect as it stays throughout a step that begins with this state, until its teeth touch or part."""
+        del state
+        return self
+
+    def loose(self) -> AbstractEffect:
+        """The effect while its teeth do not touch."""
+        return self
 
     def stiffens(self, motor: Motor, current: Scalars) -> Scalars | None:
         """How much faster, in 1/s, the motor becomes at a current in A; None where `longest_step` is always enough."""

@@ -7,23 +7,40 @@ from typing import TYPE_CHECKING, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .base import AbstractEffect, ParameterRange, Scalars, State
+from .base import AbstractEffect, ParameterRange, Scalars, State, Teeth
 
 if TYPE_CHECKING:
     from ..motor import Motor
 
 
-def _rotor(motor: Motor, share: Scalars) -> Motor:
-    """The motor with the inertia that is left on its own side of the shaft."""
-    return eqx.tree_at(lambda m: m.J, motor, motor.J * (1 - share))
+class _TwoInertias(AbstractEffect):
+    """A rotor and a load at the ends of a shaft; its `states` are the load's speed and the twist of the shaft."""
+
+    equation: ClassVar = "mechanical"
+
+    stiffness_Nm_rad: Scalars
+    damping_Nms_rad: Scalars
+    load_share: Scalars
+
+    def slip(self, state: State) -> Scalars:
+        """rad/s by which the rotor is faster than the load."""
+        return state.speed - state.extra[self.states[0]]
+
+    def parameters(self, motor: Motor, state: State) -> Motor:
+        """The motor with the inertia that is left on its own side of the shaft."""
+        del state
+        return eqx.tree_at(lambda m: m.J, motor, motor.J * (1 - self.load_share))
+
+    def load_at_rotor(self, load: Scalars) -> Scalars:
+        return 0.0 * load
+
+    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
+        speed, twist = self.states
+        net = self.torque(state) - load
+        return {speed: net * (1 / motor.J) * (1 / self.load_share - 1), twist: self.slip(state)}
 
 
-def _load_acceleration(rotor: Motor, share: Scalars, torque: Scalars) -> Scalars:
-    """rad/s^2 of the inertia behind the shaft under a torque."""
-    return torque * (1 / rotor.J) * (1 / share - 1)
-
-
-class ShaftCompliance(AbstractEffect):
+class ShaftCompliance(_TwoInertias):
     """Compliant shaft: the load torque acts on an inertia s J behind a spring and damper.
 
     (1 - s) J dw/dt = Kt i - f w - T_s,  s J dw_L/dt = T_s - T_load,
@@ -41,7 +58,6 @@ class ShaftCompliance(AbstractEffect):
     name: ClassVar = "shaft_compliance"
     label: ClassVar = "Compliant shaft"
     formula: ClassVar = "T_s = k twist + d (w - w_L), s J dw_L/dt = T_s - T_load"
-    equation: ClassVar = "mechanical"
     states: ClassVar = ("load_speed", "twist")
     affine: ClassVar = True
     ranges: ClassVar = {
@@ -50,30 +66,10 @@ class ShaftCompliance(AbstractEffect):
         "load_share": ParameterRange("", 1e-2, 0.99),
     }
 
-    stiffness_Nm_rad: Scalars
-    damping_Nms_rad: Scalars
-    load_share: Scalars
-
-    def shaft_torque(self, state: State) -> Scalars:
-        slip = state.speed - state.extra["load_speed"]
-        return self.stiffness_Nm_rad * state.extra["twist"] + self.damping_Nms_rad * slip
-
-    def parameters(self, motor: Motor, state: State) -> Motor:
-        del state
-        return _rotor(motor, self.load_share)
-
     def torque(self, state: State) -> Scalars:
-        return self.shaft_torque(state)
-
-    def load_at_rotor(self, load: Scalars) -> Scalars:
-        return 0.0 * load
-
-    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
-        net = self.shaft_torque(state) - load
-        return {
-            "load_speed": _load_acceleration(motor, self.load_share, net),
-            "twist": state.speed - state.extra["load_speed"],
-        }
+        return self.stiffness_Nm_rad * state.extra["twist"] + self.damping_Nms_rad * self.slip(
+            state
+        )
 
     def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del angle
@@ -83,7 +79,7 @@ class ShaftCompliance(AbstractEffect):
         return self
 
 
-class GearBacklash(AbstractEffect):
+class GearBacklash(_TwoInertias):
     """Backlash: a compliant shaft, or gear, that carries torque only once its play is taken up.
 
     As `shaft_compliance`, with T_s = stiffness bite + damping (w - w_L) while the teeth touch, where bite = twist
@@ -91,9 +87,9 @@ class GearBacklash(AbstractEffect):
     it is nearly a compliant shaft. A run begins with the teeth in contact on the side that the load presses them to,
     or in the middle without load.
 
-    **Fields**: `gap_rad`, the whole play in rad, > 0, usually 0.001 to 0.1; `stiffness_Nm_rad` of the teeth in
-    contact in N m/rad, > 0; `damping_Nms_rad` in N m s/rad, > 0; `load_share`, s, the share of the inertia behind the
-    gear, between 0 and 1.
+    **Fields**: `stiffness_Nm_rad` of the teeth in contact in N m/rad, > 0; `damping_Nms_rad` in N m s/rad, > 0;
+    `load_share`, s, the share of the inertia behind the gear, between 0 and 1; `gap_rad`, the whole play in rad, > 0,
+    usually 0.001 to 0.1.
     **Excitation needed**: torque through zero again and again, at two amplitudes.
     **Source**: Nordin, Gutman, "Controlling mechanical systems with backlash: a survey", Automatica 38
     (2002), doi:10.1016/S0005-1098(02)00047-X, section 2.
@@ -104,45 +100,37 @@ class GearBacklash(AbstractEffect):
     formula: ClassVar = (
         "T_s = k bite + d (w - w_L) while the teeth touch, bite = |twist| - gap/2, else 0"
     )
-    equation: ClassVar = "mechanical"
     states: ClassVar = ("gear_speed", "gear_twist")
-    longest_step: ClassVar = 2.5e-4
+    affine: ClassVar = True
+    twists: ClassVar = "gear_twist"
     ranges: ClassVar = {
-        "gap_rad": ParameterRange("rad", 1e-6, 1.0),
         "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
         "damping_Nms_rad": ParameterRange("N m s/rad", 1e-11, 1e6),
         "load_share": ParameterRange("", 1e-2, 0.99),
+        "gap_rad": ParameterRange("rad", 1e-6, 1.0),
     }
 
     gap_rad: Scalars
-    stiffness_Nm_rad: Scalars
-    damping_Nms_rad: Scalars
-    load_share: Scalars
 
-    def shaft_torque(self, state: State) -> Scalars:
-        twist, slip = state.extra["gear_twist"], state.speed - state.extra["gear_speed"]
-        play = self.gap_rad / 2
-        spring, damper = self.stiffness_Nm_rad, self.damping_Nms_rad * slip
-        forward = jnp.maximum(spring * (twist - play) + damper, 0.0)
-        backward = jnp.minimum(spring * (twist + play) + damper, 0.0)
-        return jnp.where(twist > play, forward, jnp.where(twist < -play, backward, 0.0))
-
-    def parameters(self, motor: Motor, state: State) -> Motor:
-        del state
-        return _rotor(motor, self.load_share)
+    def teeth(self, state: State, side: Scalars | None = None) -> Teeth:
+        twist = state.extra["gear_twist"]
+        side = jnp.where(twist < 0, -1.0, 1.0) if side is None else side
+        bite = side * twist - self.gap_rad / 2
+        slip = self.damping_Nms_rad * (1 / self.stiffness_Nm_rad) * self.slip(state)
+        return Teeth(side, bite, bite + side * slip)
 
     def torque(self, state: State) -> Scalars:
-        return self.shaft_torque(state)
+        teeth = self.teeth(state)
+        return jnp.where(teeth.touch, teeth.side * self.stiffness_Nm_rad * teeth.push, 0.0)
 
-    def load_at_rotor(self, load: Scalars) -> Scalars:
-        return 0.0 * load
+    def while_begun(self, state: State) -> AbstractEffect:
+        return self._held(self.gap_rad, self.teeth(state))
 
-    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
-        net = self.shaft_torque(state) - load
-        return {
-            "gear_speed": _load_acceleration(motor, self.load_share, net),
-            "gear_twist": state.speed - state.extra["gear_speed"],
-        }
+    def stiffens(self, motor: Motor, current: Scalars) -> Scalars:
+        """The rate at which teeth ring: a step is then a third of the time that they touch before they bounce."""
+        del current
+        share = self.load_share
+        return jnp.sqrt(self.stiffness_Nm_rad / (motor.J * share * (1 - share)))
 
     def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del angle
@@ -151,4 +139,27 @@ class GearBacklash(AbstractEffect):
 
     def linear(self) -> AbstractEffect:
         """Without gap."""
-        return eqx.tree_at(lambda e: e.gap_rad, self, 0.0 * self.gap_rad)
+        one = jnp.ones_like(self.gap_rad)
+        return self._held(0.0 * one, Teeth(one, one, one))
+
+    def loose(self) -> AbstractEffect:
+        one = jnp.ones_like(self.gap_rad)
+        return self._held(self.gap_rad, Teeth(one, -one, -one))
+
+    def _held(self, gap_rad: Scalars, stand: Teeth) -> HeldTeeth:
+        shaft = (self.stiffness_Nm_rad, self.damping_Nms_rad, self.load_share)
+        return HeldTeeth(*shaft, gap_rad, stand)
+
+
+class HeldTeeth(GearBacklash):
+    """Backlash whose teeth go on touching, on one side, or not touching, as they stood."""
+
+    stood: Teeth
+
+    def linear(self) -> AbstractEffect:
+        return self
+
+    def torque(self, state: State) -> Scalars:
+        teeth = self.teeth(state, self.stood.side)
+        push = teeth.side * self.stiffness_Nm_rad * teeth.push
+        return jnp.where(self.stood.touch, push, 0.0)

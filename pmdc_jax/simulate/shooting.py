@@ -198,7 +198,7 @@ def _join(
     guess = _guess(motor, own, tape, begins)
     # a linear motor is joined exactly by the correction of its one pass; any other block is exact once the one
     # before it is, so this ends however hard the motor
-    exact = motor.affine and not motor.sticks
+    exact = motor.affine and not motor.switches
     passes = 1 if exact else min(most or len(guess) + 1, len(guess) + 1)
 
     def unjoined(carry):

@@ -5,24 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial, reduce
 from operator import add
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from ..effects.base import Grip, Scalars, State
+from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
 from .exponential import Matrix, phi_functions, product
+from .switches import crossed, knocked, knocks, once
 
 if TYPE_CHECKING:
     from .tape import Tape
 
 Held = Float[Array, "*#batch"]
-T = TypeVar("T")
 Vector = tuple[Scalars, ...]  # current, speed, and the states of linear effects
 
 # Steps into which a sample is divided at most
@@ -49,6 +49,8 @@ class Weights(NamedTuple):
     linear: Matrix  # A
     step: Float[Array, "*#batch"]  # s
     stages: Stages | None = None  # where the rest changes within a step
+    # what the torque does that teeth begin or cease to pass within a step, in rad of twist, where there are teeth
+    knocks: Float[Array, "powers n *#batch"] | None = None
 
 
 class Propagator(NamedTuple):
@@ -61,15 +63,36 @@ class Propagator(NamedTuple):
     whole: Matrix  # exp(A h)
     inputs: Float[Array, "n 2 *#batch"]  # h phi_1(A h) B
     weights: Weights | None = None
+    apart: Propagator | None = None  # the same while teeth do not touch
 
 
 def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator:
-    """Exact step of the linear part over `step` seconds, and the weights for what the effects add.
+    """Exact step of the linear part over `step` seconds, and the weights for what the effects add."""
+    A, B = _linear_part(motor, drive)
+    along = _propagator(motor, step, A, B)
+    teeth = motor.toothed
+    if teeth is None:
+        return along
+    assert teeth.twists is not None
+    loose = eqx.tree_at(lambda m: m.effects, motor, tuple(e.loose() for e in motor.effects))
+    A_apart, _ = _linear_part(loose, drive)
+    apart = _propagator(motor, step, A_apart, B)
+    push = (A - A_apart)[:, 2 + _linear_states(motor).index(teeth.twists)]
+    apart = _with_knocks(apart, knocks(A, push, step))
+    return _with_knocks(along, knocks(A_apart, push, step))._replace(apart=apart)
 
-    **Source**: ETDRK4, Cox, Matthews, Journal of Computational Physics 176 (2002), equations (26)-(29),
+
+def _with_knocks(along: Propagator, knocks: Float[Array, "powers n *#batch"]) -> Propagator:
+    assert along.weights is not None
+    return along._replace(weights=along.weights._replace(knocks=knocks))
+
+
+def _propagator(
+    motor: Motor, step: Float[Array, ""], A: Matrix, B: Float[Array, "n 2 *#batch"]
+) -> Propagator:
+    """**Source**: ETDRK4, Cox, Matthews, Journal of Computational Physics 176 (2002), equations (26)-(29),
     doi:10.1006/jcph.2002.6995.
     """
-    A, B = _linear_part(motor, drive)
     if motor.affine:
         _, (phi0, phi1) = phi_functions(A * step, 1)
         inputs = step * product(phi1, B)
@@ -108,17 +131,23 @@ def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 
 
 
 def steps_in_sample(motor: Motor, tape: Tape) -> int | Int[Array, ""]:
-    """Into how many equal steps a sample is divided, so that none is longer than the effects allow."""
-    allowed = [e.longest_step for e in motor.effects if e.holds or not e.affine]
+    """Into how many equal steps the samples of a tape are divided."""
+    current = jnp.max(jnp.abs(jnp.asarray(tape.measured)[:, 0]))
+    return steps_within(motor, tape.longest, current)
+
+
+def steps_within(motor: Motor, seconds: float, current: Scalars) -> int | Int[Array, ""]:
+    """Into how many equal steps that time is divided, so that none is longer than the effects allow at currents up to
+    `current` in A."""
+    allowed = [e.longest_step for e in motor.effects if e.holds or e.twists or not e.affine]
     if not allowed:
         return 1
-    least = min(max(round(tape.longest / min(allowed)), 1), FINEST)
-    current = jnp.max(jnp.abs(jnp.asarray(tape.measured)[:, 0]))
+    least = min(max(round(seconds / min(allowed)), 1), FINEST)
     rates = [rate for e in motor.effects if (rate := e.stiffens(motor, current)) is not None]
     if not rates:
         return least
     # of a population, as most of it needs: what a wild one needs would hold up all
-    needed = jnp.ceil(jnp.median(reduce(jnp.maximum, rates)) * tape.longest / STIFF)
+    needed = jnp.ceil(jnp.median(reduce(jnp.maximum, rates)) * seconds / STIFF)
     return jnp.clip(jnp.nan_to_num(needed, nan=FINEST), least, FINEST).astype(int)
 
 
@@ -134,23 +163,64 @@ def held_step(
     """The state one held sample later, in `steps` equal steps, for one of which `along` is made.
 
     Motors whose effects leave them linear: exact. Otherwise the linear part is exact and the rest goes by the
-    four stages of ETDRK4, in which dry elements act in the direction the step began with; a step in which a
-    held state crosses zero is then mended by `_cross`, so that friction sticks at exactly zero without any
-    smoothing.
+    four stages of ETDRK4, in which dry elements act in the direction the step began with, and teeth touch or not as
+    they then did. A step in which a held state crosses zero, or teeth touch or part, is then mended (`switches`), so
+    that friction sticks at exactly zero and a gear knocks without any smoothing.
     """
-    whole, inputs, weights = along
+    whole, inputs, weights, _ = along
     if weights is None:
         # the state last: two fused multiply-adds, where a sum of sums would take an addition more
         current, speed = _times(whole, (state.current, state.speed), _times(inputs, (value, load)))
         return State(current, speed, state.extra)
     if isinstance(steps, int) and steps == 1:
-        return _step(motor, whole, weights, drive, state, value, load)
+        return _step(motor, along, drive, state, value, load)
     return jax.lax.fori_loop(
-        0, steps, lambda _, now: _step(motor, whole, weights, drive, now, value, load), state
+        0, steps, lambda _, now: _step(motor, along, drive, now, value, load), state
     )
 
 
 def _step(
+    motor: Motor,
+    along: Propagator,
+    drive: Drive,
+    state: State,
+    value: Scalars,
+    load: Scalars,
+) -> State:
+    teeth = motor.toothed
+    if teeth is not None:
+        touching = teeth.teeth(state).touch
+        along = jax.tree.map(
+            lambda a, b: jnp.where(touching, a, b), along._replace(apart=None), along.apart
+        )
+        begun = tuple(e.while_begun(state) for e in motor.effects)
+        motor = eqx.tree_at(lambda m: m.effects, motor, begun)
+    weights = along.weights
+    assert weights is not None
+    rate, after = _unswitched(motor, along.whole, weights, drive, state, value, load)
+    x, begun, moved = _vector(motor, state), _vector(motor, rate), _vector(motor, after)
+    slow = _slow(motor, after)
+    if teeth is not None and weights.knocks is not None:
+        mend = knocked(teeth, weights.step, weights.knocks, state, rate, after)
+        moved = _add(moved, mend)
+    if motor.switches:
+        now, still = motor.at(state), state._replace(current=0.0 * x[0], speed=0.0 * x[1])
+        for row, holds, unit in ((1, "speed", 1 / now.J), (0, "current", drive.voltage / now.L)):
+            hold, ahead = motor.grip(holds, still), motor.grip(holds, _state(motor, moved, slow))
+            if hold is not None and ahead is not None:
+                push, decay = weights.push[:, row] * unit, -weights.linear[row, row] * weights.step
+                # a branch, though most blocks have something to mend: without it XLA computes the whole step anew
+                # for each intermediate result, and a population takes twice as long
+                moved = jax.lax.cond(
+                    jnp.any(jnp.sign(x[row]) * moved[row] <= 0),
+                    partial(crossed, row),
+                    lambda grips, before, after, *_: after,
+                    *((hold, ahead), x, moved, begun[row] / unit, push, decay),
+                )
+    return _state(motor, moved, slow)
+
+
+def _unswitched(
     motor: Motor,
     whole: Matrix,
     weights: Weights,
@@ -158,110 +228,36 @@ def _step(
     state: State,
     value: Scalars,
     load: Scalars,
-) -> State:
-    all_push, linear, h, stages = weights
+) -> tuple[State, State]:
+    """The rate at which a step begins, and how it ends if dry elements and teeth go on as they began."""
+    h, linear, always = weights.step, weights.linear, jnp.all(weights.step > 0)
     moving = (jnp.sign(state.current), jnp.sign(state.speed))
     x, slow = _vector(motor, state), _slow(motor, state)
-    moved = _times(whole, x)
 
     def rates(x, slow):
-        """What the linear part leaves over, and the rates of the states that are not in it."""
         rate = motor.derivative(_state(motor, x, slow), value, load, drive, moving)
-        left = _add(_vector(motor, rate), _times(-linear, x)), _slow(motor, rate)
-        return left if stages is None else _once(left, jnp.all(h > 0))
+        return _vector(motor, rate), _slow(motor, rate)
 
-    n0, s0 = rates(x, slow)
-    if stages is None:
-        moved, slow = _add(moved, _times(all_push, n0)), _shifted(slow, h, s0)
-    else:
-        half, push, turn, first, middle, last = stages
-        halfway = _times(half, x)
-        n1, s1 = rates(_add(halfway, _times(push, n0)), _shifted(slow, h / 2, s0))
-        n2, s2 = rates(_add(halfway, _times(push, n1)), _shifted(slow, h / 2, s1))
-        end = _add(moved, _times(2 * push, n2), _times(turn, n0))
-        n3, s3 = rates(end, _shifted(slow, h, s2))
-        moved = _add(moved, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
-        slow = _shifted(slow, h / 6, {k: s0[k] + 2 * (s1[k] + s2[k]) + s3[k] for k in slow})
-    if motor.sticks:
-        now, still = motor.at(state), state._replace(current=0.0 * x[0], speed=0.0 * x[1])
-        begun = _add(n0, _times(linear, x))
-        for row, holds, unit in ((1, "speed", 1 / now.J), (0, "current", drive.voltage / now.L)):
-            hold, ahead = motor.grip(holds, still), motor.grip(holds, _state(motor, moved, slow))
-            if hold is not None and ahead is not None:
-                push, decay = all_push[:, row] * unit, -linear[row, row] * h
-                # a branch, though most blocks have something to mend: without it XLA computes the whole step anew
-                # for each intermediate result, and a population takes twice as long
-                moved = jax.lax.cond(
-                    jnp.any(jnp.sign(x[row]) * moved[row] <= 0),
-                    partial(_cross, row),
-                    lambda grips, before, after, *_: after,
-                    *((hold, ahead), x, moved, begun[row] / unit, push, decay),
-                )
-    return _state(motor, moved, slow)
+    if weights.stages is None:
+        begun, s0 = once(rates(x, slow), always)
+        after = _state(motor, _add(x, _times(weights.push, begun)), _shifted(slow, h, s0))
+        return _state(motor, begun, s0), after
 
+    def rest(x, slow):
+        """What the linear part leaves over, and the rates of the states that are not in it."""
+        rate, slow = rates(x, slow)
+        return once((_add(rate, _times(-linear, x)), slow), always)
 
-def _once(values: T, always: Bool[Array, ""]) -> T:
-    """The same values, behind a branch that is always taken: XLA, which would compute them anew for each of all that
-    depends on them, computes them once. A play of teeth is simulated in three quarters of the time."""
-    return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
-
-
-def _cross(
-    row: int,
-    grips: tuple[Grip, Grip],
-    before: Vector,
-    after: Vector,
-    begun: Scalars,
-    push: Float[Array, "n *#batch"],
-    decay: Held,
-) -> Vector:
-    """Mend a step in which the state that a dry element holds comes to zero, or is there.
-
-    For a part of the step the state moved on as it did before; for the rest of it the element takes
-    whatever, within its limits, ends the step at zero: if it can, the state sticks, at exactly zero.
-    `grips` are those at zero and where the step would end; `begun` is the driving torque (or voltage) at the start
-    of the step; `push` is what a unit of it over the whole step adds to the state, which by itself falls by
-    exp(-`decay`).
-
-    **Source**: time-stepping with set-valued forces, Moreau (1988), doi:10.1007/978-3-7091-2624-0_1, with the
-    response of the exact linear step in place of h / J.
-    """
-    direction = jnp.sign(before[row])
-    crosses = direction * after[row] <= 0
-    # the guarded denominator keeps the derivative finite where the branch is not taken
-    fall = jnp.where(crosses & (direction != 0), before[row] - after[row], 1.0)
-    share = jnp.where(direction == 0, 0.0, before[row] / fall)
-    # what a push from then on does, over what it does in the whole step: the state moves on an exponential
-    rest = jnp.maximum((1.0 - share) / (1.0 + jnp.expm1(-decay) * share), 1e-12)
-    # what already acts against the motion; then the same force, chosen anew, over what is left of the step
-    hold, (backward, forward) = grips[0], jax.tree.map(lambda a, b: (a + b) / 2, *grips)
-    acting = jnp.where(direction > 0, forward, jnp.where(direction < 0, -backward, 0.0))
-    needed = acting + after[row] / (push[row] * rest)
-    taken = jnp.where(needed > hold.forward, forward, needed)
-    taken = jnp.where(needed < -hold.backward, -backward, taken)
-    taken = jnp.where(direction == 0, needed - _loose(hold, begun, needed), taken)
-    change = jnp.where(crosses, (acting - taken) * rest, 0.0)
-    sticks = crosses & (taken == needed)
-    # the other states follow this one, so they answer with the square of the time that is left
-    mended = [x + push[k] * change * rest for k, x in enumerate(after)]
-    mended[row] = jnp.where(sticks, 0.0, after[row] + push[row] * change)
-    return tuple(mended)
-
-
-def _loose(hold: Grip, begun: Scalars, mean: Scalars) -> Scalars:
-    """What is left over, as a mean over the step, of a force beyond what holds a state at zero.
-
-    The force goes on a straight line from what it has `begun` with, through its `mean` at half the step; where it
-    comes to exceed the limit the state breaks loose, and not before.
-    """
-    end = 2 * mean - begun
-    toward = jnp.sign(end)
-    limit = jnp.where(end > 0, hold.forward, hold.backward)
-    beyond = jnp.maximum(toward * end - limit, 0.0)
-    rise = jnp.where(beyond > 0, toward * (end - begun), 1.0)
-    at_once = jnp.maximum(toward * mean - limit, 0.0)
-    later = beyond**2 / (2 * jnp.where(rise > 0, rise, 1.0))
-    return toward * jnp.where(toward * begun < limit, later, at_once)
+    half, push, turn, first, middle, last = weights.stages
+    moved, halfway = _times(whole, x), _times(half, x)
+    n0, s0 = rest(x, slow)
+    n1, s1 = rest(_add(halfway, _times(push, n0)), _shifted(slow, h / 2, s0))
+    n2, s2 = rest(_add(halfway, _times(push, n1)), _shifted(slow, h / 2, s1))
+    end = _add(moved, _times(2 * push, n2), _times(turn, n0))
+    n3, s3 = rest(end, _shifted(slow, h, s2))
+    moved = _add(moved, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
+    slow = _shifted(slow, h / 6, {k: s0[k] + 2 * (s1[k] + s2[k]) + s3[k] for k in slow})
+    return _state(motor, _add(n0, _times(linear, x)), s0), _state(motor, moved, slow)
 
 
 class Walk(NamedTuple):
