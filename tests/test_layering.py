@@ -16,13 +16,14 @@ PACKAGE = Path(__file__).parents[1] / "pmdc_jax"
 BELOW = {
     "errors": set(),
     "precision": set(),
+    "threads": set(),
     "units": {"errors"},
     "columns": {"errors", "units"},
     "tables": {"errors"},
     "recording": {"columns", "errors", "tables", "units"},
     "effects": set(),
     "motor": {"effects"},
-    "simulate": {"effects", "motor", "precision", "recording"},
+    "simulate": {"effects", "motor", "precision", "recording", "threads"},
     "check": {"alignment", "plausibility", "recording"},
     "motor_file": {"effects", "errors", "motor", "report"},
     "control": {
@@ -34,7 +35,16 @@ BELOW = {
         "report",
         "simulate",
     },
-    "identify": {"check", "effects", "errors", "motor", "precision", "recording", "simulate"},
+    "identify": {
+        "check",
+        "effects",
+        "errors",
+        "motor",
+        "precision",
+        "recording",
+        "simulate",
+        "threads",
+    },
 }
 
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +16,7 @@ from ..identify.refine import Refined, Unknowns, polish
 from ..identify.sharpen import sharpened, squares_of
 from ..identify.solve import POOR
 from ..identify.uncertainty import FLAT
+from ..threads import CORES, side_by_side
 from .candidates import FULLER, STARTS, Values
 from .kinship import CONTAINS, spelt_out
 from .library import Library
@@ -128,13 +126,12 @@ class Refits:
 
     def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener) -> Model:
         """The best refit of several, begun one after another until one is as good as the noise or found twice."""
-        given, ends, cores = starts[0][0], [], os.cpu_count() or 1
-        with ThreadPoolExecutor(cores) as pool:
-            for first in range(0, len(starts), cores):
-                ends += pool.map(_roughly, starts[first : first + cores])
-                best, *others = sorted(end.fitness for end in ends)
-                if best < POOR * given.problem.outputs or (others and others[0] < AGREED * best):
-                    break
+        given, ends = starts[0][0], []
+        for first in range(0, len(starts), CORES):
+            ends += side_by_side(_roughly, starts[first : first + CORES])
+            best, *others = sorted(end.fitness for end in ends)
+            if best < POOR * given.problem.outputs or (others and others[0] < AGREED * best):
+                break
         return settled(effects, given, min(ends, key=lambda end: end.fitness), white)
 
     def _refitted(
@@ -231,10 +228,9 @@ class Refits:
 
 
 def _roughly(start: Start) -> Refined:
-    """A few steps of a refit in a thread, to which the precision does not carry over by itself."""
+    """A few steps of a refit."""
     given, begun = start
-    with jax.enable_x64(True):
-        return polish(given.problem, begun, ROUGHLY).refined
+    return polish(given.problem, begun, ROUGHLY).refined
 
 
 def _turns(model: Model, effect: str) -> list[np.ndarray | None]:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..motor import PARAMETERS, Motor
 from ..recording import Recording
 from ..simulate import Tape
+from ..threads import side_by_side
 from .identifiability import explain
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import white_noise
@@ -75,12 +73,10 @@ def _intervals(
         spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.reach[k])
         if not problem.parameters.logarithmic[k] or spread < QUADRATIC:
             return coordinates[k] - reach * spread, coordinates[k] + reach * spread
-        with jax.enable_x64(True):  # the setting belongs to the thread
-            return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
+        return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
 
     identified = [k for k in range(len(coordinates)) if _status(k, best, info) == "identified"]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return dict(zip(identified, pool.map(interval, identified), strict=True))
+    return dict(zip(identified, side_by_side(interval, identified), strict=True))
 
 
 def _information(problem: Problem, polished: Polished, runs: int) -> Information:

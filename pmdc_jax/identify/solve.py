@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -13,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..simulate import Tape
+from ..threads import beside, side_by_side
 from .bounds import effect_bounds
 from .identification import Search
 from .parameters import Parameters
@@ -62,13 +61,12 @@ def solve(
         return global_search(sought, searching, noise, search, seed, progress=progress)
 
     middle = (problem.parameters.lower + problem.parameters.upper) / 2
-    with ThreadPoolExecutor(1) as beside:
-        # a refinement that gives up at once: it is compiled on another core while the search runs
-        compiled = beside.submit(_refine, problem, _start(problem.tape, middle), tolerance=1e3)
-        found = look(seed)
-        searched = time.perf_counter()
-        report("refining the best candidates", float(found.best[-1]))
-        compiled.result()
+    # a refinement that gives up at once: it is compiled on another core while the search runs
+    compiled = beside(refine, problem, _start(problem.tape, middle), tolerance=1e3)
+    found = look(seed)
+    searched = time.perf_counter()
+    report("refining the best candidates", float(found.best[-1]))
+    compiled.result()
     ends = _refine_all(problem, found)
     for attempt in range(1, SEARCHES):
         if found.interrupted or _agreed(ends, problem.outputs):
@@ -123,17 +121,10 @@ def _distinct(found: Found, parameters: Parameters) -> list[np.ndarray]:
     return kept
 
 
-def _refine(problem: Problem, start: Unknowns, **options: float) -> Refined:
-    """Refine in a thread, to which the precision does not carry over by itself."""
-    with jax.enable_x64(True):
-        return refine(problem, start, **options)
-
-
 def _refine_all(problem: Problem, found: Found) -> list[Refined]:
     """Refine the best distinct candidates of a search, one a core at a time; the best first."""
     starts = [_start(problem.tape, candidate) for candidate in _distinct(found, problem.parameters)]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return sorted(pool.map(lambda start: _refine(problem, start), starts), key=_fitness)
+    return sorted(side_by_side(lambda start: refine(problem, start), starts), key=_fitness)
 
 
 def _fitness(end: Refined) -> float:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import diffrax
@@ -15,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from ..effects.base import State
 from ..motor import Motor
+from ..threads import CORES, side_by_side
 from .exponential import Matrix, product
 from .solver import (
     HeldInput,
@@ -45,26 +44,18 @@ def squared_errors(
     """
     size = motors.R.shape[0]
     least = SHARE if motors.effects else LINEAR_SHARE
-    cores = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
+    cores = CORES if jax.default_backend() == "cpu" else 1
     shares = max(1, min(cores, size // least))
     if shares == 1 or size % shares:  # unequal shares would be compiled once more
         return _errors(motors, tape, 0)
-    double = jax.config.read("jax_enable_x64")
 
     def part(k: int):
-        with jax.enable_x64(double):  # the setting belongs to the thread
-            return jax.block_until_ready(_errors(motors, tape, k, shares))
+        return jax.block_until_ready(_errors(motors, tape, k, shares))
 
     # XLA walks a population on one core; the cores share it out among them
-    parts = _threads().map(part, range(shares))
+    parts = side_by_side(part, range(shares))
     current, speed = (jnp.asarray(np.concatenate(errors)) for errors in zip(*parts, strict=True))
     return current, speed
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    """Kept: in a new thread the first call takes a millisecond longer than the next."""
-    return ThreadPoolExecutor(os.cpu_count() or 1)
 
 
 # The widest vectors, where the processor has them: by default XLA uses half of their width.
