@@ -441,6 +441,19 @@ def test_where_a_peak_of_friction_would_not_show_it_is_not_ruled_out(peak):
     assert found.next_experiment is not None
 
 
+def test_a_faint_effect_beside_a_strong_one_is_named():
+    """A dead zone explains hundreds of times as much, but leaves nothing in the mechanical equation."""
+    dry = 0.008
+    plant = Plant(**PAPER, dead_zone_V=1.0, friction_forward_Nm=dry, friction_backward_Nm=dry)
+    held_out, *training = recorded_from(plant, 12, NOISE)
+    found = diagnose(training, [held_out])
+    assert found.verdict == "named"
+    by_name = {effect.name: effect for effect in found.effects}
+    assert set(by_name) == {"input_dead_zone", "coulomb_friction"}
+    low, high = by_name["coulomb_friction"].parameters["torque_Nm"].ci95
+    assert low < dry < high < 1.1 * low
+
+
 def test_a_bearing_that_seizes_is_no_coulomb_friction():
     """Torque noise is slow too, but does not turn with the direction of motion."""
     plant = Plant(**PAPER, seizing_Nm=0.04, seizing_from_s=1.0)

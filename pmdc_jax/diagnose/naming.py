@@ -13,101 +13,30 @@ from ..identify.colour import Whitener, whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Polished
 from ..identify.sharpen import residuals_of, sharpened, squares_of
-from .candidates import FULLER, STARTS, Candidate
+from .candidates import FULLER, STARTS
 from .kinship import CONTAINS, are_rivals, is_within, spelt_out
 from .library import Library
 from .model import Model, ended
 from .periodic import Line, line_of
 from .refits import Refits
 from .screen import Screen, Signal, beyond_curves, screen, signals
+from .seen import ALARM, FORMULA, HARDER, MOST_OF_IT, Seen, chance_of_nothing
 
-# Chance that anything at all is called missing from a motor that lacks nothing, or that anything more is in all looks
-# after the first
-ALARM = 0.01
 # What is missed by a smaller share of what is measured is nothing: one simulation meets another no closer
 CLOSE = 1e-4
 # At most so many effects are named, and so many candidates for one are refitted in full simulation
 MOST, SHORTLIST = 3, 3
 # ... those whose gain to first order is at least this share of the best one's
 COMPARABLE = 0.6
-# What effects may leave of the squares that they explain, by formulas that are not quite nature's: so much, and more
-# if it is a curve over an effect's own variable
-FORMULA, OWN_FORMULA = 0.1, 0.5
-# An effect is tried if the best one would take away this share of what the clearest signal would; with the larger one
-# what is left is clearly another effect, or a richer form of one
-MUCH_OF_IT, MOST_OF_IT = 0.3, 0.7
-# ... and there may then be left no more than this share of it, or the larger one by a richer form of what was there
+# After one more effect there may be left no more than this share of what the clearest signal would take away, or the
+# larger one after a richer form of what was there
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.3
-# Fuller forms that no column shows, by the simpler ones in whose place they are tried if those leave something
-HARDER = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}
-# ... and what effects leave of what they explain if nothing more is worth a trial, the larger one for harder ones:
-# chance decides when teeth meet, and no fit of them is exact
-TRACE, TRACE_OF_HARDER = 2e-3, 1e-2
 # A model that leaves so many times the squares of another one is no match for it, whatever a filter makes of either
 FAR = 3.0
 # A fuller form of an effect is ruled out if it leaves so many squares more: two standard errors
 RULED_OUT = 4.0
 # Rivals whose criterion is nearer than this, and this share of what neither explains, are not told apart
 MARGIN, OF_UNEXPLAINED = 8.0, 0.1
-
-
-def chance_of_nothing(
-    of_candidates: Sequence[Signal], of_curves: Sequence[Signal], count: int
-) -> float:
-    """Chance of evidence as strong as the strongest if nothing were missing: Bonferroni over `count` blocks."""
-    smallest = min(s.log_p for s in (*of_candidates, *of_curves))
-    return float(min(1.0, np.exp(smallest + np.log(count))))
-
-
-class Seen(NamedTuple):
-    """The evidence against a model, read once."""
-
-    screen: Screen
-    of_candidates: list[Signal]
-    of_curves: list[Signal]
-    left: float  # chance of it if nothing more were missing
-    explained: float  # how much of what the motor without effects leaves the model takes away
-
-    @property
-    def clearest(self) -> Signal:
-        """The signal with the largest gain."""
-        return max((*self.of_candidates, *self.of_curves), key=lambda s: s.gain)
-
-    @property
-    def unexplained(self) -> float:
-        """What the clearest signal would still take away, over what the model takes away already."""
-        return float(self.clearest.gain / self.explained) if self.explained > 0 else np.inf
-
-    @property
-    def by_one_more(self) -> float:
-        """The share of that which one of the library's effects would take away."""
-        best = max((s.gain for s in self.of_candidates), default=0.0)
-        return float(best / self.clearest.gain)
-
-    def asks_for_more(self) -> bool:
-        """Whether more is missing, and one of the library's effects would take away much of it."""
-        return bool(self.left < ALARM and self.by_one_more > MUCH_OF_IT)
-
-    def is_another(self) -> bool:
-        """Whether what is left is clearly one more effect, and no formula."""
-        return bool(self.unexplained > FORMULA and self.by_one_more > MOST_OF_IT)
-
-    def is_settled(self, again: Seen, share: float) -> bool:
-        """Whether one more effect, after which the evidence is `again`, is more than a way to mend the formula of those
-        that were there: then no more than a share is left."""
-        clear = self.unexplained > FORMULA or again.left >= ALARM
-        return bool(clear or again.clearest.gain < share * self.clearest.gain)
-
-    def is_formula(self, model: Model) -> bool:
-        """Whether what is left may well be that of the model's effects by formulas of nature's own."""
-        if not model.effects or self.unexplained < FORMULA:
-            return bool(model.effects)
-        clearest = self.clearest.of
-        if isinstance(clearest, Candidate):
-            return clearest.effect in model.effects
-        kinds = [EFFECTS[name] for name in model.effects]
-        own = {("electrical" if k.equation == "input" else k.equation, k.variable) for k in kinds}
-        return self.unexplained < OWN_FORMULA and (clearest.equation, clearest.variable) in own
 
 
 class Fitted(NamedTuple):
@@ -207,8 +136,10 @@ class Namer:
         here = set(current.effects)
         if len(here) == MOST:
             return []
-        if found.unexplained < (TRACE_OF_HARDER if here & set(HARDER.values()) else TRACE):
-            return self._with(current, found, self._richer(current, found))
+        if found.is_trace(current):
+            foreign = found.is_foreign(current)
+            one_more = self._shortlist if foreign else self._richer
+            return self._with(current, found, one_more(current, found))
         tried = []
         if found.asks_for_more():
             tried += self._with(current, found, self._shortlist(current, found))

@@ -30,8 +30,9 @@ from .evidence import Block
 from .experiment import next_experiment
 from .library import Library
 from .model import model_of
-from .naming import ALARM, Namer, Naming
+from .naming import Namer, Naming
 from .screen import Screen, log_chance
+from .seen import ALARM
 
 if TYPE_CHECKING:
     from ..report.terminal import ReportProgress

@@ -1,0 +1,108 @@
+"""What the evidence against a model says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..effects import EFFECTS
+from .candidates import FULLER, Candidate
+from .kinship import CONTAINS
+from .library import Curve
+from .model import Model
+from .screen import Screen, Signal
+
+# Chance that anything at all is called missing from a motor that lacks nothing, or that anything more is in all looks
+# after the first
+ALARM = 0.01
+# What effects may leave of the squares that they explain, by formulas that are not quite nature's: so much, and more
+# if it is a curve over an effect's own variable
+FORMULA, OWN_FORMULA = 0.1, 0.5
+# An effect is tried if the best one would take away this share of what the clearest signal would; with the larger one
+# what is left is clearly another effect, or a richer form of one
+MUCH_OF_IT, MOST_OF_IT = 0.3, 0.7
+# Fuller forms that no column shows, by the simpler ones in whose place they are tried if those leave something
+HARDER = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}
+# ... and what effects leave of what they explain if nothing more is worth a trial, the larger one for harder ones:
+# chance decides when teeth meet, and no fit of them is exact
+TRACE, TRACE_OF_HARDER = 2e-3, 1e-2
+
+
+def chance_of_nothing(
+    of_candidates: Sequence[Signal], of_curves: Sequence[Signal], count: int
+) -> float:
+    """Chance of evidence as strong as the strongest if nothing were missing: Bonferroni over `count` blocks."""
+    smallest = min(s.log_p for s in (*of_candidates, *of_curves))
+    return float(min(1.0, np.exp(smallest + np.log(count))))
+
+
+class Seen(NamedTuple):
+    """The evidence against a model, read once."""
+
+    screen: Screen
+    of_candidates: list[Signal]
+    of_curves: list[Signal]
+    left: float  # chance of it if nothing more were missing
+    explained: float  # how much of what the motor without effects leaves the model takes away
+
+    @property
+    def clearest(self) -> Signal:
+        """The signal with the largest gain."""
+        return max((*self.of_candidates, *self.of_curves), key=lambda s: s.gain)
+
+    @property
+    def unexplained(self) -> float:
+        """What the clearest signal would still take away, over what the model takes away already."""
+        return float(self.clearest.gain / self.explained) if self.explained > 0 else np.inf
+
+    @property
+    def by_one_more(self) -> float:
+        """The share of that which one of the library's effects would take away."""
+        best = max((s.gain for s in self.of_candidates), default=0.0)
+        return float(best / self.clearest.gain)
+
+    def asks_for_more(self) -> bool:
+        """Whether more is missing, and one of the library's effects would take away much of it."""
+        return bool(self.left < ALARM and self.by_one_more > MUCH_OF_IT)
+
+    def is_another(self) -> bool:
+        """Whether what is left is clearly one more effect, and no formula."""
+        return bool(self.unexplained > FORMULA and self.by_one_more > MOST_OF_IT)
+
+    def is_settled(self, again: Seen, share: float) -> bool:
+        """Whether one more effect, after which the evidence is `again`, is more than a way to mend the formula of those
+        that were there: then no more than a share is left."""
+        clear = self.unexplained > FORMULA or again.left >= ALARM
+        return bool(clear or again.clearest.gain < share * self.clearest.gain)
+
+    def is_formula(self, model: Model) -> bool:
+        """Whether what is left may well be that of the model's effects by formulas of nature's own."""
+        if not model.effects or self.unexplained < FORMULA:
+            return bool(model.effects)
+        clearest = self.clearest.of
+        if isinstance(clearest, Candidate):
+            return clearest.effect in model.effects
+        return self.unexplained < OWN_FORMULA and _is_own(clearest, model)
+
+    def is_trace(self, model: Model) -> bool:
+        """Whether so little is left that the effects themselves may have left it."""
+        harder = set(model.effects) & set(HARDER.values())
+        return self.unexplained < (TRACE_OF_HARDER if harder else TRACE)
+
+    def is_foreign(self, model: Model) -> bool:
+        """Whether what is left is clearly one more effect that the model's own cannot have left: in another equation,
+        or over another variable. Of when teeth meet there is no telling what it leaves."""
+        if set(model.effects) & set(HARDER.values()):
+            return False
+        clearest = max(self.of_curves, key=lambda s: s.gain).of
+        own = isinstance(clearest, Curve) and _is_own(clearest, model)
+        return bool(self.left < ALARM and self.by_one_more > MOST_OF_IT and not own)
+
+
+def _is_own(curve: Curve, model: Model) -> bool:
+    """Whether a curve is one over a variable that one of the model's effects is a curve over, in its equation."""
+    kinds = [EFFECTS[name] for name in model.effects]
+    own = {("electrical" if k.equation == "input" else k.equation, k.variable) for k in kinds}
+    return (curve.equation, curve.variable) in own
