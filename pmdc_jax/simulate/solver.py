@@ -67,16 +67,17 @@ class Propagator(NamedTuple):
 
 
 def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator:
-    """Exact step of the linear part over `step` seconds, and the weights for what the effects add."""
+    """Exact step of the linear part over `step` seconds, and the weights for what the effects add; of teeth that touch,
+    and beside it of such that do not."""
     A, B = _linear_part(motor, drive)
-    along = _propagator(motor, step, A, B)
+    along = _by_linear_part(motor, step, A, B)
     teeth = motor.toothed
     if teeth is None:
         return along
     assert teeth.twists is not None
     loose = eqx.tree_at(lambda m: m.effects, motor, tuple(e.loose() for e in motor.effects))
     A_apart, _ = _linear_part(loose, drive)
-    apart = _propagator(motor, step, A_apart, B)
+    apart = _by_linear_part(motor, step, A_apart, B)
     push = (A - A_apart)[:, 2 + _linear_states(motor).index(teeth.twists)]
     apart = _with_knocks(apart, knocks(A, push, step))
     return _with_knocks(along, knocks(A_apart, push, step))._replace(apart=apart)
@@ -87,10 +88,12 @@ def _with_knocks(along: Propagator, knocks: Float[Array, "powers n *#batch"]) ->
     return along._replace(weights=along.weights._replace(knocks=knocks))
 
 
-def _propagator(
+def _by_linear_part(
     motor: Motor, step: Float[Array, ""], A: Matrix, B: Float[Array, "n 2 *#batch"]
 ) -> Propagator:
-    """**Source**: ETDRK4, Cox, Matthews, Journal of Computational Physics 176 (2002), equations (26)-(29),
+    """The propagator of a motor whose linear part is A and B.
+
+    **Source**: ETDRK4, Cox, Matthews, Journal of Computational Physics 176 (2002), equations (26)-(29),
     doi:10.1006/jcph.2002.6995.
     """
     if motor.affine:
