@@ -88,17 +88,21 @@ class Seen(NamedTuple):
 
     def is_trace(self, model: Model) -> bool:
         """Whether so little is left that the effects themselves may have left it."""
-        harder = set(model.effects) & set(HARDER.values())
-        return self.unexplained < (TRACE_OF_HARDER if harder else TRACE)
+        return self.unexplained < (TRACE_OF_HARDER if _is_hard(model) else TRACE)
 
     def is_foreign(self, model: Model) -> bool:
         """Whether what is left is clearly one more effect that the model's own cannot have left: in another equation,
         or over another variable. Of when teeth meet there is no telling what it leaves."""
-        if set(model.effects) & set(HARDER.values()):
+        if _is_hard(model):
             return False
         clearest = max(self.of_curves, key=lambda s: s.gain).of
         own = isinstance(clearest, Curve) and _is_own(clearest, model)
         return bool(self.left < ALARM and self.by_one_more > MOST_OF_IT and not own)
+
+
+def _is_hard(model: Model) -> bool:
+    """Whether one of the model's effects is a harder form, of which no fit is exact."""
+    return bool(set(model.effects) & set(HARDER.values()))
 
 
 def _is_own(curve: Curve, model: Model) -> bool:
