@@ -454,6 +454,24 @@ def test_a_faint_effect_beside_a_strong_one_is_named():
     assert low < dry < high < 1.1 * low
 
 
+def test_what_is_one_volt_in_the_given_runs_is_not_told_apart():
+    """A dead zone beside a delay, turning one way, without a current: dry friction and a load would do the same."""
+    plant = Plant(**PAPER, dead_zone_V=1.0, delay_s=0.01)
+    rng, runs = np.random.default_rng(13), []
+    for name in ("first", "second", "third"):
+        excitation = vb.prbs(rng, 2.0, offset=12.0, hold=0.03)
+        columns = record(plant, excitation, rng, NOISE, Bench({}))
+        time, volts, _, speed = (columns[q] for q in QUANTITIES)
+        runs.append(Recording(name, time, volts, speed=speed))
+    found = diagnose(runs[:2], runs[2:], unloaded=True)
+    assert found.verdict == "ambiguous"
+    chosen = {effect.name for effect in found.effects}
+    sets = [chosen, *(set(rival.split(" + ")) for rival in found.effects[0].also_possible)]
+    for same in ("input_dead_zone", "coulomb_friction", "constant_load"):
+        assert {same, "speed_sensor_delay"} in sets
+    assert found.closed_fraction > 0.99
+
+
 def test_a_bearing_that_seizes_is_no_coulomb_friction():
     """Torque noise is slow too, but does not turn with the direction of motion."""
     plant = Plant(**PAPER, seizing_Nm=0.04, seizing_from_s=1.0)

@@ -26,6 +26,8 @@ from .seen import ALARM, FORMULA, HARDER, MOST_OF_IT, Seen, chance_of_nothing
 CLOSE = 1e-4
 # At most so many effects are named, and so many candidates for one are refitted in full simulation
 MOST, SHORTLIST = 3, 3
+# ... and those that gain as much as the last of them but for this share: rounding must not choose
+TIED = 1e-3
 # ... those whose gain to first order is at least this share of the best one's
 COMPARABLE = 0.6
 # After one more effect there may be left no more than this share of what the clearest signal would take away, or the
@@ -74,6 +76,8 @@ class Namer:
         self.seen: dict[Model, Seen] = {}
         self.filters: dict[Model, Whitener] = {}
         self.compared: dict[tuple[Model, int], Fitted] = {}
+        # by effect: those that did as well when it was added
+        self.instead: dict[str, set[str]] = {}
 
     def name(self) -> Naming:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
@@ -89,7 +93,7 @@ class Namer:
                 if better is None or not self._is_settled(current, found, better):
                     break
             current, found = better, self._see(better)
-        return self._naming(current)
+        return self._naming(self._better(current, found, self._tied(current, found)) or current)
 
     def _better(self, current: Model, found: Seen, tried: Sequence[Model | None]) -> Model | None:
         """The best of some models in place of the current one, if it is better, without what it can do without."""
@@ -152,6 +156,16 @@ class Namer:
         richer = [s for s in self._richer(model, found) if CONTAINS[_effect(s)] & added]
         return self._with(model, found, richer) + self._in_harder_form(model, found, added)
 
+    def _tied(self, current: Model, found: Seen) -> list[Model | None]:
+        """The model with others in the place of its effects that did as well as these when they were added."""
+        if len(current.effects) < 2:
+            return []
+        return [
+            self.refits.in_place(current, found.screen.white, effect, other)
+            for effect in current.effects
+            for other in sorted(self.instead.get(effect, set()) - set(current.effects))
+        ]
+
     def _with(self, current: Model, found: Seen, signals: Sequence[Signal]) -> list[Model | None]:
         return [self.refits.with_signal(current, s, found.screen) for s in signals]
 
@@ -198,7 +212,19 @@ class Namer:
     def _best(self, tried: Sequence[Model], white: Whitener) -> Model:
         """The best of some refits, by the filter of what the one that leaves least leaves."""
         least = self.compare(tried, white)[0].model
-        return _plainest(self.compare(tried, self._white(least)))
+        ranked = self.compare(tried, self._white(least))
+        best = _plainest(ranked)
+        self._note_ties(best, ranked)
+        return best
+
+    def _note_ties(self, best: Model, ranked: Sequence[Fitted]) -> None:
+        """Keep in mind which effects do as well as one of the best model's."""
+        mine = set(best.effects)
+        least = next(f.criterion for f in ranked if f.model is best)
+        for other in (f for f in ranked if f.criterion < least + MARGIN):
+            its = set(other.model.effects)
+            if len(mine - its) == len(its - mine) == 1 and are_rivals(mine, its):
+                self.instead.setdefault(*(mine - its), set()).update(its - mine)
 
     def _shortlist(self, current: Model, found: Seen) -> list[Signal]:
         """The most significant shape of each of the few effects that explain most.
@@ -217,7 +243,9 @@ class Namer:
         ranked.sort(key=lambda s: -s.gain)
         # where little is left one has to settle nearly all of it, so those that promise less do no harm
         share = 0.0 if found.unexplained < FORMULA else COMPARABLE
-        return [s for s in ranked if s.gain > share * ranked[0].gain][:SHORTLIST]
+        ranked = [s for s in ranked if s.gain > share * ranked[0].gain]
+        least = ranked[:SHORTLIST][-1].gain if ranked else 0.0
+        return [s for s in ranked if s.gain >= (1 - TIED) * least]
 
     def _clear(self, found: Seen) -> list[Signal]:
         """The most significant shape of every effect that chance would not bring about."""
