@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import reduce
 from typing import NamedTuple
 
@@ -102,6 +103,10 @@ class Motor(eqx.Module):
     def toothed(self) -> AbstractEffect | None:
         """The effect that has teeth."""
         return next((effect for effect in self.effects if effect.twists), None)
+
+    def with_effects(self, effects: Iterable[AbstractEffect]) -> Motor:
+        """The same motor with other effects than its own."""
+        return eqx.tree_at(lambda motor: motor.effects, self, tuple(effects))
 
     def rest(
         self,

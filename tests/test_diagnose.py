@@ -454,6 +454,15 @@ def test_a_faint_effect_beside_a_strong_one_is_named():
     assert low < dry < high < 1.1 * low
 
 
+def test_drag_beside_dry_friction_is_no_stribeck_friction():
+    """The slope of a Stribeck curve and more viscous friction bend together as drag does."""
+    plant = Plant(**PAPER, friction_forward_Nm=0.12, friction_backward_Nm=0.12, drag=2.7e-6)
+    held_out, *training = recorded_from(plant, 14, SHAKEN)
+    found = diagnose(training, [held_out])
+    assert found.verdict == "named"
+    assert {effect.name for effect in found.effects} == {"coulomb_friction", "quadratic_drag"}
+
+
 def test_what_is_one_volt_in_the_given_runs_is_not_told_apart():
     """A dead zone beside a delay, turning one way, without a current: dry friction and a load would do the same."""
     plant = Plant(**PAPER, dead_zone_V=1.0, delay_s=0.01)

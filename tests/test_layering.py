@@ -15,6 +15,7 @@ PACKAGE = Path(__file__).parents[1] / "pmdc_jax"
 # what a part may import at run time, beside what lies in itself; parts not named may import anything
 BELOW = {
     "errors": set(),
+    "compiled": set(),
     "precision": set(),
     "threads": set(),
     "units": {"errors"},
@@ -37,6 +38,7 @@ BELOW = {
     },
     "identify": {
         "check",
+        "compiled",
         "effects",
         "errors",
         "motor",

@@ -27,8 +27,9 @@ class Model(NamedTuple):
     @classmethod
     def of(cls, motor: Motor, sample_time: Number) -> Model:
         """The exact discretisation of the motor, whose effects the law does not know."""
-        linear = eqx.tree_at(lambda m: m.effects, motor, ())
-        whole, inputs, *_ = propagator(linear, jnp.asarray(sample_time, float), Drive())
+        whole, inputs, *_ = propagator(
+            motor.with_effects(()), jnp.asarray(sample_time, float), Drive()
+        )
         return cls(whole[0, 0], whole[0, 1], inputs[0, 0], whole[1, 0], whole[1, 1], inputs[1, 0])
 
     def next(self, current: Number, speed: Number, voltage: Number) -> tuple[Number, Number]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -106,7 +106,7 @@ class Library:
         if key not in self._whole:
             values = {field: jnp.asarray(x) for field, x in candidate.columns[0].items()}
             local = self._base.polished.refined.unknowns.local
-            motor = _with(self.bare, EFFECTS[candidate.effect], values)
+            motor = self.bare.with_effects([EFFECTS[candidate.effect](**values)])
             seen = free_run(motor, tape, local[:, :2], local[:, 2])
             change = np.asarray(seen) - np.asarray(self._base.polished.evaluation.seen)
             self._whole[key] = change.transpose(2, 1, 0)
@@ -124,7 +124,7 @@ def _small(
     """Kicks, and what is seen on top of them, by small settings of one effect; settings last."""
 
     def change(values):
-        motor = _with(bare, effect, values)
+        motor = bare.with_effects([effect(**values)])
         if effect.equation == "sensor":
             seen = sensed(motor, tape, path)
             return jnp.zeros_like(seen), seen
@@ -132,10 +132,6 @@ def _small(
         return kicked, jnp.zeros_like(kicked)
 
     return jax.vmap(change, out_axes=-1)(settings)
-
-
-def _with(bare: Motor, effect: type[AbstractEffect], values: dict[str, Any]) -> Motor:
-    return eqx.tree_at(lambda m: m.effects, bare, (effect(**values),))
 
 
 def curves_over(library: Library, tape: Tape, path: Path) -> tuple[list[Curve], Iterator[Change]]:

@@ -30,9 +30,9 @@ MOST, SHORTLIST = 3, 3
 TIED = 1e-3
 # ... those whose gain to first order is at least this share of the best one's
 COMPARABLE = 0.6
-# After one more effect there may be left no more than this share of what the clearest signal would take away, or the
-# larger one after a richer form of what was there
-NEXT_TO_NOTHING, LITTLE = 0.1, 0.3
+# What the clearest signal would take away after one more effect, over what that effect takes away, at most; the larger
+# one after a richer form of what was there
+NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
 # A model that leaves so many times the squares of another one is no match for it, whatever a filter makes of either
 FAR = 3.0
 # A fuller form of an effect is ruled out if it leaves so many squares more: two standard errors
@@ -108,11 +108,18 @@ class Namer:
         return self._spared(best)
 
     def _is_settled(self, current: Model, found: Seen, better: Model) -> bool:
-        """Whether a better model explains enough of what the current one leaves to be named."""
+        """Whether a better model is more than a way to mend the formula of what the current one has.
+
+        What was left is clearly something else; or little is, beside what the better one takes away.
+        """
         if (set(better.effects) - set(current.effects)) & set(HARDER.values()):
             return True
-        grown = len(better.effects) > len(current.effects)
-        return found.is_settled(self._see(better), NEXT_TO_NOTHING if grown else LITTLE)
+        again = self._see(better)
+        if found.is_clear(current) or again.left >= ALARM:
+            return True
+        white, grown = self._white(better), len(better.effects) > len(current.effects)
+        gained = self._left(current, white).squares - self._left(better, white).squares
+        return bool(again.clearest.gain < (NEXT_TO_NOTHING if grown else LITTLE) * gained)
 
     def without(self, named: Naming, effect: str) -> Naming:
         """The set without one of its effects."""
@@ -268,7 +275,8 @@ class Namer:
         ][:1]
 
     def _spared(self, model: Model) -> Model:
-        """The model without effects that it can do without, or with simpler forms of them that leave nothing more."""
+        """The model without effects that it can do without, or with simpler forms of them, alone or beside another one,
+        that leave nothing more."""
         white = self._white(model)
         for effect in model.effects[:-1]:
             smaller = self.refits.without(model, effect, white)
@@ -279,7 +287,36 @@ class Namer:
                 simpler = self.refits.in_place(model, white, effect, simple)
                 if simpler and self._does_as_well(simpler, model):
                     return self._spared(simpler)
+                two = simpler and self._beside(simpler, model, effect)
+                if two and self._is_far_better(two, model, white):
+                    return self._spared(two)
         return model
+
+    def _beside(self, simpler: Model, model: Model, rich: str) -> Model | None:
+        """A model with a simpler form of a rich effect, and one more beside it that promises as much as the rich form.
+
+        Stribeck friction bends as drag does, if viscous friction makes up for the rest.
+        """
+        if len(simpler.effects) == MOST:
+            return None
+        found = self._see(simpler)
+        promised = {_effect(s): s for s in self._clear(found)}
+        enough = COMPARABLE * promised[rich].gain if rich in promised else 0.0
+        here = set(simpler.effects)
+        others = [
+            s
+            for effect, s in promised.items()
+            if effect not in {*model.effects, *CONTAINS}
+            and spelt_out({*here, effect}) != spelt_out(set(model.effects))
+            and s.gain > enough
+        ]
+        best = max(others, key=lambda s: s.gain, default=None)
+        two = best and self.refits.with_signal(simpler, best, found.screen)
+        return two if two and two.is_possible else None
+
+    def _is_far_better(self, two: Model, model: Model, white: Whitener) -> bool:
+        criterion = {f.model: f.criterion for f in self.compare([two, model], white)}
+        return bool(criterion[two] + MARGIN < criterion[model])
 
     def _does_as_well(self, simpler: Model, model: Model) -> bool:
         """Whether a simpler form of an effect, chosen while another one was still missing, does as well by now: but for

@@ -10,6 +10,7 @@ import attrs
 import numpy as np
 from scipy import stats
 
+from ..compiled import make_room
 from ..effects import EFFECTS
 from ..identify.identification import Identification, Role
 from ..identify.judge import judge
@@ -64,6 +65,7 @@ def diagnose(
     """
     began = time.perf_counter()
     report = progress or (lambda *args, **kwargs: None)
+    make_room()
     report("checking the recordings")
     given = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
     given, solved = solve(given, search, seed, progress)

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..effects import EFFECTS
-from .candidates import FULLER, Candidate
+from ..effects.base import AbstractEffect
+from .candidates import FULLER
 from .kinship import CONTAINS
 from .library import Curve
 from .model import Model
@@ -50,7 +51,7 @@ class Seen(NamedTuple):
     @property
     def clearest(self) -> Signal:
         """The signal with the largest gain."""
-        return max((*self.of_candidates, *self.of_curves), key=lambda s: s.gain)
+        return max((*self.of_candidates, *self.of_curves), key=_gain)
 
     @property
     def unexplained(self) -> float:
@@ -71,20 +72,22 @@ class Seen(NamedTuple):
         """Whether what is left is clearly one more effect, and no formula."""
         return bool(self.unexplained > FORMULA and self.by_one_more > MOST_OF_IT)
 
-    def is_settled(self, again: Seen, share: float) -> bool:
-        """Whether one more effect, after which the evidence is `again`, is more than a way to mend the formula of those
-        that were there: then no more than a share is left."""
-        clear = self.unexplained > FORMULA or again.left >= ALARM
-        return bool(clear or again.clearest.gain < share * self.clearest.gain)
+    def is_clear(self, model: Model) -> bool:
+        """Whether what a model leaves is too much for a formula, and not of the very kind of an effect that it has."""
+        return bool(self.unexplained > FORMULA and not self._is_more_of(model))
 
     def is_formula(self, model: Model) -> bool:
         """Whether what is left may well be that of the model's effects by formulas of nature's own."""
         if not model.effects or self.unexplained < FORMULA:
             return bool(model.effects)
         clearest = self.clearest.of
-        if isinstance(clearest, Candidate):
-            return clearest.effect in model.effects
-        return self.unexplained < OWN_FORMULA and _is_own(clearest, model)
+        own = isinstance(clearest, Curve) and _is_own(clearest, model)
+        return self._is_more_of(model) or bool(own and self.unexplained < OWN_FORMULA)
+
+    def _is_more_of(self, model: Model) -> bool:
+        """Whether the clearest signal is that of an effect which the model has."""
+        clearest = self.clearest.candidate
+        return clearest is not None and clearest.effect in model.effects
 
     def is_trace(self, model: Model) -> bool:
         """Whether so little is left that the effects themselves may have left it."""
@@ -93,11 +96,16 @@ class Seen(NamedTuple):
     def is_foreign(self, model: Model) -> bool:
         """Whether what is left is clearly one more effect that the model's own cannot have left: in another equation,
         or over another variable. Of when teeth meet there is no telling what it leaves."""
-        if _is_hard(model):
+        if _is_hard(model) or self.left >= ALARM or self.by_one_more < MOST_OF_IT:
             return False
-        clearest = max(self.of_curves, key=lambda s: s.gain).of
-        own = isinstance(clearest, Curve) and _is_own(clearest, model)
-        return bool(self.left < ALARM and self.by_one_more > MOST_OF_IT and not own)
+        curve = max(self.of_curves, key=_gain).of
+        effect = max(self.of_candidates, key=_gain).candidate
+        assert isinstance(curve, Curve) and effect is not None
+        return not (_is_own(curve, model) or _is_own(EFFECTS[effect.effect], model))
+
+
+def _gain(signal: Signal) -> float:
+    return signal.gain
 
 
 def _is_hard(model: Model) -> bool:
@@ -105,8 +113,11 @@ def _is_hard(model: Model) -> bool:
     return bool(set(model.effects) & set(HARDER.values()))
 
 
-def _is_own(curve: Curve, model: Model) -> bool:
-    """Whether a curve is one over a variable that one of the model's effects is a curve over, in its equation."""
-    kinds = [EFFECTS[name] for name in model.effects]
-    own = {("electrical" if k.equation == "input" else k.equation, k.variable) for k in kinds}
-    return (curve.equation, curve.variable) in own
+def _is_own(one: Curve | type[AbstractEffect], model: Model) -> bool:
+    """Whether a curve or an effect is one over a variable that one of the model's effects is a curve over, in its
+    equation."""
+    return one.variable is not None and _axes(one) in {_axes(EFFECTS[e]) for e in model.effects}
+
+
+def _axes(one: Curve | type[AbstractEffect]) -> tuple[str, str | None]:
+    return ("electrical" if one.equation == "input" else one.equation, one.variable)

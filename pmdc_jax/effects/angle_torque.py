@@ -47,6 +47,7 @@ class CoggingTorque(_Angular):
     label: ClassVar = "Cogging torque"
     formula: ClassVar = "T = a sin(n angle + phase)"
     equation: ClassVar = "mechanical"
+    variable: ClassVar = "angle"
     ranges: ClassVar = {
         "amplitude_Nm": ParameterRange("N m", 1e-10, 1e4),
         "phase_rad": PHASE,
@@ -82,6 +83,7 @@ class TorqueRipple(_Angular):
         "T_m = Kt i (1 + a sin(n angle + phase)), e = Kb w (1 + e_s a sin(n angle + phase))"
     )
     equation: ClassVar = "mechanical"
+    variable: ClassVar = "angle"
     ranges: ClassVar = {
         "amplitude": ParameterRange("", 1e-5, 1.0),
         "phase_rad": PHASE,

@@ -86,7 +86,7 @@ class AbstractEffect(eqx.Module):
     ranges: ClassVar[dict[str, ParameterRange]]
     states: ClassVar[tuple[str, ...]] = ()
     # the variable that its term is a curve over, where it is one
-    variable: ClassVar[Literal["speed", "current", "voltage"] | None] = None
+    variable: ClassVar[Literal["speed", "current", "voltage", "angle"] | None] = None
     # its size is in amperes, and says something only where the current was measured
     needs_current: ClassVar[bool] = False
     # which state a dry element holds at zero

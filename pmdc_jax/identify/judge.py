@@ -107,9 +107,9 @@ def _lifted(problem: Problem, polished: Polished, k: int) -> Polished | None:
     unknowns = polished.refined.unknowns._replace(coordinates=jnp.asarray(coordinates))
     held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
     lifted = polish(held, polished.refined._replace(unknowns=unknowns))
-    if lifted.refined.fitness > polished.refined.fitness * (1 + SAME):
-        return None
-    return polish(problem, lifted.refined._replace(at_bound=()), steps=0)
+    # no fit at all, if it ended where nothing can be simulated
+    as_good = lifted.refined.fitness <= polished.refined.fitness * (1 + SAME)
+    return polish(problem, lifted.refined._replace(at_bound=()), steps=0) if as_good else None
 
 
 def _tidy(problem: Problem, polished: Polished, info: Information) -> Polished:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import attrs
 
+from ..compiled import make_room
 from ..precision import double_precision
 from ..recording import Recording
 from .colour import whitener
@@ -49,6 +50,7 @@ def identify(
     """
     began = time.perf_counter()
     report = progress or (lambda *args, **kwargs: None)
+    make_room()
     report("checking the recordings")
     given = prepare(
         recordings, holdout, tie=tie, known=known, unloaded=unloaded, effects=effects_named(effects)

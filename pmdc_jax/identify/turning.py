@@ -24,8 +24,7 @@ def of_rotor(problem: Problem, fit: Polished) -> Float[Array, "blocks 2 samples"
         return fit.evaluation.seen
     unknowns = fit.refined.unknowns
     motor, local = problem.parameters(unknowns.coordinates), jnp.asarray(unknowns.local)
-    kept = tuple(effect for effect in motor.effects if effect.equation != "sensor")
-    bare = eqx.tree_at(lambda m: m.effects, motor, kept)
+    bare = motor.with_effects(effect for effect in motor.effects if effect.equation != "sensor")
     return free_run(bare, problem.tape, local[:, :2], local[:, 2], local[:, 3])
 
 

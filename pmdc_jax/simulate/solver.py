@@ -8,7 +8,6 @@ from operator import add
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -75,7 +74,7 @@ def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator
     if teeth is None:
         return along
     assert teeth.twists is not None
-    loose = eqx.tree_at(lambda m: m.effects, motor, tuple(e.loose() for e in motor.effects))
+    loose = motor.with_effects(e.loose() for e in motor.effects)
     A_apart, _ = _linear_part(loose, drive)
     apart = _by_linear_part(motor, step, A_apart, B)
     push = (A - A_apart)[:, 2 + _linear_states(motor).index(teeth.twists)]
@@ -122,7 +121,7 @@ def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 
     linear = tuple(e for effect in motor.effects if (e := effect.linear()) is not None)
     if not linear:
         return A, B
-    core = eqx.tree_at(lambda m: m.effects, motor, linear)
+    core = motor.with_effects(linear)
     zero, one = jnp.zeros_like(motor.R), jnp.ones_like(motor.R)
     count = 2 + len(core.states)
     columns = []
@@ -196,8 +195,7 @@ def _step(
         along = jax.tree.map(
             lambda a, b: jnp.where(touching, a, b), along._replace(apart=None), along.apart
         )
-        begun = tuple(e.while_begun(state) for e in motor.effects)
-        motor = eqx.tree_at(lambda m: m.effects, motor, begun)
+        motor = motor.with_effects(e.while_begun(state) for e in motor.effects)
     weights = along.weights
     assert weights is not None
     rate, after = _unswitched(motor, along.whole, weights, drive, state, value, load)
