@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
 from .exponential import Matrix, phi_functions, product
-from .switches import crossed, knocked, knocks, once
+from .switches import crossed, knocked, knocks_of, once
 
 if TYPE_CHECKING:
     from .tape import Tape
@@ -78,8 +78,8 @@ def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator
     A_apart, _ = _linear_part(loose, drive)
     apart = _by_linear_part(motor, step, A_apart, B)
     push = (A - A_apart)[:, 2 + _linear_states(motor).index(teeth.twists)]
-    apart = _with_knocks(apart, knocks(A, push, step))
-    return _with_knocks(along, knocks(A_apart, push, step))._replace(apart=apart)
+    apart = _with_knocks(apart, knocks_of(A, push, step))
+    return _with_knocks(along, knocks_of(A_apart, push, step))._replace(apart=apart)
 
 
 def _with_knocks(along: Propagator, knocks: Float[Array, "powers n *#batch"]) -> Propagator:

@@ -31,7 +31,7 @@ def once(values: T, always: Bool[Array, ""]) -> T:
     return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
 
 
-def knocks(
+def knocks_of(
     A: Matrix, push: Float[Array, "n *#batch"], step: Float[Array, ""]
 ) -> Float[Array, "powers n *#batch"]:
     """What a constant push does that lasts for a share of the step until its end, over that share: the coefficients
