@@ -154,9 +154,22 @@ class Namer:
         tried = []
         if found.asks_for_more():
             tried += self._with(current, found, self._shortlist(current, found))
+        elif found.left < ALARM and not here:
+            tried += self._sought(current, found)
         if not found.is_another():
             tried += self._in_harder_form(current, found, here)
         return tried
+
+    def _sought(self, current: Model, found: Seen) -> list[Model | None]:
+        """Those effects of which no response to first order explains much, but that leave far less once the whole motor
+        is searched for anew: one whose rotor sticks for long is far from one that is thought to creep.
+        """
+        far = current.polished.refined.fitness / FAR
+        if far < current.given.problem.outputs:  # not even a perfect one would
+            return []
+        best = sorted(self._clear(found), key=lambda s: -s.gain)[:SHORTLIST]
+        tried = [self.refits.sought(current, _effect(s)) for s in best]
+        return [model for model in tried if model.polished.refined.fitness < far]
 
     def _in_other_form(self, model: Model, found: Seen, added: set[str]) -> list[Model | None]:
         """The model with what was added to it in a richer or a harder form."""

@@ -14,7 +14,7 @@ from ..identify.colour import Whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Refined, Unknowns, polish
 from ..identify.sharpen import sharpened, squares_of
-from ..identify.solve import POOR
+from ..identify.solve import POOR, solve
 from ..identify.uncertainty import FLAT
 from ..threads import CORES, side_by_side
 from .candidates import FULLER, STARTS, Values
@@ -29,6 +29,8 @@ KEPT = 0.5
 ROUGHLY = 8
 # ... and of which two have ended alike if their misfits differ by no more
 AGREED = 1.05
+# What searches for a motor that is far from the one fitted
+METHOD = "cma_es"
 # How finely a phase is looked for that all runs have in common
 PHASES = 120
 
@@ -80,6 +82,19 @@ class Refits:
             return self._best_of(effects, starts, white)
 
         return self._once(effects, current, refit)
+
+    def sought(self, current: Model, effect: str) -> Model:
+        """The current model with one more effect, searched for without regard to how it was fitted."""
+        effects = (*current.effects, effect)
+
+        def search() -> Model:
+            given = current.given.with_effects([EFFECTS[e] for e in effects])
+            given, solved = solve(given, METHOD, seed=0)
+            return model_of(effects, given, solved.polished)
+
+        model = self._once(effects, current, search)
+        assert model is not None
+        return model
 
     def clearly_in_full(self, current: Model, white: Whitener, effect: str) -> Model:
         """The current model with a fuller form of an effect, where what makes it fuller stays clearly there."""
