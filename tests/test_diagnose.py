@@ -481,6 +481,32 @@ def test_what_is_one_volt_in_the_given_runs_is_not_told_apart():
     assert found.closed_fraction > 0.99
 
 
+def test_a_rotor_that_sticks_for_long_is_found_by_searching_anew():
+    """One short staircase under load: the best motor without friction is so far off that no response to first order
+    shows what is missing."""
+    motor = {"R": 0.956, "L": 2.84e-4, "Kb": 0.01145, "Kt": 0.01153, "J": 8.18e-6, "f": 3.93e-6}
+    dry, peak, speed = 3.08e-3, 7.38e-3, 15.7
+    plant = Plant(
+        **motor,
+        friction_forward_Nm=dry,
+        friction_backward_Nm=dry,
+        friction_excess_Nm=peak - dry,
+        stribeck_speed_rad_s=speed,
+    )
+    rng, excitation = np.random.default_rng(15), vb.staircase(2.4, dt=5e-4, amplitude=4.8)
+    load = np.repeat(rng.uniform(-0.018, 0.018, 10), len(excitation.time) // 10)
+    noise = vb.Noise(current_A=0.019, speed_rad_s=1.05)
+    columns = record(plant, excitation._replace(load=load), rng, noise, Bench({}))
+    found = diagnose(
+        [Recording("staircase", *(columns[q] for q in QUANTITIES), load=columns[LOAD])]
+    )
+    assert found.verdict == "named"
+    (effect,) = found.effects
+    assert effect.name == "stribeck_friction"
+    for field, truth in {"coulomb_Nm": dry, "static_Nm": peak, "speed_rad_s": speed}.items():
+        assert effect.parameters[field].value == pytest.approx(truth, rel=0.02)
+
+
 def test_a_bearing_that_seizes_is_no_coulomb_friction():
     """Torque noise is slow too, but does not turn with the direction of motion."""
     plant = Plant(**PAPER, seizing_Nm=0.04, seizing_from_s=1.0)

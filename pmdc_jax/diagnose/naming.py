@@ -154,21 +154,22 @@ class Namer:
         tried = []
         if found.asks_for_more():
             tried += self._with(current, found, self._shortlist(current, found))
-        elif found.left < ALARM and not here:
+        if found.left < ALARM and not here and not tried:
             tried += self._sought(current, found)
         if not found.is_another():
             tried += self._in_harder_form(current, found, here)
         return tried
 
     def _sought(self, current: Model, found: Seen) -> list[Model | None]:
-        """Those effects of which no response to first order explains much, but that leave far less once the whole motor
-        is searched for anew: one whose rotor sticks for long is far from one that is thought to creep.
+        """Those effects of which no response to first order is clear, but that leave far less once the whole motor is
+        searched for anew: one whose rotor sticks for long is far from one that is thought to creep.
         """
         far = current.polished.refined.fitness / FAR
         if far < current.given.problem.outputs:  # not even a perfect one would
             return []
-        best = sorted(self._clear(found), key=lambda s: -s.gain)[:SHORTLIST]
-        tried = [self.refits.sought(current, _effect(s)) for s in best]
+        by_gain = sorted(found.of_candidates, key=lambda s: -s.gain)
+        best = list(dict.fromkeys(_effect(s) for s in by_gain))[:SHORTLIST]
+        tried = [self.refits.sought(current, effect) for effect in best]
         return [model for model in tried if model.polished.refined.fitness < far]
 
     def _in_other_form(self, model: Model, found: Seen, added: set[str]) -> list[Model | None]:
