@@ -89,7 +89,7 @@ class Refits:
 
         def search() -> Model:
             given = current.given.with_effects([EFFECTS[e] for e in effects])
-            given, solved = solve(given, METHOD, seed=0)
+            given, solved = solve(given, METHOD, seed=0, searches=1)
             return model_of(effects, given, solved.polished)
 
         model = self._once(effects, current, search)

@@ -46,9 +46,13 @@ class Solved(NamedTuple):
 
 
 def solve(
-    given: Prepared, search: str, seed: int, progress: ReportProgress | None = None
+    given: Prepared,
+    search: str,
+    seed: int,
+    progress: ReportProgress | None = None,
+    searches: int = SEARCHES,
 ) -> tuple[Prepared, Solved]:
-    """Search the bounds, refine the best candidates; again, from another seed, while the fit is poor.
+    """Search the bounds, refine the best candidates; again, from another seed, while the fit is poor, so many times.
 
     **Returns**: the problem, its rotor turned as the fit says where a torque depends on the angle, and the fit.
     """
@@ -68,7 +72,7 @@ def solve(
     report("refining the best candidates", float(found.best[-1]))
     compiled.result()
     ends = _refine_all(problem, found)
-    for attempt in range(1, SEARCHES):
+    for attempt in range(1, searches):
         if found.interrupted or _agreed(ends, problem.outputs):
             break
         before, found = found, look(seed + attempt)
