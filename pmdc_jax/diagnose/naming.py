@@ -9,45 +9,33 @@ import numpy as np
 from scipy import stats
 
 from ..effects import EFFECTS
-from ..identify.colour import Whitener, whitener
+from ..identify.colour import Whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Polished
-from ..identify.sharpen import residuals_of, sharpened, squares_of
-from .candidates import FULLER, STARTS
-from .kinship import CONTAINS, are_rivals, is_within, spelt_out
+from .candidates import FULLER
+from .compare import FAR, MARGIN, Comparison, Fitted, plainest
+from .kinship import CONTAINS, are_rivals, spelt_out
 from .library import Library
 from .model import Model, ended
 from .periodic import Line, line_of
 from .refits import Refits
 from .screen import Screen, Signal, beyond_curves, screen, signals
-from .seen import ALARM, FORMULA, HARDER, MOST_OF_IT, Seen, chance_of_nothing
+from .seen import ALARM, HARDER, Seen, chance_of_nothing
+from .shortlist import COMPARABLE, SHORTLIST, clear, effect_of, richer, shortlist
 
 # What is missed by a smaller share of what is measured is nothing: one simulation meets another no closer
 CLOSE = 1e-4
-# At most so many effects are named, and so many candidates for one are refitted in full simulation
-MOST, SHORTLIST = 3, 3
-# ... and those that gain as much as the last of them but for this share: rounding must not choose
-TIED = 1e-3
-# ... those whose gain to first order is at least this share of the best one's
-COMPARABLE = 0.6
+# At most so many effects are named
+MOST = 3
 # What the clearest signal would take away after one more effect, over what that effect takes away, at most; the larger
 # one after a richer form of what was there
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
-# A model that leaves so many times the squares of another one is no match for it, whatever a filter makes of either
-FAR = 3.0
 # A fuller form of an effect is ruled out if it leaves so many squares more: two standard errors
 RULED_OUT = 4.0
-# Rivals whose criterion is nearer than this, and this share of what neither explains, are not told apart
-MARGIN, OF_UNEXPLAINED = 8.0, 0.1
-
-
-class Fitted(NamedTuple):
-    """A model among others fitted to the same runs, and how well it does by a common filter of the noise."""
-
-    model: Model
-    squares: float
-    criterion: float  # squares and the price of every parameter; less is better
-    white: Whitener
+# The simplest effect by which a rotor sticks
+DRY = "coulomb_friction"
+# Rivals whose criterion is nearer than the margin, and this share of what neither explains, are not told apart
+OF_UNEXPLAINED = 0.1
 
 
 class Naming(NamedTuple):
@@ -74,8 +62,7 @@ class Namer:
         self.base, self.library = base, Library(base)
         self.refits = Refits(base, self.library, report)
         self.seen: dict[Model, Seen] = {}
-        self.filters: dict[Model, Whitener] = {}
-        self.compared: dict[tuple[Model, int], Fitted] = {}
+        self.comparison = Comparison()
         # by effect: those that did as well when it was added
         self.instead: dict[str, set[str]] = {}
 
@@ -103,7 +90,7 @@ class Namer:
         best = self._best(possible, found.screen.white)
         # judged by the noise that the clearest signal leaves: a filter of what a poorer model leaves takes
         # for noise what is missing
-        if _plainest(self.compare([current, best], found.screen.white)) is current:
+        if plainest(self.comparison.ranked([current, best], found.screen.white)) is current:
             return None
         return self._spared(best)
 
@@ -117,13 +104,16 @@ class Namer:
         again = self._see(better)
         if found.is_clear(current) or again.left >= ALARM:
             return True
-        white, grown = self._white(better), len(better.effects) > len(current.effects)
-        gained = self._left(current, white).squares - self._left(better, white).squares
+        white, grown = self.comparison.white(better), len(better.effects) > len(current.effects)
+        gained = (
+            self.comparison.left(current, white).squares
+            - self.comparison.left(better, white).squares
+        )
         return bool(again.clearest.gain < (NEXT_TO_NOTHING if grown else LITTLE) * gained)
 
     def without(self, named: Naming, effect: str) -> Naming:
         """The set without one of its effects."""
-        white = self._white(named.chosen)
+        white = self.comparison.white(named.chosen)
         return self._naming(self.refits.without(named.chosen, effect, white))
 
     def _naming(self, current: Model) -> Naming:
@@ -138,7 +128,7 @@ class Namer:
             explained=found.is_formula(current),
             noise=np.sqrt(beyond_curves(found.screen)) if found.left < ALARM else 1.0,
             without=self._without(current, found.screen.white),
-            ended=ended(current, self._white(current)),
+            ended=ended(current, self.comparison.white(current)),
             line=line_of(current),
         )
 
@@ -149,11 +139,11 @@ class Namer:
             return []
         if found.is_trace(current):
             foreign = found.is_foreign(current)
-            one_more = self._shortlist if foreign else self._richer
+            one_more = shortlist if foreign else richer
             return self._with(current, found, one_more(current, found))
         tried = []
         if found.asks_for_more():
-            tried += self._with(current, found, self._shortlist(current, found))
+            tried += self._with(current, found, shortlist(current, found))
         if found.left < ALARM and not here and not tried:
             tried += self._sought(current, found)
         if not found.is_another():
@@ -161,21 +151,21 @@ class Namer:
         return tried
 
     def _sought(self, current: Model, found: Seen) -> list[Model | None]:
-        """Those effects of which no response to first order is clear, but that leave far less once the whole motor is
-        searched for anew: one whose rotor sticks for long is far from one that is thought to creep.
-        """
+        """The motor with dry friction, searched for anew, if that may explain a misfit of which no first-order response
+        is clear, and leaves far less: a motor whose rotor sticks for long is far from one that is thought to creep."""
         far = current.polished.refined.fitness / FAR
-        if far < current.given.problem.outputs:  # not even a perfect one would
-            return []
         by_gain = sorted(found.of_candidates, key=lambda s: -s.gain)
-        best = list(dict.fromkeys(_effect(s) for s in by_gain))[:SHORTLIST]
-        tried = [self.refits.sought(current, effect) for effect in best]
-        return [model for model in tried if model.polished.refined.fitness < far]
+        best = list(dict.fromkeys(effect_of(s) for s in by_gain))[:SHORTLIST]
+        sticks = any(EFFECTS[effect].holds == "speed" for effect in best)
+        if not sticks or far < current.given.problem.outputs:  # not even a perfect fit would
+            return []
+        model = self.refits.sought(current, DRY)
+        return [model] if model.polished.refined.fitness < far else []
 
     def _in_other_form(self, model: Model, found: Seen, added: set[str]) -> list[Model | None]:
         """The model with what was added to it in a richer or a harder form."""
-        richer = [s for s in self._richer(model, found) if CONTAINS[_effect(s)] & added]
-        return self._with(model, found, richer) + self._in_harder_form(model, found, added)
+        fuller = [s for s in richer(model, found) if CONTAINS[effect_of(s)] & added]
+        return self._with(model, found, fuller) + self._in_harder_form(model, found, added)
 
     def _tied(self, current: Model, found: Seen) -> list[Model | None]:
         """The model with others in the place of its effects that did as well as these when they were added."""
@@ -199,7 +189,7 @@ class Namer:
     def _rivals(self, chosen: Model, found: Seen) -> list[Model]:
         """Other sets that explain the runs as well, the best first."""
         models = [m for m in self.refits.models.values() if m.is_possible or m is chosen]
-        ranked = self.compare(models, found.screen.white)
+        ranked = self.comparison.ranked(models, found.screen.white)
         least = next(f.criterion for f in ranked if f.model.effects == chosen.effects)
         margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.left < ALARM else 0.0)
         near = [f.model for f in ranked if f.criterion < least + margin]
@@ -210,8 +200,12 @@ class Namer:
         """The set with an effect in a fuller form, clearly so, where the runs show too little of it to tell."""
         simple = [effect for effect in chosen.effects if effect in FULLER]
         fuller = [self.refits.clearly_in_full(chosen, white, effect) for effect in simple]
-        least = self._left(chosen, white).squares
-        return [model for model in fuller if self._left(model, white).squares < least + RULED_OUT]
+        least = self.comparison.left(chosen, white).squares
+        return [
+            model
+            for model in fuller
+            if self.comparison.left(model, white).squares < least + RULED_OUT
+        ]
 
     def _see(self, model: Model) -> Seen:
         if model not in self.seen:
@@ -226,15 +220,15 @@ class Namer:
         left = 1.0 if model.misses < CLOSE else chance_of_nothing(of_candidates, of_curves, count)
         explained = 0.0
         if model.effects:
-            base, mine = (self._left(m, found.white) for m in (self.base, model))
+            base, mine = (self.comparison.left(m, found.white) for m in (self.base, model))
             explained = base.squares - mine.squares
         return Seen(found, of_candidates, of_curves, left, explained)
 
     def _best(self, tried: Sequence[Model], white: Whitener) -> Model:
         """The best of some refits, by the filter of what the one that leaves least leaves."""
-        least = self.compare(tried, white)[0].model
-        ranked = self.compare(tried, self._white(least))
-        best = _plainest(ranked)
+        least = self.comparison.ranked(tried, white)[0].model
+        ranked = self.comparison.ranked(tried, self.comparison.white(least))
+        best = plainest(ranked)
         self._note_ties(best, ranked)
         return best
 
@@ -247,54 +241,16 @@ class Namer:
             if len(mine - its) == len(its - mine) == 1 and are_rivals(mine, its):
                 self.instead.setdefault(*(mine - its), set()).update(its - mine)
 
-    def _shortlist(self, current: Model, found: Seen) -> list[Signal]:
-        """The most significant shape of each of the few effects that explain most.
-
-        If that is an effect which is there already and little is left, its own formula is what is left to be desired,
-        or else an effect that does more than its columns show. One that contains an effect which is there, and explains
-        most of what is left, needs no other beside it.
-        """
-        clear = self._clear(found)
-        ranked = [s for s in clear if _effect(s) not in current.effects]
-        if clear and _effect(clear[0]) in current.effects and found.unexplained < FORMULA:
-            ranked = [s for s in ranked if _effect(s) in STARTS]
-        elif richer := self._richer(current, found):
-            return richer
-        # what may be slow noise is trusted less, but is tried for what it explains
-        ranked.sort(key=lambda s: -s.gain)
-        # where little is left one has to settle nearly all of it, so those that promise less do no harm
-        share = 0.0 if found.unexplained < FORMULA else COMPARABLE
-        ranked = [s for s in ranked if s.gain > share * ranked[0].gain]
-        least = ranked[:SHORTLIST][-1].gain if ranked else 0.0
-        return [s for s in ranked if s.gain >= (1 - TIED) * least]
-
-    def _clear(self, found: Seen) -> list[Signal]:
-        """The most significant shape of every effect that chance would not bring about."""
-        best: dict[str, Signal] = {}
-        for s in found.of_candidates:
-            best.setdefault(_effect(s), s)
-        enough = np.log(ALARM / len(found.screen.candidates))
-        return [s for s in best.values() if s.log_p < enough]
-
-    def _richer(self, current: Model, found: Seen) -> list[Signal]:
-        """An effect that contains one which is there, and explains most of what is left; if there is one."""
-        here = spelt_out(set(current.effects))
-        enough = MOST_OF_IT * found.clearest.gain
-        return [
-            s
-            for s in self._clear(found)
-            if CONTAINS.get(_effect(s), set()) & here
-            and _effect(s) not in current.effects
-            and s.gain > enough
-        ][:1]
-
     def _spared(self, model: Model) -> Model:
         """The model without effects that it can do without, or with simpler forms of them, alone or beside another one,
         that leave nothing more."""
-        white = self._white(model)
+        white = self.comparison.white(model)
         for effect in model.effects[:-1]:
             smaller = self.refits.without(model, effect, white)
-            if smaller.is_possible and self.compare([model, smaller], white)[0].model is smaller:
+            if (
+                smaller.is_possible
+                and self.comparison.ranked([model, smaller], white)[0].model is smaller
+            ):
                 return self._spared(smaller)
         for effect in model.effects:
             for simple in sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys()):
@@ -314,7 +270,7 @@ class Namer:
         if len(simpler.effects) == MOST:
             return None
         found = self._see(simpler)
-        promised = {_effect(s): s for s in self._clear(found)}
+        promised = {effect_of(s): s for s in clear(found)}
         enough = COMPARABLE * promised[rich].gain if rich in promised else 0.0
         here = set(simpler.effects)
         others = [
@@ -329,67 +285,27 @@ class Namer:
         return two if two and two.is_possible else None
 
     def _is_far_better(self, two: Model, model: Model, white: Whitener) -> bool:
-        criterion = {f.model: f.criterion for f in self.compare([two, model], white)}
+        criterion = {f.model: f.criterion for f in self.comparison.ranked([two, model], white)}
         return bool(criterion[two] + MARGIN < criterion[model])
 
     def _does_as_well(self, simpler: Model, model: Model) -> bool:
         """Whether a simpler form of an effect, chosen while another one was still missing, does as well by now: but for
         less than what neither explains."""
-        rich, plain = (self._left(m, self._white(model)).criterion for m in (model, simpler))
+        rich, plain = (
+            self.comparison.left(m, self.comparison.white(model)).criterion
+            for m in (model, simpler)
+        )
         rest = self._see(model)
         margin = MARGIN + (rest.clearest.gain if rest.left < ALARM else 0.0)
         return plain < rich + margin or self._see(simpler).left >= ALARM
-
-    def compare(self, models: Sequence[Model], white: Whitener) -> list[Fitted]:
-        """By the squares of what each leaves when fitted to residuals that a filter makes white, the best first.
-
-        One that leaves far more than another of what is measured is out of the question: filters pass none of what
-        changes slowly.
-        """
-        least = min(m.polished.refined.fitness for m in models)
-        fitted = [
-            self._left(m, white)
-            if m.polished.refined.fitness < FAR * least
-            else Fitted(m, np.inf, np.inf, white)
-            for m in models
-        ]
-        return sorted(fitted, key=lambda f: f.criterion)
-
-    def _left(self, model: Model, white: Whitener) -> Fitted:
-        key = model, id(white)
-        if key not in self.compared:
-            given, polished = sharpened(model.given, model.polished.refined, white)
-            squares = squares_of(given, polished)
-            samples = np.count_nonzero(given.problem.tape.weight)
-            price = len(given.problem.parameters.names) * np.log(samples)
-            self.compared[key] = Fitted(model, squares, squares + price, white)
-        return self.compared[key]
-
-    def _white(self, model: Model) -> Whitener:
-        if model not in self.filters:
-            self.filters[model] = whitener(residuals_of(model.given, model.polished))
-        return self.filters[model]
 
     def _without(self, chosen: Model, white: Whitener) -> dict[str, float]:
         chances = {}
         for effect in chosen.effects:
             smaller = self.refits.without(chosen, effect, white)
-            both = {f.model.effects: f.squares for f in self.compare([chosen, smaller], white)}
+            both = {
+                f.model.effects: f.squares for f in self.comparison.ranked([chosen, smaller], white)
+            }
             gain = both[smaller.effects] - both[chosen.effects]
             chances[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
         return chances
-
-
-def _effect(signal: Signal) -> str:
-    assert signal.candidate is not None
-    return signal.candidate.effect
-
-
-def _plainest(ranked: Sequence[Fitted]) -> Model:
-    """The best model, or a simpler one that it contains and that the data do not tell from it."""
-    best = ranked[0]
-    for other in ranked[1:]:
-        within = is_within(set(other.model.effects), set(best.model.effects))
-        if within and other.criterion < best.criterion + MARGIN:
-            return other.model
-    return best.model

@@ -1,0 +1,68 @@
+"""Which effects the evidence against a model puts first."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .candidates import STARTS
+from .kinship import CONTAINS, spelt_out
+from .model import Model
+from .screen import Signal
+from .seen import ALARM, FORMULA, MOST_OF_IT, Seen
+
+# So many candidates for one effect are refitted in full simulation
+SHORTLIST = 3
+# ... and those that gain as much as the last of them but for this share: rounding must not choose
+TIED = 1e-3
+# ... those whose gain to first order is at least this share of the best one's
+COMPARABLE = 0.6
+
+
+def shortlist(current: Model, found: Seen) -> list[Signal]:
+    """The most significant shape of each of the few effects that explain most.
+
+    If that is an effect which is there already and little is left, its own formula is what is left to be desired,
+    or else an effect that does more than its columns show. One that contains an effect which is there, and explains
+    most of what is left, needs no other beside it.
+    """
+    obvious = clear(found)
+    ranked = [s for s in obvious if effect_of(s) not in current.effects]
+    if obvious and effect_of(obvious[0]) in current.effects and found.unexplained < FORMULA:
+        ranked = [s for s in ranked if effect_of(s) in STARTS]
+    elif fuller := richer(current, found):
+        return fuller
+    # what may be slow noise is trusted less, but is tried for what it explains
+    ranked.sort(key=lambda s: -s.gain)
+    # where little is left one has to settle nearly all of it, so those that promise less do no harm
+    share = 0.0 if found.unexplained < FORMULA else COMPARABLE
+    ranked = [s for s in ranked if s.gain > share * ranked[0].gain]
+    least = ranked[:SHORTLIST][-1].gain if ranked else 0.0
+    return [s for s in ranked if s.gain >= (1 - TIED) * least]
+
+
+def clear(found: Seen) -> list[Signal]:
+    """The most significant shape of every effect that chance would not bring about."""
+    best: dict[str, Signal] = {}
+    for s in found.of_candidates:
+        best.setdefault(effect_of(s), s)
+    enough = np.log(ALARM / len(found.screen.candidates))
+    return [s for s in best.values() if s.log_p < enough]
+
+
+def richer(current: Model, found: Seen) -> list[Signal]:
+    """An effect that contains one which is there, and explains most of what is left; if there is one."""
+    here = spelt_out(set(current.effects))
+    enough = MOST_OF_IT * found.clearest.gain
+    return [
+        s
+        for s in clear(found)
+        if CONTAINS.get(effect_of(s), set()) & here
+        and effect_of(s) not in current.effects
+        and s.gain > enough
+    ][:1]
+
+
+def effect_of(signal: Signal) -> str:
+    """The name of the effect that a candidate's signal is of."""
+    assert signal.candidate is not None
+    return signal.candidate.effect
