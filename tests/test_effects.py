@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -457,7 +456,7 @@ def test_hard_teeth_are_nearly_as_exact(x64, gap_rad, drag):
     motor = with_effect("gear_backlash", values)
     if drag:
         also = with_effect("quadratic_drag", {"drag_Nms2_rad2": drag})
-        motor = eqx.tree_at(lambda m: m.effects, motor, motor.effects + also.effects)
+        motor = motor.with_effects(motor.effects + also.effects)
     # an impact is over in a fraction of a sample, so a moment too late shows at once in the speed; steps half as long
     # are off by a tenth of this
     assert relative_errors(simulated(motor, RUNS), expected)[1] < 2e-3

@@ -12,10 +12,10 @@ from .seen import ALARM, FORMULA, MOST_OF_IT, Seen
 
 # So many candidates for one effect are refitted in full simulation
 SHORTLIST = 3
-# ... and those that gain as much as the last of them but for this share: rounding must not choose
-TIED = 1e-3
 # ... those whose gain to first order is at least this share of the best one's
 COMPARABLE = 0.6
+# ... and those that gain as much as the last of them but for this share: rounding must not choose
+TIED = 1e-3
 
 
 def shortlist(current: Model, found: Seen) -> list[Signal]:

@@ -52,7 +52,7 @@ def solve(
     progress: ReportProgress | None = None,
     searches: int = SEARCHES,
 ) -> tuple[Prepared, Solved]:
-    """Search the bounds, refine the best candidates; again, from another seed, while the fit is poor, so many times.
+    """Search the bounds, refine the best candidates; again, by another seed, while the fit is poor: `searches` in all.
 
     **Returns**: the problem, its rotor turned as the fit says where a torque depends on the angle, and the fit.
     """
