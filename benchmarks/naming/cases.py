@@ -11,6 +11,7 @@ The suites:
     blind         excitation that cannot tell: only an asserted wrong name is a mistake
     noise_sweep   each effect at 0.1, 0.5, 1, 2.5, 5 % noise, of the spread of each signal
     rough         singles with pulses at the bridge, an uneven clock, unequal noise in every run
+    foreign       no effect or one, in motors, drives and sensors of all kinds (see `foreign`)
 
 Two sets of seeds: methods are tuned on `tuning`, figures are reported on `report`. Both were fixed
 before anything was tuned. Sample k of every suite is the same whatever else is asked for.
@@ -31,6 +32,7 @@ from numpy.random import Generator
 from benchmarks import virtual_bench as vb
 from benchmarks.virtual_bench import Columns, Excitation, Noise
 
+from . import foreign
 from .excitations import BLIND, HOLDOUT, Excitations, jittered, standard
 from .hidden import FORMULAS, LIBRARY, NAMES, STRANGERS, Hidden, Parameters, log_uniform
 from .plant import Plant, ornstein_uhlenbeck, simulate, substeps
@@ -74,11 +76,18 @@ class Case:
 
 @dataclass(frozen=True)
 class Bench:
-    """How the runs are recorded: sensors and torque noise by run, pulses, an uneven clock."""
+    """How the runs are recorded: sensors and torque noise by run, pulses, an uneven clock.
+
+    Sensors may have noise on the voltage, round voltage and current, or count the lines of an encoder.
+    """
 
     noises: Mapping[str, Noise]
     pwm_Hz: float = 0.0
     jitter: float = 0.0
+    voltage_V: float = 0.0
+    voltage_quantum_V: float = 0.0
+    current_quantum_A: float = 0.0
+    encoder_lines: float = 0.0
 
 
 # ---------------------------------------------------------------------------------------- recording
@@ -110,15 +119,29 @@ def record(plant: Plant, excitation: Excitation, rng: Generator, noise: Noise, b
     read = simulate(plant, *excitation, disturbance=disturbance, **start)
     current = read[:, 0] + noise.current_A * rng.standard_normal(samples)
     speed = read[:, 1] + noise.speed_rad_s * rng.standard_normal(samples)
-    if quantum := noise.speed_quantum_rad_s:
-        speed = quantum * np.round(speed / quantum)
+    speed = _rounded(speed, noise.speed_quantum_rad_s)
+    if bench.encoder_lines:
+        speed = _counted(excitation.time, read[:, 2], bench.encoder_lines)
+    voltage = excitation.voltage
+    if bench.voltage_V:
+        voltage = voltage + bench.voltage_V * rng.standard_normal(samples)
     return {
         "time_s": excitation.time,
-        "voltage_V": excitation.voltage,
-        "current_A": current,
+        "voltage_V": _rounded(voltage, bench.voltage_quantum_V),
+        "current_A": _rounded(current, bench.current_quantum_A),
         "speed_rad_s": speed,
         "load_torque_Nm": excitation.load,
     }
+
+
+def _rounded(values, quantum: float):
+    return quantum * np.round(values / quantum) if quantum else values
+
+
+def _counted(time, angle, lines: float):
+    """Lines passed from the sample before to the one after, as a speed."""
+    count = np.floor(angle * lines / (2 * math.pi))
+    return np.gradient(count, time) * 2 * math.pi / lines
 
 
 def drawn_noise(rng: Generator, kind: str) -> Noise:
@@ -217,6 +240,9 @@ class Plan:
     percent: float | None = None  # noise of that share of each signal instead of a drawn one
     rough: bool = False
     load_known: bool = True
+    plant: Plant | None = None  # in place of one about the paper's
+    noises: Noise | None = None  # in place of a drawn one
+    sensors: Mapping[str, float] = field(default_factory=dict)  # fields of `Bench`
 
 
 def drawn_plant(rng: Generator) -> Plant:
@@ -246,9 +272,9 @@ def _bench(plan: Plan, rng: Generator, plant: Plant, excitations: Excitations) -
         current, speed = _spread(_ideal(plant, excitations))
         share = plan.percent / 100.0
         return Bench(dict.fromkeys(excitations, Noise(share * current, share * speed)))
-    noise = drawn_noise(rng, plan.noise)
+    noise = plan.noises or drawn_noise(rng, plan.noise)
     if not plan.rough:
-        return Bench(dict.fromkeys(excitations, noise))
+        return Bench(dict.fromkeys(excitations, noise), **plan.sensors)
     noises = {
         name: replace(noise, current_A=noise.current_A * c, speed_rad_s=noise.speed_rad_s * s)
         for name in excitations
@@ -259,7 +285,8 @@ def _bench(plan: Plan, rng: Generator, plant: Plant, excitations: Excitations) -
 
 def build(suite: str, index: int, plan: Plan, rng: Generator) -> Case:
     """Draw the motor, set the amplitudes, run and measure."""
-    plant, excitations = drawn_plant(rng), plan.drive(rng)
+    plant = plan.plant or drawn_plant(rng)
+    excitations = plan.drive(rng)
     bench = _bench(plan, rng, plant, excitations)
     levels = noise_levels(plant, _typical(bench))
     drawn: list[Parameters] = []
@@ -376,6 +403,24 @@ def _rough(index: int, rng: Generator) -> Plan:
     return replace(_single(index, rng), rough=True)
 
 
+def _foreign(index: int, rng: Generator) -> Plan:
+    name, turn = _turn((None, *NAMES), index)
+    kind, _ = _turn(foreign.SENSORS, index + turn)
+    plant = foreign.motor(rng)
+    excited = foreign.excitations(rng, plant)
+    return Plan(
+        kind,
+        "named" if name else "none_detected",
+        (foreign.EFFECTS[name],) if name else (),
+        (_clear(rng, 2.0, 8.0),) if name else (),
+        detail=name or "",
+        drive=lambda rng: excited,
+        plant=plant,
+        noises=foreign.noise(rng, plant),
+        sensors=foreign.sensors(kind, plant, excited[HOLDOUT]),
+    )
+
+
 SUITES: Mapping[str, Callable[[int, Generator], Plan]] = {
     "singles": _single,
     "strengths": _strength,
@@ -386,6 +431,7 @@ SUITES: Mapping[str, Callable[[int, Generator], Plan]] = {
     "blind": _blind,
     "noise_sweep": _noise_sweep,
     "rough": _rough,
+    "foreign": _foreign,
 }
 
 

@@ -82,8 +82,8 @@ def _amplitude(field: str, size: Callable[[Scales], float], signed: bool = False
     return rows
 
 
-def _sensor(field: str, grid: Callable[[Scales], Sequence[float]]):
-    """An effect of a sensor tried at finite sizes, scaled up or down by the coefficient."""
+def _finite(field: str, grid: Callable[[Scales], Sequence[float]]):
+    """An effect tried at finite sizes, scaled up or down by the coefficient."""
 
     def rows(name: str, scales: Scales) -> list[Candidate]:
         def candidate(size: float) -> Candidate:
@@ -95,6 +95,11 @@ def _sensor(field: str, grid: Callable[[Scales], Sequence[float]]):
         return [candidate(size) for size in grid(scales)]
 
     return rows
+
+
+def _either(*rows: Callable[[str, Scales], list[Candidate]]):
+    """An effect tried in several ways."""
+    return lambda name, scales: [c for of_one in rows for c in of_one(name, scales)]
 
 
 def _stribeck(name: str, scales: Scales) -> list[Candidate]:
@@ -260,8 +265,12 @@ TABLE: Mapping[str, Callable[[str, Scales], list[Candidate]]] = {
     ),
     "torque_constant_saturation": _amplitude("per_A2", lambda s: 1 / s.current**2),
     "inductance_saturation": _amplitude("per_A2", lambda s: 1 / s.current**2),
-    "input_dead_zone": _amplitude("width_V", lambda s: s.voltage),
-    "speed_sensor_lag": _sensor("time_constant_s", _times),
-    "speed_sensor_delay": _sensor("delay_s", _times),
+    # a voltage within it that is noise, or a small signal, has a sign which the motor does not feel
+    "input_dead_zone": _either(
+        _amplitude("width_V", lambda s: s.voltage),
+        _finite("width_V", lambda s: [share * s.voltage for share in (0.01, 0.05)]),
+    ),
+    "speed_sensor_lag": _finite("time_constant_s", _times),
+    "speed_sensor_delay": _finite("delay_s", _times),
     "current_sensor_offset": _amplitude("offset_A", lambda s: s.current, signed=True),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -32,6 +33,8 @@ class Prepared(NamedTuple):
     known: Mapping[str, float]
     ties: tuple[tuple[str, str], ...]
     problem: Problem
+    # by run: standard deviation of what was taken out of the record of its drive, for the motor did not feel it
+    unfelt: Mapping[str, float] = MappingProxyType({})
 
     @property
     def training(self) -> list[Recording]:

@@ -20,6 +20,7 @@ from .refine import Polished, Problem, Refined, Unknowns, polish, refine
 from .search import Found
 from .search import search as global_search
 from .turning import turned
+from .unfelt import without_unfelt
 
 if TYPE_CHECKING:
     from ..report.terminal import ReportProgress
@@ -79,6 +80,7 @@ def solve(
         found = found._replace(evaluations=before.evaluations + found.evaluations)
         ends = sorted([*ends, *_refine_all(problem, found)], key=_fitness)
     given, polished = settle(given, ends[0])
+    given, polished = without_unfelt(given, polished)
     seconds = {"search": searched - began, "refine": time.perf_counter() - searched}
     record = _search_record(search, found, ends)
     return given, Solved(polished, record, seed, found.interrupted, seconds)

@@ -1,0 +1,135 @@
+"""Noise in the record of what drives the motor: where the motor did not feel it, it is taken out.
+
+A simulation takes the recorded voltage for true. The noise of its sensor then moves the simulated motor and not the
+real one: the misfit looks like a missing effect, and the parameters make up for it (errors in variables). Whether a
+motor felt the rough part of a voltage, as that of a controller which answers to a noisy speed, it says itself: its
+response to that part is in its records or it is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import attrs
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.signal import savgol_coeffs
+
+from ..simulate import Tape
+from .colour import whitener
+from .prepare import Prepared
+from .refine import Polished, Problem, polish
+from .sharpen import series_of
+
+# Half widths of the windows that are smoothed over, samples
+WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40)
+# Windows of a polynomial's order: behind, around and ahead of a sample, and a parabola around it
+WINDOWS = ((-1, 0), (0, 0), (1, 0), (0, 2))
+# A wider window is no longer smooth if it departs from a narrower one by more standard errors than so many of each
+DEPARTURE = 1.5
+# Rough parts of which the motor felt less than this share, so many standard errors below all, are noise
+FELT, CLEAR = 0.5, 5.0
+# ... unless the fit is worse by more than this without them
+NO_WORSE = 1.05
+
+
+def without_unfelt(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
+    """The runs with what drives them smoothed where the motor did not feel its rough part, and the fit to them.
+
+    **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if nothing was found, or the
+    fit is worse for it.
+    """
+    drives = [np.asarray(getattr(run, run.drive)) for run in given.runs]
+    rough = [drive - smoothed(drive) for drive in drives]
+    if not any(map(np.any, rough)):
+        return given, fit
+    smooth = _driven(given, [d - r for d, r in zip(drives, rough, strict=True)])
+    felt = _felt(given.problem, fit, polish(smooth, fit.refined, steps=0))
+    if not any(share < 1 for share in felt):
+        return given, fit
+    lost = [(1 - share) * r for share, r in zip(felt, rough, strict=True)]
+    problem = _driven(given, [d - x for d, x in zip(drives, lost, strict=True)])
+    better = polish(problem, fit.refined)
+    if better.refined.fitness > NO_WORSE * fit.refined.fitness:
+        return given, fit
+    unfelt = {
+        run.name: float(np.std(x)) for run, x in zip(given.runs, lost, strict=True) if np.any(x)
+    }
+    return given._replace(problem=problem, unfelt=unfelt), better
+
+
+def _driven(given: Prepared, drives: list[np.ndarray]) -> Problem:
+    """The problem with the runs driven so."""
+    runs = [attrs.evolve(r, **{r.drive: d}) for r, d in zip(given.runs, drives, strict=True)]
+    value = jnp.asarray(Tape.from_recordings(runs).value)
+    return replace(given.problem, tape=replace(given.problem.tape, value=value))
+
+
+def _felt(problem: Problem, rough: Polished, smooth: Polished) -> list[float]:
+    """Of every run the share of the rough part that the motor felt, one unless it is clearly less than half.
+
+    By regression of what the whole drive leaves on the response to its rough part, both made white by what the smooth
+    drive leaves.
+    """
+    shares = []
+    left, left_smooth = (
+        -np.asarray(fit.evaluation.residuals) * fit.noise[:, None] for fit in (rough, smooth)
+    )
+    for run in range(problem.tape.runs):
+        both = series_of(problem.tape, run, np.stack([left, left_smooth - left], -1))
+        white = whitener([series_of(problem.tape, run, left_smooth)])(0, both)
+        rest, response = white[:, 0], white[:, 1]
+        power = response @ response
+        share = 1 + rest @ response / power if power > 0 else 1.0
+        error = np.std(rest) / np.sqrt(power) if power > 0 else 1.0
+        clear = share < FELT and share + CLEAR * error < 1
+        shares.append(float(np.clip(share, 0.0, 1.0)) if clear else 1.0)
+    return shares
+
+
+def smoothed(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    """A signal less its white noise, with its steps and bends as they are.
+
+    Every sample is the mean over the widest window about it, or on one side of it, in which the signal is as smooth as
+    its noise allows: the estimates by all narrower windows have a value within their errors in common.
+
+    **Source**: Goldenshluger & Nemirovski, Mathematical Methods of Statistics 6 (1997) 135 (intersection of
+    confidence intervals); Katkovnik, IEEE Transactions on Signal Processing 47 (1999) 2567.
+    """
+    noise = _noise(signal)
+    if not noise > 0:
+        return signal
+    estimates, errors = zip(*(_widest(signal, noise, *window) for window in WINDOWS), strict=True)
+    best = np.argmin(errors, axis=0)
+    return np.take_along_axis(np.array(estimates), best[None], axis=0)[0]
+
+
+def _noise(signal: np.ndarray) -> float:
+    """Standard deviation of white noise, by the median of its fourth differences: most of a signal is smooth."""
+    differences = np.diff(signal, 4)
+    return float(np.median(np.abs(differences)) / 0.6745 / np.sqrt(70)) if len(differences) else 0.0
+
+
+def _widest(
+    signal: np.ndarray, noise: float, side: int, order: int
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
+    """The estimate of every sample by the widest window on a side of it that is smooth, and its standard error."""
+    best, error = signal.copy(), np.full(len(signal), noise)
+    low, high = signal - DEPARTURE * noise, signal + DEPARTURE * noise
+    smooth = np.ones(len(signal), bool)
+    for width in WIDTHS:
+        samples = width + 1 if side else 2 * width + 1
+        if not order < samples - 1 < len(signal):
+            continue
+        before = {-1: width, 0: width, 1: 0}[side]
+        weights = savgol_coeffs(samples, order, pos=before, use="dot")
+        spread = noise * np.sqrt(weights @ weights)
+        inner = slice(before, len(signal) - samples + 1 + before)
+        estimate = np.full(len(signal), np.nan)
+        estimate[inner] = np.correlate(signal, weights, "valid")
+        low = np.fmax(low, estimate - DEPARTURE * spread)
+        high = np.fmin(high, estimate + DEPARTURE * spread)
+        smooth &= ~np.isnan(estimate) & (low <= high)
+        best, error = np.where(smooth, estimate, best), np.where(smooth, spread, error)
+    return best, error
