@@ -407,7 +407,7 @@ def _foreign(index: int, rng: Generator) -> Plan:
     name, turn = _turn((None, *NAMES), index)
     kind, _ = _turn(foreign.SENSORS, index + turn)
     plant = foreign.motor(rng)
-    excited = foreign.excitations(rng, plant)
+    excited = foreign.excitations(rng, plant, kind)
     return Plan(
         kind,
         "named" if name else "none_detected",
@@ -416,7 +416,7 @@ def _foreign(index: int, rng: Generator) -> Plan:
         detail=name or "",
         drive=lambda rng: excited,
         plant=plant,
-        noises=foreign.noise(rng, plant),
+        noises=foreign.noise(rng, plant, kind),
         sensors=foreign.sensors(kind, plant, excited[HOLDOUT]),
     )
 

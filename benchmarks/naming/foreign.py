@@ -21,6 +21,7 @@ from .hidden import LIBRARY, Hidden, Parameters, log_uniform
 from .plant import Plant
 
 SENSORS = ("ordinary", "encoder", "noisy_voltage", "converter")
+COUNT = 0.01  # of the largest speed is what one line of an encoder makes
 SAMPLE_TIMES = (2e-4, 5e-4, 1e-3, 2e-3, 5e-3)
 Voltage = Callable[[Generator, "Size", NDArray[np.float64]], NDArray[np.float64]]
 
@@ -56,9 +57,9 @@ def motor(rng: Generator) -> Plant:
     return Plant(R, min(fast, slow / 4) * R, Kb, Kt, J, f, bus_V=volt)
 
 
-def sample_time(rng: Generator, plant: Plant) -> float:
-    """One that a careful engineer might choose for the motor."""
-    longest = Size.of(plant).mechanical_s / 8
+def sample_time(rng: Generator, plant: Plant, kind: str) -> float:
+    """One that a careful engineer might choose for the motor: the speed of an encoder is a mean over two samples."""
+    longest = Size.of(plant).mechanical_s / (32 if kind == "encoder" else 8)
     return float(f"{min(rng.choice(SAMPLE_TIMES), longest):.1g}")
 
 
@@ -124,9 +125,9 @@ VOLTAGES: tuple[Voltage, ...] = (
 HELD_OUT: tuple[Voltage, ...] = (_steps, _two_levels, _sines)
 
 
-def excitations(rng: Generator, plant: Plant) -> Excitations:
-    """One to five runs and a hold-out, the first and the last loaded."""
-    size, dt = Size.of(plant), sample_time(rng, plant)
+def excitations(rng: Generator, plant: Plant, kind: str) -> Excitations:
+    """One to five runs and a hold-out, the first and the last loaded, for a kind of sensors."""
+    size, dt = Size.of(plant), sample_time(rng, plant, kind)
     samples = int(np.clip(40 * size.mechanical_s / dt, 1500, 8000))
     time = np.arange(samples) * dt
     chosen = [VOLTAGES[k] for k in rng.permutation(len(VOLTAGES))[: rng.integers(1, 6)]]
@@ -145,21 +146,22 @@ def excitations(rng: Generator, plant: Plant) -> Excitations:
 # ------------------------------------------------------------------------------------------ sensors
 
 
-def noise(rng: Generator, plant: Plant) -> Noise:
-    """That of good sensors, and in every third case a torque that fluctuates."""
+def noise(rng: Generator, plant: Plant, kind: str) -> Noise:
+    """That of good sensors, or the rounding of an encoder, and in every third case a torque that fluctuates."""
     size = Size.of(plant)
+    of_speed = COUNT / math.sqrt(6.0) if kind == "encoder" else 0.002
     shaken = 0.006 * size.torque * float(rng.random() < 1 / 3)
     memory = size.mechanical_s * log_uniform(rng, 0.1, 1.0)
     good = {"torque_Nm": shaken, "torque_correlation_s": memory}
-    return Noise(0.003 * size.current, 0.002 * size.speed, **good)
+    return Noise(0.003 * size.current, of_speed * size.speed, **good)
 
 
 def sensors(kind: str, plant: Plant, driven: Excitation) -> dict[str, float]:
-    """What else a kind of sensors does, as fields of `Bench`; an encoder counts 1 % of the largest speed at a time."""
+    """What else a kind of sensors does, as fields of `Bench`."""
     size, dt = Size.of(plant), float(driven.time[1])
     return {
         "ordinary": {},
-        "encoder": {"encoder_lines": math.pi / (0.01 * size.speed * dt)},
+        "encoder": {"encoder_lines": math.pi / (COUNT * size.speed * dt)},
         "noisy_voltage": {"voltage_V": 0.004 * size.volt},
         "converter": {
             "voltage_quantum_V": size.volt / 1024,
@@ -248,6 +250,8 @@ _DRAWS: Mapping[str, Callable[[Generator, Plant], Parameters]] = {
     "speed_sensor_delay": _share("delay_s", 0.05, 0.15, lambda s: s.mechanical_s),
     "current_sensor_offset": _signed(_share("offset_A", 0.01, 0.03, lambda s: s.current)),
 }
-EFFECTS: Mapping[str, Hidden] = {
+EFFECTS: dict[str, Hidden] = {
     name: replace(LIBRARY[name], draw=draw) for name, draw in _DRAWS.items()
 }
+# beyond that hardly any inductance would be left
+EFFECTS["inductance_saturation"] = replace(EFFECTS["inductance_saturation"], limits=(1e-4, 1.0))

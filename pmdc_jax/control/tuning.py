@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from attrs import field, frozen
 
+from ..compiled import make_room
 from ..motor import Motor
 from ..motor_file import Uncertainty
 from ..precision import double_precision
@@ -155,6 +156,7 @@ def tune(
     **Raises**: `InputError` for a specification that no controller can meet, with the limit.
     """
     begin = time.perf_counter()
+    make_room()
     asked = Asked(
         controller=controller,
         setpoint=setpoint,

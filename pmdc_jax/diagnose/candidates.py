@@ -50,6 +50,13 @@ class Candidate(NamedTuple):
         """How many coefficients it has (in one run, with `own_phase`)."""
         return len(self.columns)
 
+    @property
+    def unit(self) -> float:
+        """The amplitude for a last coefficient of one: the response is to that, or to the whole of a finite one."""
+        if self.amplitude is None or self.units[-1] != 1.0:
+            return 1.0
+        return self.columns[-1][self.amplitude]
+
 
 # An amplitude that is small, as a share of the scale: the response to it is as good as a derivative.
 SMALL = 1e-4

@@ -51,6 +51,8 @@ class Curve(NamedTuple):
     shapes: np.ndarray | None = None
     # turns with the direction of motion, as a friction that changes does
     reverses: bool = False
+    # what it shows is noise
+    noise: bool = False
 
     @property
     def order(self) -> int:
@@ -82,6 +84,8 @@ class Library:
         # errors that last look like a voltage that changes in time
         speeds = [run.speed for run in base.given.training if run.speed is not None]
         self.coarse = any(is_coarse(speed) for speed in speeds)
+        # ... and of noise that the motor did not feel something is left
+        self.wavers = bool(base.given.unfelt)
         self._whole: dict[int, np.ndarray] = {}
         self._base = base
 
@@ -153,7 +157,8 @@ def curves_over(library: Library, tape: Tape, path: Path) -> tuple[list[Curve], 
             own, x = variable == "time", known[variable]
             knots = np.linspace(0, 1, KNOTS_IN_TIME) if own else _knots(x, weight)
             hats = partial(_hats, x, knots)
-            terms.append((Curve(equation, variable, knots, own), push, hats))
+            noise = own and equation == "electrical" and library.wavers
+            terms.append((Curve(equation, variable, knots, own, noise=noise), push, hats))
             if own and equation == "mechanical":
                 turning = partial(_hats, x, knots, _direction(known["speed"], tape))
                 terms.append((Curve(equation, variable, knots, own, reverses=True), push, turning))

@@ -12,6 +12,7 @@ from ..effects import EFFECTS
 from ..identify.colour import Whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Polished
+from ..identify.solve import Solved
 from .candidates import FULLER
 from .compare import FAR, MARGIN, Comparison, Fitted, plainest
 from .kinship import CONTAINS, are_rivals, spelt_out
@@ -58,9 +59,10 @@ class Naming(NamedTuple):
 class Namer:
     """Gathers evidence, has sets of effects refitted, and compares them."""
 
-    def __init__(self, base: Model, report):
+    def __init__(self, base: Model, solved: Solved, report):
+        """`base` is the motor without effects, and `solved` how it was found."""
         self.base, self.library = base, Library(base)
-        self.refits = Refits(base, self.library, report)
+        self.refits = Refits(base, solved, self.library, report)
         self.seen: dict[Model, Seen] = {}
         self.comparison = Comparison()
         # by effect: those that did as well when it was added

@@ -71,7 +71,7 @@ def diagnose(
     given, solved = solve(given, search, seed, progress)
     identified = time.perf_counter()
     report("gathering evidence", solved.polished.refined.fitness)
-    namer = Namer(model_of((), given, solved.polished), report)
+    namer = Namer(model_of((), given, solved.polished), solved, report)
     naming = namer.name()
     named = time.perf_counter()
     report("judging the uncertainty", naming.chosen.polished.refined.fitness)
@@ -242,9 +242,7 @@ def _detectable(found: Screen) -> tuple[Detectable, ...]:
         if field is None:
             continue
         error = float(np.min(found.evidence.regress([block]).errors[0][..., -1]))
-        # a column is the response to a unit of the amplitude, or to the whole of a finite one
-        size = candidate.columns[-1][field] if candidate.units[-1] == 1.0 else 1.0
-        amplitude = float(needed * error * size)
+        amplitude = max(float(needed * error * candidate.unit), found.hidden(candidate))
         if error > 0 and (
             candidate.effect not in smallest or amplitude < smallest[candidate.effect].amplitude
         ):

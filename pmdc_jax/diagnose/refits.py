@@ -14,7 +14,7 @@ from ..identify.colour import Whitener
 from ..identify.prepare import Prepared
 from ..identify.refine import Refined, Unknowns, polish
 from ..identify.sharpen import sharpened, squares_of
-from ..identify.solve import POOR, solve
+from ..identify.solve import POOR, Solved, searched
 from ..identify.uncertainty import FLAT
 from ..threads import CORES, side_by_side
 from .candidates import FULLER, STARTS, Values
@@ -29,8 +29,6 @@ KEPT = 0.5
 ROUGHLY = 8
 # ... and of which two have ended alike if their misfits differ by no more
 AGREED = 1.05
-# What searches for a motor that is far from the one fitted
-METHOD = "cma_es"
 # How finely a phase is looked for that all runs have in common
 PHASES = 120
 
@@ -38,10 +36,10 @@ Start = tuple[Prepared, Refined]
 
 
 class Refits:
-    """The models that were fitted so far."""
+    """The models that were fitted so far; `solved` is how the motor without effects was found."""
 
-    def __init__(self, base: Model, library: Library, report):
-        self.library, self.report = library, report
+    def __init__(self, base: Model, solved: Solved, library: Library, report):
+        self.library, self.solved, self.report = library, solved, report
         self.models: dict[frozenset[str], Model] = {frozenset(): base}
         self.begun: dict[str, Values] = {}  # where each effect was first begun to be fitted
 
@@ -89,8 +87,9 @@ class Refits:
 
         def search() -> Model:
             given = current.given.with_effects([EFFECTS[e] for e in effects])
-            given, solved = solve(given, METHOD, seed=0, searches=1)
-            return model_of(effects, given, solved.polished)
+            method, seed = self.solved.search.method, self.solved.seed
+            given, found = searched(given, method, seed, searches=1)
+            return model_of(effects, given, found.polished)
 
         model = self._once(effects, current, search)
         assert model is not None

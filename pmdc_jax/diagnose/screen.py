@@ -38,10 +38,21 @@ class Screen(NamedTuple):
     curves: list[Curve]
     of_curve: list[Block]
     dry: float  # Coulomb friction in the model, N m
+    unfelt: float  # noise that was taken out of the recorded voltage, V
 
     def possible(self, candidate: Candidate, coefficients: np.ndarray) -> bool:
-        """Whether physics allows these coefficients."""
-        return candidate.own_phase or candidate.build(coefficients, self.dry) is not None
+        """Whether physics allows these coefficients, and they are no trace of noise."""
+        if candidate.own_phase:
+            return True
+        amplitude = abs(coefficients[-1]) * candidate.unit
+        physical = candidate.build(coefficients, self.dry) is not None
+        return physical and bool(amplitude >= self.hidden(candidate))
+
+    def hidden(self, candidate: Candidate) -> float:
+        """An amplitude that may be what is left of the noise of the recorded voltage."""
+        field = candidate.amplitude
+        voltage = field is not None and EFFECTS[candidate.effect].ranges[field].unit == "V"
+        return self.unfelt if voltage else 0.0
 
 
 def screen(model: Model, library: Library) -> Screen:
@@ -69,6 +80,7 @@ def screen(model: Model, library: Library) -> Screen:
         curves=curves,
         of_curve=blocks[len(library.candidates) :],
         dry=model.dry,
+        unfelt=max(model.given.unfelt.values(), default=0.0),
     )
     white = whitener(_without_clearest(found, rows))
     return found._replace(evidence=_evidence(rows, white), white=white)
@@ -98,12 +110,15 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     """Of every candidate that physics allows, and of every curve; the most significant first."""
     base = found.evidence.regress().squares
     # rows that no filter has made white all drift
-    drift = _drift(found) if found.evidence is not found.unfiltered else None
+    white = found.evidence is not found.unfiltered
+    drift, waver = (_drift(found), _waver(found)) if white else (None, None)
 
     def signal(of: Candidate | Curve, block: Block, gain: float) -> Signal:
         noise = 1.0
         if drift is not None and _is_slow_torque(of):
             noise = _beside(found, block, drift)
+        if waver is not None and _is_voltage(of):
+            noise = _beside(found, block, waver)
         return Signal(gain, log_chance(gain / noise, found.evidence.freedom(block)), of, block)
 
     of_candidates = []
@@ -120,6 +135,8 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
             gains[k] = _left(found, drift) - _left(found, drift, found.of_curve[k])
         elif found.of_curve[k] is drift:
             gains[k] /= SLOWER
+        elif curve.noise:
+            gains[k] = 0.0
     of_curves = [signal(*one) for one in zip(found.curves, found.of_curve, gains, strict=True)]
     return sorted(of_candidates, key=_log_p), sorted(of_curves, key=_log_p)
 
@@ -137,6 +154,18 @@ def _drift(found: Screen) -> Block | None:
     return None
 
 
+def _waver(found: Screen) -> Block | None:
+    """A voltage that wavers in every run in its own way, where it is known to be noise."""
+    pairs = zip(found.curves, found.of_curve, strict=True)
+    return next((block for curve, block in pairs if curve.noise), None)
+
+
+def _is_voltage(of: Candidate | Curve) -> bool:
+    """Whether something is a voltage: what is left of the noise of the recorded one may look like it."""
+    equation = EFFECTS[of.effect].equation if isinstance(of, Candidate) else of.equation
+    return equation in ("electrical", "input")
+
+
 def _is_slow_torque(of: Candidate | Curve) -> bool:
     """Whether something is a torque that changes no faster than the motion: slow noise may look like it."""
     if isinstance(of, Candidate):
@@ -146,7 +175,7 @@ def _is_slow_torque(of: Candidate | Curve) -> bool:
 
 
 def _beside(found: Screen, block: Block, drift: Block) -> float:
-    """How much more than by chance a torque gains that drifts beside a block.
+    """How much more than by chance a torque, or a voltage, gains that drifts beside a block.
 
     A filter leaves a weak fluctuation of some tenths of a second, hidden beneath the noise of the sensors, and the
     block takes its share of it.

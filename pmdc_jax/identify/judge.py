@@ -23,6 +23,8 @@ from .solve import SAME, Solved
 from .uncertainty import FLAT, Information, information
 
 TIDYINGS = 3
+# Of what drives a motor
+UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
 # A parameter is alone in an unseen direction of unit length if it has so much of it
 ALONE = 0.99
 # ... and large enough to show if it changes the outputs by this share of what the strongest one does
@@ -59,7 +61,7 @@ def judge(given: Prepared, solved: Solved) -> Identification:
         findings=given.findings,
         covariance=info.covariance,
         covariance_names=parameters.names,
-        messages=_messages(solved, best, chosen is not polished),
+        messages=_messages(given, solved, best, chosen is not polished),
     )
 
 
@@ -243,8 +245,13 @@ def _noise_of(fit: Mapping[str, RunFit]) -> dict[str, float | None]:
     }
 
 
-def _messages(solved: Solved, best: Refined, tied: bool) -> tuple[str, ...]:
-    messages = []
+def _messages(given: Prepared, solved: Solved, best: Refined, tied: bool) -> tuple[str, ...]:
+    messages = [
+        f"{run.name}: the {run.drive} holds {given.unfelt[run.name]:.3g} {UNITS[run.drive]} of noise that the motor "
+        "did not feel: it was taken out"
+        for run in given.runs
+        if run.name in given.unfelt
+    ]
     if solved.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
     if not best.converged:

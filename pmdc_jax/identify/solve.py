@@ -47,6 +47,18 @@ class Solved(NamedTuple):
 
 
 def solve(
+    given: Prepared, search: str, seed: int, progress: ReportProgress | None = None
+) -> tuple[Prepared, Solved]:
+    """The best fit of a search, to runs less what the motor did not feel of what drives it.
+
+    **Returns**: the problem as `searched` and `without_unfelt` leave it, and the fit.
+    """
+    given, solved = searched(given, search, seed, progress)
+    given, polished = without_unfelt(given, solved.polished)
+    return given, solved._replace(polished=polished)
+
+
+def searched(
     given: Prepared,
     search: str,
     seed: int,
@@ -80,7 +92,6 @@ def solve(
         found = found._replace(evaluations=before.evaluations + found.evaluations)
         ends = sorted([*ends, *_refine_all(problem, found)], key=_fitness)
     given, polished = settle(given, ends[0])
-    given, polished = without_unfelt(given, polished)
     seconds = {"search": searched - began, "refine": time.perf_counter() - searched}
     record = _search_record(search, found, ends)
     return given, Solved(polished, record, seed, found.interrupted, seconds)

@@ -1,0 +1,82 @@
+"""Noise in the record of what drives a motor, taken out where the motor did not feel it, and only there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks import virtual_bench as vb
+from pmdc_jax import identify
+from pmdc_jax.identify.unfelt import smoothed
+from pmdc_jax.recording import Recording
+
+NOISE = 0.1  # V
+SIX = ("R", "L", "Kb", "Kt", "J", "f")
+
+
+def steps(samples: int = 2000) -> np.ndarray:
+    return np.repeat([0.0, 5.0, -12.0, 3.0, 3.5], samples // 5)
+
+
+def wave(samples: int = 2000) -> np.ndarray:
+    return 10.0 * np.sin(2 * np.pi * np.arange(samples) / 200)
+
+
+@pytest.mark.parametrize(
+    ("signal", "left"), [(steps(), 0.25), (wave(), 0.6)], ids=["steps", "sine"]
+)
+def test_noise_goes_and_steps_stay(signal, left):
+    seen = signal + NOISE * np.random.default_rng(3).standard_normal(len(signal))
+    error = smoothed(seen) - signal
+    assert np.std(error) < left * NOISE
+    assert np.max(np.abs(error)) < 4.5 * NOISE  # nowhere near a step's height
+
+
+@given(st.lists(st.floats(-48, 48), min_size=1, max_size=12), st.integers(9, 60), st.integers(0, 8))
+def test_what_has_no_noise_stays_as_it_is(levels, hold, rest):
+    """A voltage of steps without noise, of any length, is not touched."""
+    signal = np.repeat(levels, hold)[rest:]
+    np.testing.assert_array_equal(smoothed(signal), signal)
+
+
+def recorded(felt: float, unfelt: float) -> list[Recording]:
+    """Runs whose voltage has noise that the motor felt, and noise of the sensor alone, V."""
+    rng = np.random.default_rng(11)
+    runs = {"prbs": vb.prbs(rng, 3.0), "loaded": vb.loaded(rng, 3.0), "stairs": vb.staircase(3.0)}
+    found = []
+    for name, excitation in runs.items():
+        driven = excitation._replace(voltage=excitation.voltage + felt * noise(rng, excitation))
+        columns = vb.record(vb.paper_motor(), driven, rng, vb.Noise(0.1, 0.5))
+        seen = columns["voltage_V"] + unfelt * noise(rng, excitation)
+        names = ("time_s", "current_A", "speed_rad_s")
+        time, current, speed = (columns[n] for n in names)
+        found.append(Recording(name, time, seen, current, speed, load=columns["load_torque_Nm"]))
+    return found
+
+
+def noise(rng, excitation) -> np.ndarray:
+    return rng.standard_normal(excitation.time.size)
+
+
+def errors(found) -> np.ndarray:
+    """Of the six parameters, in standard errors."""
+    truth = vb.paper_motor()
+    return np.array(
+        [(found.parameters[n].value - getattr(truth, n)) / found.parameters[n].stderr for n in SIX]
+    )
+
+
+def test_noise_of_the_voltage_sensor_does_not_bend_the_parameters():
+    found = identify(recorded(felt=0.0, unfelt=0.3))
+    assert [m.split(":")[0] for m in found.messages if "did not feel" in m] == [
+        *("prbs", "loaded", "stairs")
+    ]
+    assert np.max(np.abs(errors(found))) < 3.5
+
+
+def test_a_rough_voltage_that_the_motor_felt_is_left_alone():
+    found = identify(recorded(felt=0.3, unfelt=0.0))
+    assert not [m for m in found.messages if "did not feel" in m]
+    assert np.max(np.abs(errors(found))) < 3.5
