@@ -18,6 +18,7 @@ from scipy.integrate import cumulative_simpson
 from scipy.signal import lfilter, lsim
 
 from benchmarks import virtual_bench as vb
+from benchmarks.naming.plant import Plant, simulate
 from pmdc_jax import InputError, identify
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.binary_ga import BinaryGA
@@ -28,7 +29,7 @@ from pmdc_jax.identify.judge import judge
 from pmdc_jax.identify.noise import is_coarse, quantum, white_noise
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.prepare import prepare
-from pmdc_jax.identify.refine import Problem, Refined, Unknowns, evaluate, polish, refine
+from pmdc_jax.identify.refine import Problem, Refined, Unknowns, evaluate, fit_own, polish, refine
 from pmdc_jax.identify.search import METHODS, Found, search
 from pmdc_jax.identify.sharpen import last_fit, residuals_of
 from pmdc_jax.identify.solve import _distinct, solve
@@ -763,3 +764,33 @@ BAD = {
 def test_bad_arguments_are_refused(runs, call, says):
     with pytest.raises(InputError, match=says):
         call(runs)
+
+
+@pytest.mark.parametrize("gap", [0.05, 0.3])
+def test_what_belongs_to_a_run_is_never_fitted_for_the_worse(gap):
+    """Nobody knows the load of a run behind a gear with play, where straight lines lead anywhere."""
+    gear = {"stiffness": 500.0, "damping": 0.1, "load_share": 0.4, "gap_rad": gap}
+    driven = vb.prbs(np.random.default_rng(0), 1.0)
+    motor = {name: getattr(PAPER, name) for name in PARAMETERS}
+    plant = Plant(**motor, **gear)
+    seen = simulate(plant, driven.time, driven.voltage, driven.load + 0.1)
+    run = Recording("gear", driven.time, driven.voltage, seen[:, 0], seen[:, 1])
+    with jax.enable_x64(True):
+        given = prepare([run], [], effects=[EFFECTS["gear_backlash"]])
+        names = ("stiffness_Nm_rad", "damping_Nms_rad", "load_share", "gap_rad")
+        truth = {**motor, **dict(zip(names, gear.values(), strict=True))}
+        named = [
+            truth[name.removeprefix("gear_backlash.")] for name in given.problem.parameters.names
+        ]
+        logarithmic = np.asarray(given.problem.parameters.logarithmic)
+        coordinates = np.where(logarithmic, np.log(named), named)
+        begun = Unknowns(jnp.asarray(coordinates), jnp.zeros((1, LOCAL)))
+        squares = [
+            float(jnp.square(evaluation.residuals).sum())
+            for evaluation in (
+                evaluate(given.problem, begun),
+                *(fit_own(given.problem, begun, passes)[1] for passes in (1, 4)),
+            )
+        ]
+    assert squares == sorted(squares, reverse=True)
+    assert np.isfinite(squares[-1])

@@ -330,10 +330,7 @@ def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
     with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
         squares = np.square(np.asarray(evaluation.residuals)[problem.counted]).sum((0, 2))
         noise, stretch = _own_noise(problem, squares)
-    scaled = evaluation._replace(
-        residuals=evaluation.residuals * stretch[:, None],
-        jacobian=evaluation.jacobian * stretch[:, None, None],
-    )
+    scaled = _scaled(evaluation, stretch)
     matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
     if problem.whitening is not None:
         cost = float(np.log(np.maximum(squares.sum(), 1e-300)))
@@ -344,15 +341,61 @@ def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
     return _Weighed(unknowns, scaled, noise, matrix, cost, float(squares.sum()) / _samples(problem))
 
 
-def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 3) -> tuple[Unknowns, Evaluation]:
-    """Fit only what belongs to each run: its initial state, and its load where nobody knows it."""
+def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unknowns, Evaluation]:
+    """Fit only what belongs to each run: its initial state, and its load where nobody knows it.
+
+    A step that makes a run worse, as where teeth of a gear meet at another time, is taken shorter for that run.
+    """
     still = eqx.tree_at(lambda p: p.free, problem, jnp.zeros_like(problem.free))
-    everyone = jnp.ones(problem.tape.runs, bool)
+    run = np.asarray(problem.tape.run)
+    everyone, share = jnp.ones(problem.tape.runs, bool), np.ones(problem.tape.runs)
+
+    def squares_of_runs(evaluation: Evaluation) -> np.ndarray:
+        with np.errstate(over="ignore", invalid="ignore"):
+            of_block = np.square(np.asarray(evaluation.residuals)).sum((1, 2))
+        return np.bincount(run, of_block, problem.tape.runs)
+
+    best = evaluate(still, unknowns)
     for _ in range(passes):
-        matrix = np.asarray(normal_matrix(evaluate(still, unknowns), still.tape, everyone))
-        step, _ = gauss_newton(matrix, set(), 0)
-        unknowns = _unflatten(problem, _flatten(unknowns) + step)
-    return unknowns, evaluate(still, unknowns)
+        matrix = np.asarray(normal_matrix(best, still.tape, everyone))
+        step = _unflatten(problem, jnp.asarray(gauss_newton(matrix, set(), 0)[0])).local
+        trial = unknowns._replace(local=unknowns.local + share[:, None] * step)
+        reached = evaluate(still, trial)
+        better = squares_of_runs(reached) <= squares_of_runs(
+            best
+        )  # not where it cannot be simulated
+        share = np.where(better, 1.0, share / 4)
+        local = jnp.where(better[:, None], trial.local, unknowns.local)
+        unknowns = unknowns._replace(local=local)
+        best = _taken(jnp.asarray(better[run]), reached, best)
+    return unknowns, best
+
+
+def with_own(problem: Problem, fit: Polished) -> Polished:
+    """A fit in which runs that do not count have found what belongs to each of them, too."""
+    if np.all(problem.counts):
+        return fit
+    unknowns, evaluation = fit_own(problem, fit.refined.unknowns)
+    counts = jnp.asarray(problem.counts)
+    local = jnp.where(counts[:, None], fit.refined.unknowns.local, unknowns.local)
+    refined = fit.refined._replace(unknowns=unknowns._replace(local=local))
+    scaled = _scaled(evaluation, np.asarray(problem.noise) / fit.noise)
+    return Polished(
+        refined, _taken(jnp.asarray(problem.counted), fit.evaluation, scaled), fit.noise
+    )
+
+
+def _scaled(evaluation: Evaluation, stretch: Float[np.ndarray, "2"]) -> Evaluation:
+    """Residuals and derivatives over another noise."""
+    return evaluation._replace(
+        residuals=evaluation.residuals * stretch[:, None],
+        jacobian=evaluation.jacobian * stretch[:, None, None],
+    )
+
+
+def _taken(blocks: Bool[Array, " blocks"], one: Evaluation, other: Evaluation) -> Evaluation:
+    """One evaluation in some blocks, another one in the others."""
+    return jax.tree.map(jax.vmap(jnp.where), *(Evaluation(*3 * [blocks]), one, other))
 
 
 # Curvature added to every coordinate in a step, as if each were known to within a factor of e beforehand:

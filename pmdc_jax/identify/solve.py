@@ -16,7 +16,7 @@ from .bounds import effect_bounds
 from .identification import Search
 from .parameters import Parameters
 from .prepare import Prepared
-from .refine import Polished, Problem, Refined, Unknowns, polish, refine
+from .refine import Polished, Problem, Refined, Unknowns, polish, refine, with_own
 from .search import Found
 from .search import search as global_search
 from .turning import turned
@@ -54,7 +54,7 @@ def solve(
     **Returns**: the problem as `searched` and `without_unfelt` leave it, and the fit.
     """
     given, solved = searched(given, search, seed, progress)
-    given, polished = without_unfelt(given, solved.polished)
+    given, polished = without_unfelt(given, with_own(given.problem, solved.polished))
     return given, solved._replace(polished=polished)
 
 
