@@ -31,7 +31,7 @@ SIZES = {
     "blind": 52,
     "noise_sweep": 500,  # 100 at each of 5 noises
     "rough": 51,
-    "foreign": 72,  # 17 effects and none, 4 kinds of sensors
+    "foreign": 90,  # 17 effects and none, 5 kinds of sensors
 }
 
 

@@ -78,7 +78,8 @@ class Case:
 class Bench:
     """How the runs are recorded: sensors and torque noise by run, pulses, an uneven clock.
 
-    Sensors may have noise on the voltage, round voltage and current, or count the lines of an encoder.
+    Sensors may have noise on the voltage, round voltage and current, count the lines of an encoder, or read the angle
+    by lines and no speed.
     """
 
     noises: Mapping[str, Noise]
@@ -88,6 +89,7 @@ class Bench:
     voltage_quantum_V: float = 0.0
     current_quantum_A: float = 0.0
     encoder_lines: float = 0.0
+    angle_lines: float = 0.0
 
 
 # ---------------------------------------------------------------------------------------- recording
@@ -125,11 +127,14 @@ def record(plant: Plant, excitation: Excitation, rng: Generator, noise: Noise, b
     voltage = excitation.voltage
     if bench.voltage_V:
         voltage = voltage + bench.voltage_V * rng.standard_normal(samples)
+    motion = {"speed_rad_s": speed}
+    if bench.angle_lines:
+        motion = {"angle_rad": _rounded(read[:, 2], 2 * math.pi / bench.angle_lines)}
     return {
         "time_s": excitation.time,
         "voltage_V": _rounded(voltage, bench.voltage_quantum_V),
         "current_A": _rounded(current, bench.current_quantum_A),
-        "speed_rad_s": speed,
+        **motion,
         "load_torque_Nm": excitation.load,
     }
 

@@ -1,7 +1,7 @@
 """Motors, drives and sensors of all kinds, far from the paper's: 6 to 48 V, 3 to 80 A, 0.2 to 5 ms a sample.
 
 Effects are drawn relative to the motor they are in. Few runs, some of a speed loop whose rough voltage the motor
-feels; sensors that count, round, or put noise on the voltage, which it does not feel.
+feels; sensors that count, round, measure the angle alone, or put noise on the voltage, which it does not feel.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .excitations import HOLDOUT, Excitations
 from .hidden import LIBRARY, Hidden, Parameters, log_uniform
 from .plant import Plant
 
-SENSORS = ("ordinary", "encoder", "noisy_voltage", "converter")
+SENSORS = ("ordinary", "encoder", "noisy_voltage", "converter", "angle")
 COUNT = 0.01  # of the largest speed is what one line of an encoder makes
 SAMPLE_TIMES = (2e-4, 5e-4, 1e-3, 2e-3, 5e-3)
 Voltage = Callable[[Generator, "Size", NDArray[np.float64]], NDArray[np.float64]]
@@ -162,6 +162,7 @@ def sensors(kind: str, plant: Plant, driven: Excitation) -> dict[str, float]:
     return {
         "ordinary": {},
         "encoder": {"encoder_lines": math.pi / (COUNT * size.speed * dt)},
+        "angle": {"angle_lines": 4096.0},
         "noisy_voltage": {"voltage_V": 0.004 * size.volt},
         "converter": {
             "voltage_quantum_V": size.volt / 1024,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from benchmarks.virtual_bench import Columns
 
 from .sparse import sparse
@@ -26,15 +28,27 @@ def ours(runs: Runs, holdout: Runs) -> Answer:
 def _recordings(runs: Runs):
     from pmdc_jax import Recording
 
-    names = ("time_s", "voltage_V", "current_A", "speed_rad_s")
-    return [
-        Recording(name, *(c[n] for n in names), load=c.get("load_torque_Nm"))
-        for name, c in runs.items()
-    ]
+    names = ("time_s", "voltage_V", "current_A", "speed_rad_s", "load_torque_Nm", "angle_rad")
+    return [Recording(run, *map(columns.get, names)) for run, columns in runs.items()]
+
+
+def _with_speed(method: Callable[[Runs, Runs], Answer]) -> Callable[[Runs, Runs], Answer]:
+    """A method that knows no angle, given its differences where no speed was measured."""
+
+    def speed(columns: Columns) -> Columns:
+        if "speed_rad_s" in columns:
+            return columns
+        return columns | {"speed_rad_s": np.gradient(columns["angle_rad"], columns["time_s"])}
+
+    def answer(runs: Runs, holdout: Runs) -> Answer:
+        given = ({run: speed(columns) for run, columns in some.items()} for some in (runs, holdout))
+        return method(*given)
+
+    return answer
 
 
 METHODS: Mapping[str, Callable[[Runs, Runs], Answer]] = {
     "pmdc": ours,
-    "stepwise": stepwise,
-    "sparse": sparse,
+    "stepwise": _with_speed(stepwise),
+    "sparse": _with_speed(sparse),
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ from jaxtyping import Array
 from ..effects import EFFECTS, AbstractEffect
 from ..identify.noise import is_coarse
 from ..motor import Motor
+from ..recording import Recording
 from ..simulate import Tape, free_run
 from .candidates import Candidate, Scales, candidates
 from .model import Model
@@ -82,8 +83,7 @@ class Library:
             c for c in candidates(self.scales) if known or not EFFECTS[c.effect].needs_current
         ]
         # errors that last look like a voltage that changes in time
-        speeds = [run.speed for run in base.given.training if run.speed is not None]
-        self.coarse = any(is_coarse(speed) for speed in speeds)
+        self.coarse = any(is_coarse(speed) for speed in _counted(base.given.training))
         # ... and of noise that the motor did not feel something is left
         self.wavers = bool(base.given.unfelt)
         self._whole: dict[int, np.ndarray] = {}
@@ -115,6 +115,12 @@ class Library:
             change = np.asarray(seen) - np.asarray(self._base.polished.evaluation.seen)
             self._whole[key] = change.transpose(2, 1, 0)
         return self._whole[key]
+
+
+def _counted(runs: Sequence[Recording]) -> list[np.ndarray]:
+    """Speeds as sensors count them: where angles were measured, how far they go in two samples."""
+    speeds = [run.speed for run in runs if run.speed is not None]
+    return speeds + [np.gradient(run.angle) for run in runs if run.angle is not None]
 
 
 @eqx.filter_jit

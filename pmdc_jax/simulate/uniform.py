@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from ..recording import Recording
 
@@ -61,7 +62,7 @@ def _interpolate(time: np.ndarray, samples: np.ndarray, grid: np.ndarray) -> np.
 
 
 def _speed_of(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Central difference: the mean speed over two steps, whose noise is that of the angle."""
+    """The derivative of a cubic spline: a difference would be a mean over two steps, which looks like a lag."""
     known = ~np.isnan(angle)
     unwrapped = np.full_like(angle, np.nan)
     jumps = np.abs(np.diff(angle[known]))
@@ -72,5 +73,6 @@ def _speed_of(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
         and np.max(jumps) > np.pi
     )
     unwrapped[known] = np.unwrap(angle[known]) if wraps else angle[known]
-    speed = np.gradient(unwrapped, time)
-    return np.asarray(speed)
+    speed = np.full_like(angle, np.nan)
+    speed[known] = CubicSpline(time[known], unwrapped[known])(time[known], 1)
+    return speed
