@@ -28,6 +28,7 @@ BELOW = {
     "check": {"alignment", "plausibility", "recording"},
     "motor_file": {"effects", "errors", "motor", "report"},
     "control": {
+        "compiled",
         "effects",
         "errors",
         "motor",

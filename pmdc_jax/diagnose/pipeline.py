@@ -112,7 +112,8 @@ def _judged(naming: Naming, solved: Solved) -> Identification:
 
 
 def _idle(naming: Naming, final: Identification, library: Library) -> str | None:
-    """One of several effects that the others do without: by its chance, or as its interval reaches to nothing."""
+    """One of several effects that the others do without: by its chance, as its interval reaches to nothing, or as the
+    runs determine nothing of it."""
     if len(naming.without) < 2:
         return None
     amplitude = {c.effect: c.amplitude for c in library.candidates if c.amplitude}
@@ -121,6 +122,7 @@ def _idle(naming: Naming, final: Identification, library: Library) -> str | None
         for effect, chance in naming.without.items()
         if chance > ALARM
         or (effect in amplitude and _may_be_none(final, effect, amplitude[effect]))
+        or all(final.parameters[f"{effect}.{f}"].ci95 is None for f in EFFECTS[effect].ranges)
     }
     return max(idle, key=lambda effect: idle[effect], default=None)
 
