@@ -411,6 +411,8 @@ def _rough(index: int, rng: Generator) -> Plan:
 def _foreign(index: int, rng: Generator) -> Plan:
     name, turn = _turn((None, *NAMES), index)
     kind, _ = _turn(foreign.SENSORS, index + turn)
+    if name in foreign.OF_SPEED_SENSOR and kind in foreign.WITHOUT_SPEED_SENSOR:
+        kind = foreign.SENSORS[0]
     plant = foreign.motor(rng)
     excited = foreign.excitations(rng, plant, kind)
     return Plan(

@@ -21,6 +21,9 @@ from .hidden import LIBRARY, Hidden, Parameters, log_uniform
 from .plant import Plant
 
 SENSORS = ("ordinary", "encoder", "noisy_voltage", "converter", "angle")
+# an encoder has neither
+OF_SPEED_SENSOR = ("speed_sensor_lag", "speed_sensor_delay")
+WITHOUT_SPEED_SENSOR = ("encoder", "angle")
 COUNT = 0.01  # of the largest speed is what one line of an encoder makes
 SAMPLE_TIMES = (2e-4, 5e-4, 1e-3, 2e-3, 5e-3)
 Voltage = Callable[[Generator, "Size", NDArray[np.float64]], NDArray[np.float64]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ from scipy import special, stats
 
 from ..effects import EFFECTS
 from ..identify.colour import Series, Whitener, plain, whitener
+from ..identify.noise import quantum
 from ..simulate import LOCAL
 from .candidates import Candidate
 from .evidence import Block, Evidence, blocks_of, products
@@ -38,10 +39,10 @@ class Screen(NamedTuple):
     curves: list[Curve]
     of_curve: list[Block]
     dry: float  # Coulomb friction in the model, N m
-    unfelt: float  # noise that was taken out of the recorded voltage, V
+    traces: Mapping[str, float]  # by unit: what may be but a trace of what a sensor does
 
     def possible(self, candidate: Candidate, coefficients: np.ndarray) -> bool:
-        """Whether physics allows these coefficients, and they are no trace of noise."""
+        """Whether physics allows these coefficients, and they are no trace of a sensor."""
         if candidate.own_phase:
             return True
         amplitude = abs(coefficients[-1]) * candidate.unit
@@ -49,10 +50,10 @@ class Screen(NamedTuple):
         return physical and bool(amplitude >= self.hidden(candidate))
 
     def hidden(self, candidate: Candidate) -> float:
-        """An amplitude that may be what is left of the noise of the recorded voltage."""
+        """An amplitude that may be but a trace of what a sensor does."""
         field = candidate.amplitude
-        voltage = field is not None and EFFECTS[candidate.effect].ranges[field].unit == "V"
-        return self.unfelt if voltage else 0.0
+        unit = EFFECTS[candidate.effect].ranges[field].unit if field else ""
+        return self.traces.get(unit, 0.0)
 
 
 def screen(model: Model, library: Library) -> Screen:
@@ -80,10 +81,17 @@ def screen(model: Model, library: Library) -> Screen:
         curves=curves,
         of_curve=blocks[len(library.candidates) :],
         dry=model.dry,
-        unfelt=max(model.given.unfelt.values(), default=0.0),
+        traces=_traces(model),
     )
     white = whitener(_without_clearest(found, rows))
     return found._replace(evidence=_evidence(rows, white), white=white)
+
+
+def _traces(model: Model) -> dict[str, float]:
+    """What is left of noise that was taken out of the recorded voltage, and half of what a current moves by."""
+    currents = [run.current for run in model.given.training if run.current is not None]
+    rounded = max((quantum(np.diff(current)) / 2 for current in currents), default=0.0)
+    return {"V": max(model.given.unfelt.values(), default=0.0), "A": rounded}
 
 
 def beyond_curves(found: Screen) -> float:

@@ -252,6 +252,10 @@ def _messages(given: Prepared, solved: Solved, best: Refined, tied: bool) -> tup
         for run in given.runs
         if run.name in given.unfelt
     ]
+    if given.averaged:
+        messages.append(
+            "the speed is a mean over two samples, as differences of an angle are: it is taken for that"
+        )
     if solved.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
     if not best.converged:

@@ -9,6 +9,8 @@ from jaxtyping import Float
 
 # A channel without noise (a simulation) is still scaled by something: this share of its size.
 FLOOR = 1e-5
+# Steps that are this share of the largest one are none
+ROUNDING = 1e-9
 
 
 def white_noise(signals: Sequence[np.ndarray]) -> float | None:
@@ -40,7 +42,9 @@ def _rounding(signals: Sequence[np.ndarray]) -> float:
 
 def quantum(steps: Float[np.ndarray, " steps"]) -> float:
     """The step of which all steps are multiples, zero if there is none."""
-    sizes = np.abs(steps[steps != 0])
+    sizes = np.abs(steps)
+    # a number divided by another one differs from itself by its last bits
+    sizes = sizes[sizes > ROUNDING * np.max(sizes, initial=0.0)]
     if not len(sizes):
         return 0.0
     smallest = float(np.quantile(sizes, 0.01))

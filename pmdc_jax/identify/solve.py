@@ -12,6 +12,7 @@ import numpy as np
 
 from ..simulate import Tape
 from ..threads import beside, side_by_side
+from .averaged import without_averaging
 from .bounds import effect_bounds
 from .identification import Search
 from .parameters import Parameters
@@ -49,12 +50,13 @@ class Solved(NamedTuple):
 def solve(
     given: Prepared, search: str, seed: int, progress: ReportProgress | None = None
 ) -> tuple[Prepared, Solved]:
-    """The best fit of a search, to runs less what the motor did not feel of what drives it.
+    """The best fit of a search, to runs less what their sensors put into them that is no motion of the motor.
 
-    **Returns**: the problem as `searched` and `without_unfelt` leave it, and the fit.
+    **Returns**: the problem as `searched`, `without_unfelt` and `without_averaging` leave it, and the fit.
     """
     given, solved = searched(given, search, seed, progress)
     given, polished = without_unfelt(given, with_own(given.problem, solved.polished))
+    given, polished = without_averaging(given, polished)
     return given, solved._replace(polished=polished)
 
 
