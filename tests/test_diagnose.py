@@ -224,12 +224,15 @@ def runs() -> list[Recording]:
     return found
 
 
-# one effect that acts through a parameter, one with a state of its own, one of a sensor
+# one effect that acts through a parameter, one with a state of its own, one of a sensor, one of the angle, where runs
+# begin anywhere in the turn
 SMOOTH = {
     "torque_constant_saturation": {"per_A2": 1e-9},
     "resistance_heating": {"rise_per_W": 1e-8, "time_constant_s": 0.2},
     "speed_sensor_delay": {"delay_s": 2.5e-3},
+    "cogging_torque": {"amplitude_Nm": 1e-6, "phase_rad": 0.3, "periods": 3.0},
 }
+BEGUN = jnp.array([0.4, 2.0])  # rad
 
 
 @pytest.mark.slow
@@ -240,8 +243,8 @@ def test_response_is_the_change_of_the_simulation(x64, name):
     bare = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()})
     effect = EFFECTS[name](**{f: jnp.asarray(x) for f, x in SMOOTH[name].items()})
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
-    without, with_it = (free_run(m, tape, tape.initial, jnp.zeros(2)) for m in (bare, motor))
-    path = path_of(without, tape, False)
+    without, with_it = (free_run(m, tape, tape.initial, jnp.zeros(2), BEGUN) for m in (bare, motor))
+    path = path_of(without, tape, BEGUN, False)
     if EFFECTS[name].equation == "sensor":
         found = sensed(motor, tape, path)
     else:

@@ -69,7 +69,8 @@ class Model:
         """The free run along which it was fitted, of the rotor itself."""
         held = "speed" in {EFFECTS[name].holds for name in self.effects}
         problem = self.given.problem
-        return path_of(of_rotor(problem, self.polished), problem.tape, held)
+        begun = self.polished.refined.unknowns.local[:, 3]
+        return path_of(of_rotor(problem, self.polished), problem.tape, begun, held)
 
     @property
     def misses(self) -> float:

@@ -30,23 +30,29 @@ class Path(NamedTuple):
 
     current: Signal
     speed: Signal
-    angle: Signal  # rad, as the tape says that the rotor turned, else as it is simulated to
+    angle: Signal  # rad, from where it began, as the tape says that the rotor turned, else as it is simulated to
     held: Bool[Array, "samples blocks"]
 
 
 @eqx.filter_jit
-def path_of(seen: Float[Array, "blocks 2 samples"], tape: Tape, dry: bool | Array) -> Path:
-    """The path of a free run as seen; `dry` says that the motor has friction that holds."""
+def path_of(
+    seen: Float[Array, "blocks 2 samples"],
+    tape: Tape,
+    begun: Float[Array, " runs"],
+    dry: bool | Array,
+) -> Path:
+    """The path of free runs as seen; each has `begun` at an angle in rad; `dry` says that the motor has friction that
+    holds."""
     current, speed = seen[:, 0].T, seen[:, 1].T
     drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid], tape.drive)
     current = drive.voltage * current + drive.current * jnp.asarray(tape.value).T
     step = jnp.asarray(tape.sample_time)[tape.grid][:, None]
-    # the mean speed over a sample turns the rotor; every run counts from its own start
+    # the mean speed over a sample turns the rotor
     ahead = jnp.append(seen[:, 1].reshape(-1)[1:], 0.0).reshape(tape.turn.shape)
     turn = jnp.where(jnp.isnan(tape.turn), (seen[:, 1] + ahead) / 2 * step, tape.turn)
     before = jnp.append(0.0, jnp.cumsum(turn.reshape(-1))[:-1]).reshape(turn.shape)
     first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
-    angle = before - before[first, :1]
+    angle = before - before[first, :1] + begun[tape.run][:, None]
     return Path(current, speed, angle.T, (speed == 0) & dry)
 
 
