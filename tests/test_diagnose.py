@@ -183,6 +183,17 @@ def test_a_periodic_torque_from_outside_is_found_at_its_frequency():
     assert line.high - line.low < 0.3
 
 
+def test_a_slow_one_too_where_it_is_strong():
+    """Six turns of it in a run, where noise is strongest."""
+    line = common_line(shaken([1.26] * 4, size=6.0))
+    assert line.low < 1.26 < line.high
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_one_run_alone_must_show_a_line_far_more_clearly(size):
+    assert common_line(shaken([7.3], size=size)) is None
+
+
 @pytest.mark.parametrize("hertz", [[7.3, 9.1, 12.4, 31.0], [7.3, 7.3, 21.0, 31.0]])
 def test_a_line_of_few_runs_is_none(hertz):
     assert common_line(shaken(hertz)) is None

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from benchmarks import virtual_bench as vb
-from benchmarks.naming import sparse, stepwise
+from benchmarks.naming import foreign, sparse, stepwise
 from benchmarks.naming.cases import SUITES, SWEEP_PERCENT, VISIBLE, case, dump
 from benchmarks.naming.excitations import HOLDOUT, jittered
 from benchmarks.naming.hidden import FORMULAS, LIBRARY, STRANGERS
@@ -264,6 +264,22 @@ def test_every_suite_plans_what_it_promises():
     assert len({p.noise for p in plans["nulls"]}) == 4
     assert all(len({h.name for h in p.hidden}) == 2 for p in plans["pairs"])
     assert all(p.rough for p in plans["rough"])
+
+
+def test_foreign_sensors_do_what_they_say():
+    """Of the first motors one has each kind of sensors."""
+    made = {c.noise: c for c in (case("foreign", k) for k in range(5))}
+    assert list(made) == list(foreign.SENSORS)
+    runs = {kind: next(iter(c.runs.values())) for kind, c in made.items()}
+    assert "speed_rad_s" not in runs["angle"]
+    turned = np.diff(runs["angle"]["angle_rad"]) * 4096 / (2 * np.pi)
+    np.testing.assert_allclose(turned, np.round(turned), atol=1e-6)
+    counts = runs["encoder"]["speed_rad_s"]
+    half = foreign.COUNT * made["encoder"].motor["Kb"] ** -1 / 2  # of a volt's speed
+    np.testing.assert_allclose(np.diff(counts) / half % 1.0 % (1 - 1e-6), 0.0, atol=1e-5)
+    # noise sits on every sample of the voltage, a converter leaves few values
+    assert len(np.unique(runs["noisy_voltage"]["voltage_V"])) > 1000
+    assert len(np.unique(runs["converter"]["current_A"])) < 513
 
 
 def test_an_uneven_clock_still_runs_forward():

@@ -24,9 +24,7 @@ def wave(samples: int = 2000) -> np.ndarray:
     return 10.0 * np.sin(2 * np.pi * np.arange(samples) / 200)
 
 
-@pytest.mark.parametrize(
-    ("signal", "left"), [(steps(), 0.25), (wave(), 0.6)], ids=["steps", "sine"]
-)
+@pytest.mark.parametrize(("signal", "left"), [(steps(), 0.3), (wave(), 0.6)], ids=["steps", "sine"])
 def test_noise_goes_and_steps_stay(signal, left):
     seen = signal + NOISE * np.random.default_rng(3).standard_normal(len(signal))
     error = smoothed(seen) - signal

@@ -15,12 +15,16 @@ from scipy import ndimage
 
 from .model import Model, rows_of
 
-# Neighbours whose median is the level about a line, and how far from the slowest ones a line is looked for
-NEIGHBOURS, SLOWEST = 41, 12
+# Neighbours whose median is the level about a line
+NEIGHBOURS = 41
+# Among the slowest, where noise rises steeply, neighbours from so far to so far away; still slower ones have none
+SLOWEST, NEAR, FAR = 12, 3, 6
 # How far a line stands out of the level about it. Measured on six runs each of motors that lack nothing: in single
 # runs with quantised speed up to 180, but at one frequency of three runs no more than 7 in any noise; a periodic
 # torque 200 and more in every run.
 STANDS_OUT = 50.0
+# ... and so many times as far if fewer than three runs could have it
+ALONE = 10.0
 # A line that what drives has as well is no line of its own
 DRIVEN = 10.0
 # ... and a drive that repeats itself this well has harmonics, at which any misfit has lines
@@ -72,6 +76,7 @@ def spectrum(
 def common_line(spectra: Sequence[Spectrum]) -> Line | None:
     """The line that stands out clearest in most runs at one frequency, if there is one."""
     longest = max(spectra, key=lambda s: s.duration)
+    enough = STANDS_OUT * (ALONE if len(spectra) < 3 else 1.0)
     best = None
     for one in spectra:
         for peak in np.argsort(one.residual)[-PEAKS:]:
@@ -81,7 +86,7 @@ def common_line(spectra: Sequence[Spectrum]) -> Line | None:
                 for s in spectra
                 if s.driving[_near(frequency, s)].max(initial=0.0) < DRIVEN
             ]
-            if 2 * sum(height > STANDS_OUT for height in mine) <= len(spectra):
+            if 2 * sum(height > enough for height in mine) <= len(spectra):
                 continue
             height = float(np.median(mine))
             if best is None or height > best.height:
@@ -105,8 +110,25 @@ def _over_level(signals: Float[np.ndarray, "samples signals"]) -> Float[np.ndarr
     level = ndimage.median_filter(power, (NEIGHBOURS, 1), mode="reflect") / np.log(2)
     floor = 1e-9 * power.sum(0) + 1e-300
     ratio = (power / np.maximum(level, floor)).max(1)
-    ratio[:SLOWEST] = 0.0
+    slowest = ratio[:SLOWEST]
+    slowest[:] = 0.0
+    if len(ratio) > SLOWEST + FAR:
+        slowest[NEAR + 1 :] = _over_neighbours(centred, floor)
     return ratio
+
+
+def _over_neighbours(
+    centred: Float[np.ndarray, "samples signals"], floor: Float[np.ndarray, " signals"]
+) -> Float[np.ndarray, " slow"]:
+    """The same for the slowest frequencies, of the tapered signals: a line must not leak into its neighbours."""
+    taper = np.hanning(len(centred))[:, None]
+    power = np.abs(np.fft.rfft(centred * taper, axis=0)[: SLOWEST + FAR]) ** 2
+    ratios = []
+    for k in range(NEAR + 1, SLOWEST):
+        neighbours = [*range(max(k - FAR, 1), k - NEAR + 1), *range(k + NEAR, k + FAR + 1)]
+        level = np.median(power[neighbours], axis=0) / np.log(2)
+        ratios.append(np.max(power[k] / np.maximum(level, floor)))
+    return np.array(ratios)
 
 
 def _repeats(driving: Float[np.ndarray, " samples"]) -> bool:
