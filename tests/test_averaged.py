@@ -17,8 +17,8 @@ QUICK = {"R": 0.5, "L": 0.001, "Kb": 0.05, "Kt": 0.05, "J": 5e-5, "f": 1e-4}
 LINES = 20_000
 
 
-def recorded(mean: bool) -> list[Recording]:
-    """Runs with the speed as an encoder gives it, or as an ideal tachometer does with noise as large."""
+def recorded(kind: str) -> list[Recording]:
+    """Runs with the speed as counts of an encoder give it, or as an ideal tachometer does with noise as large."""
     rng = np.random.default_rng(5)
     runs = {"prbs": prbs(rng, 4.0), "stairs": staircase(4.0)}
     found = []
@@ -26,17 +26,27 @@ def recorded(mean: bool) -> list[Recording]:
         read = simulate(Plant(**QUICK), *driven)
         count = np.floor(read[:, 2] * LINES / (2 * np.pi))
         speed = np.gradient(count, driven.time) * 2 * np.pi / LINES
-        if not mean:
+        if kind == "counts of the last sample":
+            speed = np.diff(count, prepend=count[0]) * 2 * np.pi / LINES / 1e-3
+        if kind == "tachometer":
             speed = read[:, 1] + np.std(speed - read[:, 1]) * rng.standard_normal(len(speed))
         current = read[:, 0] + 0.1 * rng.standard_normal(len(speed))
         found.append(Recording(name, driven.time, driven.voltage, current, speed, driven.load))
     return found
 
 
-@pytest.mark.parametrize("mean", [True, False])
-def test_only_a_mean_is_taken_for_one(mean):
-    found = identify(recorded(mean), tie=[("Kt", "Kb")])
-    assert any("mean over two samples" in m for m in found.messages) is mean
+def is_taken_for_a_mean(found) -> bool:
+    return any("mean over two samples" in m for m in found.messages)
+
+
+def test_counts_of_the_last_sample_are_late_and_no_mean_over_two():
+    assert not is_taken_for_a_mean(identify(recorded("counts of the last sample")))
+
+
+@pytest.mark.parametrize("kind", ["counts of two samples", "tachometer"])
+def test_only_a_mean_is_taken_for_one(kind):
+    found = identify(recorded(kind), tie=[("Kt", "Kb")])
+    assert is_taken_for_a_mean(found) is (kind == "counts of two samples")
     for name in ("R", "L", "Kb", "J"):
         estimate = found.parameters[name]
         assert abs(estimate.value - QUICK[name]) < max(3.5 * estimate.stderr, 2e-3 * QUICK[name])

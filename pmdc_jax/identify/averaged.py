@@ -20,10 +20,12 @@ from .prepare import Prepared
 from .refine import Polished, polish
 from .sharpen import residuals_of, series_of, training_runs
 
-# A mean over two samples must be this much likelier than the speed itself, by the logarithm, the smaller one where the
-# speed moves by steps, as counts of an encoder do; and what it does be of the size of one to within this
-LIKELIER, IF_COUNTED = 30.0, 1.0
-NEAR = 0.2
+# What a sensor that makes w + a h w' + b h^2 w'' / 6 of the speed w, sampled every h, has for a and b: a mean from the
+# sample before to the one after; the speed itself, and a mean over the last sample, which is late by half of it
+MEAN, OTHERS = np.array([0.0, 1.0]), np.array([[0.0, 0.0], [-0.5, 1.0]])
+# A mean over two samples must be this much likelier than those, by the logarithm, the smaller one where the speed moves
+# by steps, as counts of an encoder do; and be as likely as this itself
+LIKELIER, IF_COUNTED, LIKELY = 30.0, 1.0, 12.0
 
 
 def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
@@ -31,10 +33,12 @@ def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polishe
 
     **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if nothing was found.
     """
-    size, error = _size(given, fit)
-    likelier = (2 * size - 1) / (2 * error**2)
+    found, information = _regressed(given, fit)
+    unlikely, *of_others = (
+        float((found - x) @ information @ (found - x)) / 2 for x in (MEAN, *OTHERS)
+    )
     enough = IF_COUNTED if _is_counted(given) else LIKELIER
-    if likelier < enough or abs(size - 1) > NEAR + 3 * error:
+    if unlikely > LIKELY or min(of_others) - unlikely < enough:
         return given, fit
     tape = given.problem.tape
     measured = np.array(tape.measured)
@@ -62,26 +66,28 @@ def undone(mean: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]
     return solve_banded((1, 1), bands, mean)
 
 
-def _size(given: Prepared, fit: Polished) -> tuple[float, float]:
-    """How much of what a mean over two samples does is in the residuals, and its standard error.
+def _regressed(
+    given: Prepared, fit: Polished
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
+    """How much of what makes a speed late, and of what a mean over two samples does, is in the residuals; and the
+    inverse of the covariance of both.
 
-    By regression of every run's white residuals on it, beside the motor's parameters and what belongs to the run.
+    By regression of every run's white residuals on them, beside the motor's parameters and what belongs to the run.
     """
     tape = given.problem.tape
     jacobian = np.asarray(fit.evaluation.jacobian) * fit.noise[:, None, None]
-    weight = information = 0.0
+    gradient, information = np.zeros(2), np.zeros((2, 2))
     for run, residual in zip(training_runs(given), residuals_of(given, fit), strict=True):
         if 1 not in residual.kind[1]:
             continue
-        seen = series_of(tape, run, np.asarray(fit.evaluation.seen)).values
-        rounded = np.zeros_like(seen)
-        rounded[1:-1, -1] = np.diff(seen[:, -1], 2) / 6
+        speed = series_of(tape, run, np.asarray(fit.evaluation.seen)).values[:, -1]
+        sensed = np.zeros((*residual.values.shape, 2))
+        sensed[:, -1, 0] = np.gradient(speed)
+        sensed[1:-1, -1, 1] = np.diff(speed, 2) / 6
         moved = series_of(tape, run, jacobian).values
-        columns = np.concatenate([residual.values[..., None], rounded[..., None], moved], -1)
+        columns = np.concatenate([residual.values[..., None], sensed, moved], -1)
         white = whitener([residual])(0, Series(columns, residual.known, residual.kind))
-        left = white[:, :2] - white[:, 2:] @ np.linalg.lstsq(white[:, 2:], white[:, :2])[0]
-        information += left[:, 1] @ left[:, 1]
-        weight += left[:, 1] @ left[:, 0]
-    if not information > 0:
-        return 0.0, 1.0
-    return float(weight / information), float(1 / np.sqrt(information))
+        left = white[:, :3] - white[:, 3:] @ np.linalg.lstsq(white[:, 3:], white[:, :3])[0]
+        gradient += left[:, 1:].T @ left[:, 0]
+        information += left[:, 1:].T @ left[:, 1:]
+    return np.linalg.lstsq(information, gradient)[0], information
