@@ -358,7 +358,10 @@ def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unkn
     best = evaluate(still, unknowns)
     for _ in range(passes):
         matrix = np.asarray(normal_matrix(best, still.tape, everyone))
-        step = _unflatten(problem, jnp.asarray(gauss_newton(matrix, set(), 0)[0])).local
+        flat, gain = gauss_newton(matrix, set(), 0)
+        if gain < WORTH * matrix[-1, -1] / _samples(problem):
+            break
+        step = _unflatten(problem, jnp.asarray(flat)).local
         trial = unknowns._replace(local=unknowns.local + share[:, None] * step)
         reached = evaluate(still, trial)
         better = squares_of_runs(reached) <= squares_of_runs(

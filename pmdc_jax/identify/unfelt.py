@@ -22,6 +22,8 @@ from .prepare import Prepared
 from .refine import Polished, Problem, polish
 from .sharpen import series_of
 
+# Noise of a smaller share of the largest value is rounding
+ROUNDING = 1e-7
 # Half widths of the windows that are smoothed over, samples
 WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40)
 # Windows behind, around and ahead of a sample, each with the order of the polynomial that is fitted in it
@@ -100,7 +102,7 @@ def smoothed(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " sampl
     confidence intervals); Katkovnik, IEEE Transactions on Signal Processing 47 (1999) 2567.
     """
     noise = _noise(signal)
-    if not noise > 0:
+    if not noise > ROUNDING * np.max(np.abs(signal)):
         return signal
     estimates, errors = zip(*(_widest(signal, noise, *window) for window in WINDOWS), strict=True)
     return np.average(estimates, axis=0, weights=1 / np.square(errors))
