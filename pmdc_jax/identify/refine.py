@@ -375,8 +375,8 @@ def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unkn
 
 
 def with_own(problem: Problem, fit: Polished) -> Polished:
-    """A fit in which runs that do not count have found what belongs to each of them, too."""
-    if np.all(problem.counts):
+    """A fit in which runs that do not count have found what belongs to each of them, too, where nobody knows a load."""
+    if not np.any(~np.asarray(problem.counts) & np.asarray(problem.tape.load_unknown)):
         return fit
     unknowns, evaluation = fit_own(problem, fit.refined.unknowns)
     counts = jnp.asarray(problem.counts)

@@ -14,7 +14,6 @@ import attrs
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import savgol_coeffs
 
 from ..simulate import Tape
 from .colour import whitener
@@ -126,7 +125,7 @@ def _widest(
         if not order < samples - 1 < len(signal):
             continue
         before = {-1: width, 0: width, 1: 0}[side]
-        weights = savgol_coeffs(samples, order, pos=before, use="dot")
+        weights = np.linalg.pinv(np.vander(np.arange(samples) - before, order + 1))[-1]
         spread = noise * np.sqrt(weights @ weights)
         inner = slice(before, len(signal) - samples + 1 + before)
         estimate = np.full(len(signal), np.nan)

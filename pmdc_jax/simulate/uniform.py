@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from ..recording import Recording
 
@@ -63,6 +62,8 @@ def _interpolate(time: np.ndarray, samples: np.ndarray, grid: np.ndarray) -> np.
 
 def _speed_of(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
     """The derivative of a cubic spline: a difference would be a mean over two steps, which looks like a lag."""
+    from scipy.interpolate import CubicSpline  # late, for it takes long to load
+
     known = ~np.isnan(angle)
     unwrapped = np.full_like(angle, np.nan)
     jumps = np.abs(np.diff(angle[known]))
