@@ -364,9 +364,8 @@ def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unkn
         step = _unflatten(problem, jnp.asarray(flat)).local
         trial = unknowns._replace(local=unknowns.local + share[:, None] * step)
         reached = evaluate(still, trial)
-        better = squares_of_runs(reached) <= squares_of_runs(
-            best
-        )  # not where it cannot be simulated
+        # not where it cannot be simulated
+        better = squares_of_runs(reached) <= squares_of_runs(best)
         share = np.where(better, 1.0, share / 4)
         local = jnp.where(better[:, None], trial.local, unknowns.local)
         unknowns = unknowns._replace(local=local)
