@@ -32,6 +32,7 @@ SIZES = {
     "noise_sweep": 500,  # 100 at each of 5 noises
     "rough": 51,
     "foreign": 90,  # 17 effects and none, 5 kinds of sensors
+    "foreign_pairs": 50,
 }
 
 

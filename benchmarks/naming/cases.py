@@ -12,6 +12,7 @@ The suites:
     noise_sweep   each effect at 0.1, 0.5, 1, 2.5, 5 % noise, of the spread of each signal
     rough         singles with pulses at the bridge, an uneven clock, unequal noise in every run
     foreign       no effect or one, in motors, drives and sensors of all kinds (see `foreign`)
+    foreign_pairs two effects in those
 
 Two sets of seeds: methods are tuned on `tuning`, figures are reported on `report`. Both were fixed
 before anything was tuned. Sample k of every suite is the same whatever else is asked for.
@@ -361,12 +362,16 @@ NO_PAIRS = (
 )
 
 
+def _two_names(rng: Generator) -> tuple[str, ...]:
+    while True:
+        names = tuple(rng.choice(NAMES, 2, replace=False).tolist())
+        if set(names) not in NO_PAIRS:
+            return names
+
+
 def _pair(index: int, rng: Generator) -> Plan:
     noise, _ = _turn(NOISES, index)
-    while True:
-        names = rng.choice(NAMES, 2, replace=False).tolist()
-        if set(names) not in NO_PAIRS:
-            break
+    names = _two_names(rng)
     wanted = tuple(_clear(rng, 1.5, 8.0) for _ in names)
     hidden = tuple(LIBRARY[n] for n in names)
     return Plan(noise, "named", hidden, wanted, detail=" + ".join(names))
@@ -411,16 +416,26 @@ def _rough(index: int, rng: Generator) -> Plan:
 def _foreign(index: int, rng: Generator) -> Plan:
     name, turn = _turn((None, *NAMES), index)
     kind, _ = _turn(foreign.SENSORS, index + turn)
-    if name in foreign.OF_SPEED_SENSOR and kind in foreign.WITHOUT_SPEED_SENSOR:
+    return _in_foreign(rng, kind, (name,) if name else ())
+
+
+def _foreign_pair(index: int, rng: Generator) -> Plan:
+    kind, _ = _turn(foreign.SENSORS, index)
+    return _in_foreign(rng, kind, _two_names(rng))
+
+
+def _in_foreign(rng: Generator, kind: str, names: tuple[str, ...]) -> Plan:
+    """Effects in a foreign motor with a kind of sensors, or with ordinary ones if those cannot have the effects."""
+    if kind in foreign.WITHOUT_SPEED_SENSOR and set(names) & set(foreign.OF_SPEED_SENSOR):
         kind = foreign.SENSORS[0]
     plant = foreign.motor(rng)
     excited = foreign.excitations(rng, plant, kind)
     return Plan(
         kind,
-        "named" if name else "none_detected",
-        (foreign.EFFECTS[name],) if name else (),
-        (_clear(rng, 2.0, 8.0),) if name else (),
-        detail=name or "",
+        "named" if names else "none_detected",
+        tuple(foreign.EFFECTS[name] for name in names),
+        tuple(_clear(rng, 2.0, 8.0) for _ in names),
+        detail=" + ".join(names),
         drive=lambda rng: excited,
         plant=plant,
         noises=foreign.noise(rng, plant, kind),
@@ -439,6 +454,7 @@ SUITES: Mapping[str, Callable[[int, Generator], Plan]] = {
     "noise_sweep": _noise_sweep,
     "rough": _rough,
     "foreign": _foreign,
+    "foreign_pairs": _foreign_pair,
 }
 
 

@@ -111,7 +111,7 @@ def _staircase(rng: Generator, size: Size, time):
 def _speed_loop(rng: Generator, size: Size, time):
     """The voltage of a PI loop about a motor of first order, which answers to a noisy speed."""
     dt, per_speed = time[1], size.volt / size.speed
-    wanted = size.speed * np.repeat(rng.uniform(-0.6, 0.6, 8), -(-len(time) // 8))[: len(time)]
+    wanted = 0.6 * size.speed * _eight_levels(rng, len(time))
     speed, sum_of_errors, voltage = 0.0, 0.0, np.empty(len(time))
     for k, noise in enumerate(0.002 * size.speed * rng.standard_normal(len(time))):
         error = wanted[k] - speed - noise
@@ -122,8 +122,19 @@ def _speed_loop(rng: Generator, size: Size, time):
     return voltage
 
 
+def _eight_levels(rng: Generator, samples: int) -> NDArray[np.float64]:
+    """One after another, between -1 and 1."""
+    return np.repeat(rng.uniform(-1.0, 1.0, 8), -(-samples // 8))[:samples]
+
+
 VOLTAGES: tuple[Voltage, ...] = (
-    *(_steps, _two_levels, _chirp, _sines, _trapezoid, _staircase, _speed_loop),
+    _steps,
+    _two_levels,
+    _chirp,
+    _sines,
+    _trapezoid,
+    _staircase,
+    _speed_loop,
 )
 HELD_OUT: tuple[Voltage, ...] = (_steps, _two_levels, _sines)
 
@@ -139,7 +150,7 @@ def excitations(rng: Generator, plant: Plant, kind: str) -> Excitations:
     def excitation(voltage: Voltage, loaded: bool) -> Excitation:
         load = np.zeros(samples)
         if loaded:
-            load = np.repeat(rng.uniform(-0.25, 0.25, 8), -(-samples // 8))[:samples] * size.torque
+            load = 0.25 * size.torque * _eight_levels(rng, samples)
         return Excitation(time, voltage(rng, size, time), load)
 
     runs = {v.__name__[1:]: excitation(v, k == 0) for k, v in enumerate(chosen)}
