@@ -17,7 +17,7 @@ from .bounds import effect_bounds
 from .identification import Search
 from .parameters import Parameters
 from .prepare import Prepared
-from .refine import Polished, Problem, Refined, Unknowns, polish, refine, with_own
+from .refine import IDLE, Polished, Problem, Refined, Unknowns, polish, refine, with_own
 from .search import Found
 from .search import search as global_search
 from .turning import turned
@@ -111,7 +111,7 @@ def settle(given: Prepared, end: Refined) -> tuple[Prepared, Polished]:
     for _ in range(TURNINGS if given.problem.angular else 0):
         again = given._replace(problem=turned(given.problem, polished))
         better = polish(again.problem, polished.refined)
-        if not better.refined.fitness < polished.refined.fitness:
+        if not better.refined.fitness < (1 - IDLE) * polished.refined.fitness:
             break
         given, polished = again, better
     return given, polished
