@@ -256,12 +256,12 @@ class Polished(NamedTuple):
 
 # Steps after which a fall of the cost by no more than so much ends the polish: dry elements leave kinks where a
 # straight line foretells more than there is to gain
-PATIENCE, IDLE = 3, 1e-5
+PATIENCE, IDLE = 5, 1e-5
 # Gauss-Newton steps of the polish, and the fall of the sum of squares, in noise variances, below which a step is
 # not worth it: the square of 0.03 standard errors.
 POLISH = 20
 WORTH = 1e-3
-# ... and that a step may foretell that does not lower it, at the kinks of dry elements: of 0.3 errors
+# ... and that a step may foretell where none is found that lowers it, at the kinks of dry elements: of 0.3 errors
 AT_KINK = 0.1
 
 
@@ -269,7 +269,7 @@ def polish(problem: Problem, end: Refined, steps: int = POLISH) -> Polished:
     """Gauss-Newton to the bottom, while each output is weighed by what its own residuals turn out to be.
 
     The claim of convergence is the gradient's: no step within the bounds would lower the sum of squares by
-    more than `WORTH` noise variances (`AT_KINK`, where the step does not lower it). A coordinate held at a bound is
+    more than `WORTH` noise variances (`AT_KINK`, where no step is found that does). A coordinate held at a bound is
     let go where the gradient points back inside.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
@@ -282,15 +282,14 @@ def polish(problem: Problem, end: Refined, steps: int = POLISH) -> Polished:
             break
         if not np.isfinite(best.cost):
             break  # what cannot be simulated has no slope to follow
-        is_lower = reached.cost <= best.cost + 1e-9
-        if not is_lower and share > 1e-3 and gain > AT_KINK * _variance(problem, best):
+        if reached.cost > best.cost + 1e-9 and share > 1e-3:
             share /= 4  # the last step was too long
-        elif is_lower:
+        elif reached.cost <= best.cost + 1e-9:
             best, share = reached, 1.0
             start = np.asarray(best.unknowns.coordinates)
             held = {k for k in held if (best.matrix[k, -1] > 0) == (start[k] <= low[k])}
             step, gain = gauss_newton(best.matrix, held, len(low))
-            if converged := gain <= WORTH * _variance(problem, best):
+            if converged := gain <= WORTH * best.matrix[-1, -1] / _samples(problem):
                 break
         else:
             break
@@ -300,7 +299,7 @@ def polish(problem: Problem, end: Refined, steps: int = POLISH) -> Polished:
         moved[: len(low)] = inside
         reached = _weighed(problem, _unflatten(problem, jnp.asarray(moved)))
         costs.append(min(reached.cost, best.cost))
-    converged = converged or gain <= AT_KINK * _variance(problem, best)
+    converged = converged or gain <= AT_KINK * best.matrix[-1, -1] / _samples(problem)
     refined = Refined(best.unknowns, best.fitness, tuple(sorted(held)), bool(converged))
     return Polished(refined, best.evaluation, best.noise)
 
@@ -442,11 +441,6 @@ def _own_noise(problem: Problem, squares: np.ndarray):
     ratio = np.maximum(ratio, FLOOR * problem.sizes / noise)
     ratio = np.where(ratio == 0, 1.0, ratio)
     return noise * ratio, 1 / ratio
-
-
-def _variance(problem: Problem, at: _Weighed) -> float:
-    """Mean square residual, over the noise."""
-    return float(at.matrix[-1, -1]) / _samples(problem)
 
 
 def _samples(problem: Problem) -> float:
