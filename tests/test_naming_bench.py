@@ -276,10 +276,11 @@ def test_foreign_sensors_do_what_they_say():
     turned = np.diff(runs["angle"]["angle_rad"]) * 4096 / (2 * np.pi)
     np.testing.assert_allclose(turned, np.round(turned), atol=1e-6)
     counts = runs["encoder"]["speed_rad_s"]
-    volts = np.diff(counts) / (foreign.COUNT / made["encoder"].motor["Kb"])  # that make a line
-    supply = np.min(np.abs(volts[np.abs(volts) > 1e-3]))
-    assert np.isclose([6.0, 12.0, 24.0, 48.0], supply, rtol=1e-6).sum() == 1
-    np.testing.assert_allclose(volts / supply, np.round(volts / supply), atol=1e-6)
+    steps = np.diff(counts)
+    line = np.min(np.abs(steps[np.abs(steps) > 1e-6]))  # over the time of two samples
+    np.testing.assert_allclose(steps / line, np.round(steps / line), atol=1e-6)
+    lines = np.pi / line / runs["encoder"]["time_s"][1]
+    assert lines == pytest.approx(round(lines), abs=1e-6)
     # noise sits on every sample of the voltage, a converter leaves few values
     assert len(np.unique(runs["noisy_voltage"]["voltage_V"])) > 1000
     assert len(np.unique(runs["converter"]["current_A"])) < 513

@@ -175,7 +175,7 @@ def sensors(kind: str, plant: Plant, driven: Excitation) -> dict[str, float]:
     size, dt = Size.of(plant), float(driven.time[1])
     return {
         "ordinary": {},
-        "encoder": {"encoder_lines": math.pi / (COUNT * size.speed * dt)},
+        "encoder": {"encoder_lines": round(math.pi / (COUNT * size.speed * dt))},
         "angle": {"angle_lines": 4096.0},
         "noisy_voltage": {"voltage_V": 0.004 * size.volt},
         "converter": {

@@ -1,13 +1,15 @@
-"""A speed that is a difference of angles over two samples, and so a mean: taken for what it is.
+"""A speed that is a difference of angles, and so a mean over one sample or two: taken for what it is.
 
-Where the motor speeds up or slows down within some samples such a mean rounds its motion, as a soft shaft might. What
-it does, (w(k-1) - 2 w(k) + w(k+1)) / 6 to third order, is recognised by its size and undone: the derivative of a cubic
-spline through the same angles is the speed that has this mean.
+Where the motor speeds up or slows down within some samples such a mean is late, or rounds its motion as a soft shaft
+might. Which one was recorded the fits to all of them tell, and it is undone: the derivative of a cubic spline through
+the same angles is the speed that has this mean.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,28 +20,81 @@ from .colour import Series, whitener
 from .noise import quantum
 from .prepare import Prepared
 from .refine import Polished, polish
-from .sharpen import residuals_of, series_of, training_runs
+from .sharpen import series_of, training_runs
 
-# What a sensor that makes w + a h w' + b h^2 w'' / 6 of the speed w, sampled every h, has for a and b: a mean from the
-# sample before to the one after; the speed itself, and a mean over the last sample, which is late by half of it
-MEAN, OTHERS = np.array([0.0, 1.0]), np.array([[0.0, 0.0], [-0.5, 1.0]])
-# A mean over two samples must be this much likelier than those, by the logarithm, the smaller one where the speed moves
-# by steps, as counts of an encoder do; and be as likely as this itself
-LIKELIER, IF_COUNTED, LIKELY = 30.0, 1.0, 12.0
+Samples = Float[np.ndarray, " samples"]
+
+# A mean must be this much likelier than the speed itself, by the logarithm, the smaller one where the speed moves by
+# steps, as counts of an encoder do
+LIKELIER, IF_COUNTED = 30.0, 1.0
+# An encoder has fewer lines, and a whole number of them
+LINES, WHOLE = 2e4, 0.02
+
+
+class Sensed(NamedTuple):
+    """What a sensor may make of a speed, to third order in the sample time, and how to undo it.
+
+    The samples at both ends are as given, or nearly so.
+    """
+
+    over: str  # of what it is a mean
+    of: Callable[[Samples], Samples]
+    undone: Callable[[Samples], Samples]
+
+
+def _over_two(speed: Samples) -> Samples:
+    mean = np.convolve(speed, [1 / 6, 4 / 6, 1 / 6], "same")
+    mean[[0, -1]] = speed[[0, -1]]
+    return mean
+
+
+def _two_undone(mean: Samples) -> Samples:
+    bands = np.repeat([[1 / 6], [4 / 6], [1 / 6]], len(mean), axis=1)
+    bands[1, [0, -1]], bands[0, 1], bands[2, -2] = 1.0, 0.0, 0.0
+    return solve_banded((1, 1), bands, mean)
+
+
+def _over_last(speed: Samples) -> Samples:
+    around = np.concatenate([speed[:1], speed[:1], speed, speed[-1:]])
+    return np.convolve(around, [-1 / 24, 13 / 24, 13 / 24, -1 / 24], "valid")
+
+
+def _last_undone(mean: Samples) -> Samples:
+    """Two means over one sample are one over two; the last sample goes on as straight as the one before it."""
+    ahead = np.append(mean[1:], 2 * mean[-1] - mean[-2:-1].sum())
+    return _two_undone((mean + ahead) / 2)
+
+
+ITSELF = Sensed("", lambda speed: speed, lambda speed: speed)
+TWO = Sensed("the last and the next sample", _over_two, _two_undone)
+LAST = Sensed("the last sample", _over_last, _last_undone)
+# what is late by more than half a sample is so for another reason than a mean over one
+LATE = Sensed("", lambda x: np.append(x[:1], x[:-1]), lambda x: np.append(x[1:], x[-1:]))
 
 
 def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
-    """The runs with the speed itself where a mean over two samples was recorded, and the fit to them.
+    """The runs with the speed itself where a mean was recorded, and the fit to them.
 
-    **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if nothing was found.
+    A mean over the last sample is told from a delay only if the speed is clearly counted.
+
+    **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if no mean was found.
     """
-    found, information = _regressed(given, fit)
-    unlikely, *of_others = (
-        float((found - x) @ information @ (found - x)) / 2 for x in (MEAN, *OTHERS)
-    )
-    enough = IF_COUNTED if _is_counted(given) else LIKELIER
-    if unlikely > LIKELY or min(of_others) - unlikely < enough:
+    lines = _lines(given)
+    possible = [TWO, LAST, LATE] if lines else [TWO]
+    tried = [_without(given, fit, sensed) for sensed in possible]
+    itself = _unlikely(given, fit, ITSELF)
+    left = [_unlikely(given, after, s) for s, (_, after) in zip(possible, tried, strict=True)]
+    least = int(np.argmin(left))
+    sensed, gained = possible[least], itself - left[least]
+    if gained < (IF_COUNTED if lines else LIKELIER) or not sensed.over:
         return given, fit
+    if sensed is LAST and not all(n < LINES and abs(n - round(n)) < WHOLE for n in lines):
+        return given, fit
+    return tried[least]
+
+
+def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, Polished]:
+    """The runs with the speed of which a mean was recorded, and the fit to them."""
     tape = given.problem.tape
     measured = np.array(tape.measured)
     for run in range(tape.runs):
@@ -47,47 +102,37 @@ def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polishe
         known = np.asarray(tape.weight)[mine, 1].ravel() > 0
         if known.any():
             speed = measured[mine, 1].ravel()
-            speed[known] = undone(speed[known])
+            speed[known] = sensed.undone(speed[known])
             measured[mine, 1] = speed.reshape(-1, measured.shape[2])
     problem = replace(given.problem, tape=replace(tape, measured=jnp.asarray(measured)))
-    return given._replace(problem=problem, averaged=True), polish(problem, fit.refined)
+    return given._replace(problem=problem, averaged=sensed.over), polish(problem, fit.refined)
 
 
-def _is_counted(given: Prepared) -> bool:
-    """Whether all speeds move by steps."""
-    speeds = [run.speed for run in given.training if run.speed is not None]
-    return all(quantum(np.diff(speed[~np.isnan(speed)])) > 0 for speed in speeds)
+def _lines(given: Prepared) -> list[float]:
+    """How many lines an encoder has of which the speeds are counts in a sample, by every run; none if not all are."""
+    lines = []
+    for run in given.training:
+        if run.speed is not None:
+            step = quantum(np.diff(run.speed[~np.isnan(run.speed)]))
+            if not step:
+                return []
+            lines.append(2 * np.pi / step / np.median(np.diff(run.time)))
+    return lines
 
 
-def undone(mean: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """The signal of which (s(k-1) + 4 s(k) + s(k+1)) / 6 is given; its ends are as given."""
-    bands = np.repeat([[1 / 6], [4 / 6], [1 / 6]], len(mean), axis=1)
-    bands[1, [0, -1]], bands[0, 1], bands[2, -2] = 1.0, 0.0, 0.0
-    return solve_banded((1, 1), bands, mean)
-
-
-def _regressed(
-    given: Prepared, fit: Polished
-) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
-    """How much of what makes a speed late, and of what a mean over two samples does, is in the residuals; and the
-    inverse of the covariance of both.
-
-    By regression of every run's white residuals on them, beside the motor's parameters and what belongs to the run.
-    """
-    tape = given.problem.tape
-    jacobian = np.asarray(fit.evaluation.jacobian) * fit.noise[:, None, None]
-    gradient, information = np.zeros(2), np.zeros((2, 2))
-    for run, residual in zip(training_runs(given), residuals_of(given, fit), strict=True):
-        if 1 not in residual.kind[1]:
-            continue
-        speed = series_of(tape, run, np.asarray(fit.evaluation.seen)).values[:, -1]
-        sensed = np.zeros((*residual.values.shape, 2))
-        sensed[:, -1, 0] = np.gradient(speed)
-        sensed[1:-1, -1, 1] = np.diff(speed, 2) / 6
-        moved = series_of(tape, run, jacobian).values
-        columns = np.concatenate([residual.values[..., None], sensed, moved], -1)
-        white = whitener([residual])(0, Series(columns, residual.known, residual.kind))
-        left = white[:, :3] - white[:, 3:] @ np.linalg.lstsq(white[:, 3:], white[:, :3])[0]
-        gradient += left[:, 1:].T @ left[:, 0]
-        information += left[:, 1:].T @ left[:, 1:]
-    return np.linalg.lstsq(information, gradient)[0], information
+def _unlikely(given: Prepared, fit: Polished, sensed: Sensed) -> float:
+    """How unlikely the runs are as recorded, by a fit of whose speed that is made, as a logarithm."""
+    tape, seen, unlikely = given.problem.tape, np.asarray(fit.evaluation.seen), 0.0
+    for run in training_runs(given):
+        measured, simulated = (
+            series_of(tape, run, signal) for signal in (np.asarray(tape.measured), seen)
+        )
+        values = simulated.values.copy()
+        if 1 in simulated.kind[1]:
+            values[:, -1] = sensed.of(values[:, -1])
+        residual = Series(measured.values - values, measured.known, measured.kind)
+        white = whitener([residual])
+        rest = white(0, residual).reshape(-1, values.shape[1])
+        spread = np.linalg.slogdet(np.cov(rest, rowvar=False).reshape(2 * rest.shape[1:]))[1]
+        unlikely += len(rest) / 2 * (spread - 2 * np.linalg.slogdet(white.scales[0])[1])
+    return float(unlikely)

@@ -254,7 +254,7 @@ def _messages(given: Prepared, solved: Solved, best: Refined, tied: bool) -> tup
     ]
     if given.averaged:
         messages.append(
-            "the speed is a mean over two samples, as differences of an angle are: it is taken for that"
+            f"the speed is a mean over {given.averaged}, as differences of an angle are: it is taken for that"
         )
     if solved.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")

@@ -35,8 +35,8 @@ class Prepared(NamedTuple):
     problem: Problem
     # by run: standard deviation of what was taken out of the record of its drive, for the motor did not feel it
     unfelt: Mapping[str, float] = MappingProxyType({})
-    # whether the speeds were means over two samples, and are undone
-    averaged: bool = False
+    # over which samples the speeds were means, and are undone; empty, if they were none
+    averaged: str = ""
 
     @property
     def training(self) -> list[Recording]:
