@@ -78,3 +78,28 @@ def test_a_rough_voltage_that_the_motor_felt_is_left_alone():
     found = identify(recorded(felt=0.3, unfelt=0.0))
     assert not [m for m in found.messages if "did not feel" in m]
     assert np.max(np.abs(errors(found))) < 3.5
+
+
+def in_a_speed_loop() -> Recording:
+    """A motor held at one speed after another against loads that nobody measured, by a PI loop whose voltage answers
+    to the noise of the speed."""
+    motor, rng, dt, parts = vb.paper_motor(), np.random.default_rng(21), 1e-3, 20
+    wanted = np.repeat(rng.uniform(-200.0, 200.0, 8), 750)
+    load = np.repeat(rng.uniform(-0.2, 0.2, 16), 375)
+    current = speed = errors = 0.0
+    voltage, seen = np.empty(len(wanted)), np.empty((len(wanted), 2))
+    for k in range(len(wanted)):
+        seen[k] = current + 0.05 * rng.standard_normal(), speed + 0.3 * rng.standard_normal()
+        error = wanted[k] - seen[k, 1]
+        voltage[k] = np.clip(0.2 * error + 1.5 * errors, -24.0, 24.0)
+        errors += error * dt * (abs(voltage[k]) < 24.0)
+        for _ in range(parts):
+            pushed = (voltage[k] - motor.R * current - motor.Kb * speed) / motor.L
+            turned = (motor.Kt * current - motor.f * speed - load[k]) / motor.J
+            current, speed = current + pushed * dt / parts, speed + turned * dt / parts
+    return Recording("loop", dt * np.arange(len(wanted)), voltage, *seen.T)
+
+
+def test_an_unknown_load_does_not_pass_for_a_voltage_that_the_motor_did_not_feel():
+    found = identify([in_a_speed_loop()])
+    assert not [m for m in found.messages if "did not feel" in m]

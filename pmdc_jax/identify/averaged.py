@@ -13,16 +13,12 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from scipy.linalg import solve_banded
 
-from .colour import Series, whitener
+from .likelihood import Samples, unlikely
 from .noise import quantum
 from .prepare import Prepared
 from .refine import Polished, polish
-from .sharpen import series_of, training_runs
-
-Samples = Float[np.ndarray, " samples"]
 
 # A mean must be this much likelier than the speed itself, by the logarithm, the smaller one where the speed moves by
 # steps, as counts of an encoder do
@@ -65,7 +61,6 @@ def _last_undone(mean: Samples) -> Samples:
     return _two_undone((mean + ahead) / 2)
 
 
-ITSELF = Sensed("", lambda speed: speed, lambda speed: speed)
 TWO = Sensed("the last and the next sample", _over_two, _two_undone)
 LAST = Sensed("the last sample", _over_last, _last_undone)
 # what is late by more than half a sample is so for another reason than a mean over one
@@ -82,8 +77,8 @@ def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polishe
     lines = _lines(given)
     possible = [TWO, LAST, LATE] if lines else [TWO]
     tried = [_without(given, fit, sensed) for sensed in possible]
-    itself = _unlikely(given, fit, ITSELF)
-    left = [_unlikely(given, after, s) for s, (_, after) in zip(possible, tried, strict=True)]
+    itself = unlikely(given, fit)
+    left = [unlikely(given, after, s.of) for s, (_, after) in zip(possible, tried, strict=True)]
     least = int(np.argmin(left))
     sensed, gained = possible[least], itself - left[least]
     if gained < (IF_COUNTED if lines else LIKELIER) or not sensed.over:
@@ -118,21 +113,3 @@ def _lines(given: Prepared) -> list[float]:
                 return []
             lines.append(2 * np.pi / step / np.median(np.diff(run.time)))
     return lines
-
-
-def _unlikely(given: Prepared, fit: Polished, sensed: Sensed) -> float:
-    """How unlikely the runs are as recorded, by a fit of whose speed that is made, as a logarithm."""
-    tape, seen, unlikely = given.problem.tape, np.asarray(fit.evaluation.seen), 0.0
-    for run in training_runs(given):
-        measured, simulated = (
-            series_of(tape, run, signal) for signal in (np.asarray(tape.measured), seen)
-        )
-        values = simulated.values.copy()
-        if 1 in simulated.kind[1]:
-            values[:, -1] = sensed.of(values[:, -1])
-        residual = Series(measured.values - values, measured.known, measured.kind)
-        white = whitener([residual])
-        rest = white(0, residual).reshape(-1, values.shape[1])
-        spread = np.linalg.slogdet(np.cov(rest, rowvar=False).reshape(2 * rest.shape[1:]))[1]
-        unlikely += len(rest) / 2 * (spread - 2 * np.linalg.slogdet(white.scales[0])[1])
-    return float(unlikely)

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from ..simulate import Tape
 from .colour import whitener
+from .likelihood import unlikely
 from .prepare import Prepared
 from .refine import Polished, Problem, polish
 from .sharpen import series_of
@@ -32,15 +33,13 @@ WINDOWS = ((-1, 0), (0, 0), (1, 0), (-1, 1), (0, 2), (1, 1))
 DEPARTURE = 1.25
 # Rough parts of which the motor felt less than this share, so many standard errors below all, are noise
 FELT, CLEAR = 0.5, 5.0
-# ... unless the fit is worse by more than this without them
-NO_WORSE = 1.05
 
 
 def without_unfelt(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     """The runs with what drives them smoothed where the motor did not feel its rough part, and the fit to them.
 
-    **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if nothing was found, or the
-    fit is worse for it.
+    **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if nothing was found, or makes
+    the runs less likely: where most of a misfit is another one's, its regression on a rough part may mislead.
     """
     drives = [np.asarray(getattr(run, run.drive)) for run in given.runs]
     rough = [drive - smoothed(drive) for drive in drives]
@@ -53,7 +52,7 @@ def without_unfelt(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     lost = [(1 - share) * r for share, r in zip(felt, rough, strict=True)]
     problem = _driven(given, [d - x for d, x in zip(drives, lost, strict=True)])
     better = polish(problem, fit.refined)
-    if better.refined.fitness > NO_WORSE * fit.refined.fitness:
+    if unlikely(given, better) > unlikely(given, fit):
         return given, fit
     unfelt = {
         run.name: float(np.std(x)) for run, x in zip(given.runs, lost, strict=True) if np.any(x)
