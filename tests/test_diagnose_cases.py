@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from importlib import resources
 
+import attrs
 import numpy as np
 import pytest
 
@@ -80,6 +81,13 @@ def test_nothing_is_found_where_nothing_is_missing(noise):
         assert estimate.stderr < 1.2 * found.base.parameters[name].stderr, name
     by_name = {d.effect: d for d in found.detectable}
     assert 0 < by_name["coulomb_friction"].amplitude < 0.05
+
+
+def test_a_constant_load_would_not_have_shown_beside_a_load_that_nobody_knows():
+    run = attrs.evolve(recorded(vb.BenchMotor(**PAPER), 1, NOISE)[0], load=None)
+    visible = {d.effect for d in diagnose([run]).detectable}
+    assert "coulomb_friction" in visible
+    assert "constant_load" not in visible
 
 
 def test_the_packaged_sample_hides_a_dry_friction():

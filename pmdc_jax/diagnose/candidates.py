@@ -57,6 +57,11 @@ class Candidate(NamedTuple):
             return 1.0
         return self.columns[-1][self.amplitude]
 
+    @property
+    def largest(self) -> float:
+        """An amplitude as large as what the motor does: a larger one no motor has."""
+        return np.inf if self.units[-1] == 1.0 else self.units[-1] / SMALL
+
 
 # An amplitude that is small, as a share of the scale: the response to it is as good as a derivative.
 SMALL = 1e-4

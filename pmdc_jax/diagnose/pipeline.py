@@ -235,7 +235,7 @@ def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
 
 
 def _detectable(found: Screen) -> tuple[Detectable, ...]:
-    """For every effect the smallest amplitude that would have been seen nine times of ten."""
+    """For every effect that may be seen the smallest amplitude that would have been, nine times of ten."""
     count = len(found.candidates) + len(found.curves)
     needed = stats.norm.isf(ALARM / count / 2) + stats.norm.isf(0.1)
     smallest: dict[str, Detectable] = {}
@@ -245,9 +245,8 @@ def _detectable(found: Screen) -> tuple[Detectable, ...]:
             continue
         error = float(np.min(found.evidence.regress([block]).errors[0][..., -1]))
         amplitude = max(float(needed * error * candidate.unit), found.hidden(candidate))
-        if error > 0 and (
-            candidate.effect not in smallest or amplitude < smallest[candidate.effect].amplitude
-        ):
+        before = smallest.get(candidate.effect)
+        if error > 0 and amplitude < (before.amplitude if before else candidate.largest):
             unit = EFFECTS[candidate.effect].ranges[field].unit
             smallest[candidate.effect] = Detectable(candidate.effect, field, amplitude, unit)
     return tuple(smallest.values())
