@@ -116,6 +116,14 @@ def test_a_column_that_says_nothing_new_changes_nothing():
     assert with_it.squares == pytest.approx(evidence.regress().squares, rel=1e-9)
 
 
+def test_a_column_that_belongs_to_the_run_as_well_says_nothing():
+    """But for rounding, which is no evidence."""
+    J, own, X, r = random_evidence(2)
+    X = [np.hstack([x, o[:, :1] + 1e-7 * x[:, :1]]) for x, o in zip(X, own, strict=True)]
+    fit = evidence_of(J, own, X, r).regress([Block((4 + 5,))])
+    assert fit.coefficients[0] == fit.errors[0] == 0.0
+
+
 @pytest.mark.parametrize("freedom", [1, 2, 12, 42])
 def test_chance_far_out_meets_the_exact_one(freedom):
     """The leading term of the tail, where the exact one can still be computed."""

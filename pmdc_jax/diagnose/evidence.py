@@ -45,7 +45,7 @@ class Regression(NamedTuple):
 class Evidence(NamedTuple):
     """Inner products of the white rows of every run: motor parameters first, then columns, residual last.
 
-    What belongs to a run alone (its initial state, its load) is projected out.
+    What belongs to a run alone (its initial state, its load) is projected out, with what can hardly be told from it.
     """
 
     products: Float[np.ndarray, "runs columns columns"]
@@ -123,5 +123,7 @@ def products(
             rows += len(piece)
         kept, alone = slice(0, -own), slice(-own, None)
         across = total[alone, kept]
-        gathered.append(total[kept, kept] - across.T @ _inverse(total[alone, alone]) @ across)
+        left = total[kept, kept] - across.T @ _inverse(total[alone, alone]) @ across
+        seen = np.diag(left) > VISIBLE * np.diag(total)[kept]
+        gathered.append(left * seen * seen[:, None])
     return Evidence(np.array(gathered), parameters, rows)
