@@ -57,8 +57,9 @@ def late(runs: list[Recording], samples: int) -> list[Recording]:
     return [attrs.evolve(r, speed=np.roll(r.speed, samples)) for r in runs]
 
 
-def test_what_is_later_than_a_mean_over_a_sample_is_none():
-    found = identify(late(recorded("counts of the last sample"), 2))
+@pytest.mark.parametrize("kind", ["counts of the last sample", "tachometer"])
+def test_what_is_later_than_a_mean_over_a_sample_is_none(kind):
+    found = identify(late(recorded(kind), 9))
     assert not any("mean over" in m for m in found.messages)
 
 

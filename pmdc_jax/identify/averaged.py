@@ -33,7 +33,7 @@ class Sensed(NamedTuple):
     The samples at both ends are as given, or nearly so.
     """
 
-    over: str  # of what it is a mean
+    over: str  # of what it is a mean, if of anything
     of: Callable[[Samples], Samples]
     undone: Callable[[Samples], Samples]
 
@@ -63,29 +63,34 @@ def _last_undone(mean: Samples) -> Samples:
 
 TWO = Sensed("the last and the next sample", _over_two, _two_undone)
 LAST = Sensed("the last sample", _over_last, _last_undone)
-# what is late by more than half a sample is so for another reason than a mean over one
 LATE = Sensed("", lambda x: np.append(x[:1], x[:-1]), lambda x: np.append(x[1:], x[-1:]))
 
 
 def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     """The runs with the speed itself where a mean was recorded, and the fit to them.
 
-    A mean over the last sample is told from a delay only if the speed is clearly counted.
+    A mean over the last sample is told from a delay only if the speed is clearly counted; and a speed that comes later
+    than a mean would is late for another reason.
 
     **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if no mean was found.
     """
     lines = _lines(given)
-    possible = [TWO, LAST, LATE] if lines else [TWO]
-    tried = [_without(given, fit, sensed) for sensed in possible]
-    itself = unlikely(given, fit)
-    left = [unlikely(given, after, s.of) for s, (_, after) in zip(possible, tried, strict=True)]
+    means = [TWO, LAST] if lines else [TWO]
+    tried = [_without(given, fit, mean) for mean in means]
+    left = [unlikely(given, after, mean.of) for mean, (_, after) in zip(means, tried, strict=True)]
     least = int(np.argmin(left))
-    sensed, gained = possible[least], itself - left[least]
-    if gained < (IF_COUNTED if lines else LIKELIER) or not sensed.over:
+    mean, (undone, better) = means[least], tried[least]
+    gained = unlikely(given, fit) - left[least]
+    if gained < (IF_COUNTED if lines else LIKELIER):
         return given, fit
-    if sensed is LAST and not all(n < LINES and abs(n - round(n)) < WHOLE for n in lines):
+    if mean is LAST and not all(n < LINES and abs(n - round(n)) < WHOLE for n in lines):
         return given, fit
-    return tried[least]
+    in_time = (
+        fit if mean is TWO else better
+    )  # a mean over two samples is in time, but has another noise
+    if _without(given, fit, LATE)[1].refined.fitness < in_time.refined.fitness:
+        return given, fit
+    return undone, better
 
 
 def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, Polished]:
