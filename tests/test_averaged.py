@@ -63,6 +63,11 @@ def test_what_is_later_than_a_mean_over_a_sample_is_none(kind):
     assert not any("mean over" in m for m in found.messages)
 
 
+def test_counts_without_a_current_may_be_late_by_an_inductance():
+    runs = [attrs.evolve(r, current=None) for r in recorded("counts of the last sample")]
+    assert not any("mean over" in m for m in identify(runs).messages)
+
+
 def test_counts_of_no_whole_number_of_lines_may_be_late_for_any_reason():
     runs = recorded("counts of the last sample")
     stretched = [attrs.evolve(r, speed=1.0001 * r.speed) for r in runs]

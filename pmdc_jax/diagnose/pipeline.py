@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 # A hat of a curve whose misfit is so many standard errors is part of a region
 CLEAR = 4.0
+# By this chance of the runs without it an effect is there, however little else they tell of it
+CERTAIN = 1e-30
 
 
 @double_precision
@@ -113,7 +115,7 @@ def _judged(naming: Naming, solved: Solved) -> Identification:
 
 def _idle(naming: Naming, final: Identification, library: Library) -> str | None:
     """One of several effects that the others do without: by its chance, as its interval reaches to nothing, or as the
-    runs determine nothing of it."""
+    runs determine nothing of it and do not call for it."""
     if len(naming.without) < 2:
         return None
     amplitude = {c.effect: c.amplitude for c in library.candidates if c.amplitude}
@@ -122,7 +124,10 @@ def _idle(naming: Naming, final: Identification, library: Library) -> str | None
         for effect, chance in naming.without.items()
         if chance > ALARM
         or (effect in amplitude and _may_be_none(final, effect, amplitude[effect]))
-        or all(final.parameters[f"{effect}.{f}"].ci95 is None for f in EFFECTS[effect].ranges)
+        or (
+            chance > CERTAIN
+            and all(final.parameters[f"{effect}.{f}"].ci95 is None for f in EFFECTS[effect].ranges)
+        )
     }
     return max(idle, key=lambda effect: idle[effect], default=None)
 

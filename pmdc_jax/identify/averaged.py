@@ -69,13 +69,13 @@ LATE = Sensed("", lambda x: np.append(x[:1], x[:-1]), lambda x: np.append(x[1:],
 def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     """The runs with the speed itself where a mean was recorded, and the fit to them.
 
-    A mean over the last sample is told from a delay only if the speed is clearly counted; and a speed that comes later
-    than a mean would is late for another reason.
+    A mean over the last sample is told from a delay only if the speed is clearly counted, and from an inductance only
+    beside a current; and a speed that comes later than a mean would is late for another reason.
 
     **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if no mean was found.
     """
     lines = _lines(given)
-    means = [TWO, LAST] if lines else [TWO]
+    means = [TWO, LAST] if lines and given.problem.samples[0] > 0 else [TWO]
     tried = [_without(given, fit, mean) for mean in means]
     left = [unlikely(given, after, mean.of) for mean, (_, after) in zip(means, tried, strict=True)]
     least = int(np.argmin(left))
