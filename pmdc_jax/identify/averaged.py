@@ -85,9 +85,8 @@ def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polishe
         return given, fit
     if mean is LAST and not all(n < LINES and abs(n - round(n)) < WHOLE for n in lines):
         return given, fit
-    in_time = (
-        fit if mean is TWO else better
-    )  # a mean over two samples is in time, but has another noise
+    # a mean over two samples is in time as it is; undone, it has another noise
+    in_time = fit if mean is TWO else better
     if _without(given, fit, LATE)[1].refined.fitness < in_time.refined.fitness:
         return given, fit
     return undone, better
@@ -100,7 +99,7 @@ def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, 
     for run in range(tape.runs):
         mine = np.asarray(tape.run) == run
         known = np.asarray(tape.weight)[mine, 1].ravel() > 0
-        if known.any():
+        if known.sum() > 2:
             speed = measured[mine, 1].ravel()
             speed[known] = sensed.undone(speed[known])
             measured[mine, 1] = speed.reshape(-1, measured.shape[2])
