@@ -20,9 +20,9 @@ from .noise import quantum
 from .prepare import Prepared
 from .refine import Polished, polish
 
-# A mean must be this much likelier than the speed itself, by the logarithm, the smaller one where the speed moves by
-# steps, as counts of an encoder do
-LIKELIER, IF_COUNTED = 30.0, 1.0
+# A mean must be this much likelier than the speed itself, by the logarithm; or be no less likely by more, where the
+# speed moves by steps as counts of an encoder do
+LIKELIER = 30.0
 # An encoder has fewer lines, and a whole number of them
 LINES, WHOLE = 2e4, 0.02
 
@@ -74,16 +74,15 @@ def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polishe
 
     **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if no mean was found.
     """
-    lines = _lines(given)
-    means = [TWO, LAST] if lines and given.problem.samples[0] > 0 else [TWO]
+    counted = _is_counted(given)
+    means = [TWO, LAST] if given.problem.samples[0] > 0 else [TWO]
     tried = [_without(given, fit, mean) for mean in means]
     left = [unlikely(given, after, mean.of) for mean, (_, after) in zip(means, tried, strict=True)]
     least = int(np.argmin(left))
     mean, (undone, better) = means[least], tried[least]
-    gained = unlikely(given, fit) - left[least]
-    if gained < (IF_COUNTED if lines else LIKELIER):
+    if unlikely(given, fit) - left[least] < (-LIKELIER if counted else LIKELIER):
         return given, fit
-    if mean is LAST and not all(n < LINES and abs(n - round(n)) < WHOLE for n in lines):
+    if mean is LAST and not counted:
         return given, fit
     # a mean over two samples is in time as it is; undone, it has another noise
     in_time = fit if mean is TWO else better
@@ -107,13 +106,12 @@ def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, 
     return given._replace(problem=problem, averaged=sensed.over), polish(problem, fit.refined)
 
 
-def _lines(given: Prepared) -> list[float]:
-    """How many lines an encoder has of which the speeds are counts in a sample, by every run; none if not all are."""
-    lines = []
-    for run in given.training:
-        if run.speed is not None:
-            step = quantum(np.diff(run.speed[~np.isnan(run.speed)]))
-            if not step:
-                return []
-            lines.append(2 * np.pi / step / np.median(np.diff(run.time)))
-    return lines
+def _is_counted(given: Prepared) -> bool:
+    """Whether the speeds of all runs are multiples of what a line of an encoder makes in a sample."""
+    speeds = [(run, run.speed) for run in given.training if run.speed is not None]
+    for run, speed in speeds:
+        step = quantum(np.diff(speed[~np.isnan(speed)]))
+        lines = 2 * np.pi / step / np.median(np.diff(run.time)) if step else np.inf
+        if lines > LINES or abs(lines - round(lines)) > WHOLE:
+            return False
+    return bool(speeds)
