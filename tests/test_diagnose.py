@@ -29,7 +29,7 @@ from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.simulate import Tape, free_run
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
-SCALES = Scales(10.0, 300.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0)
+SCALES = Scales(10.0, 300.0, 10.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0)
 
 
 def test_every_effect_has_a_row():
@@ -47,6 +47,14 @@ def test_candidates_are_within_the_ranges(name):
         assert built is not None
         for field, r in EFFECTS[name].ranges.items():
             assert r.scale == "linear" or built[field] > 0
+
+
+def test_only_waves_that_records_show_are_tried():
+    """At 40 rad/s, of samples of 20 ms, one of seven periods comes round in one and an eighth."""
+    seldom = SCALES._replace(slow=40.0, sample_time=0.02)
+    tried = TABLE["cogging_torque"]
+    assert [c.columns[0]["periods"] for c in tried("", seldom)] == list(range(1, 8))
+    assert max(c.columns[0]["periods"] for c in tried("", SCALES)) == 48
 
 
 @pytest.mark.parametrize("simple", FULLER)

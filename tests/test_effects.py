@@ -415,6 +415,23 @@ def test_agrees_with_an_independent_integrator(x64, name):
     assert found[0] < CASES[name].tolerance, found
 
 
+@pytest.mark.parametrize("name, most", [("cogging_torque", 0.1), ("torque_ripple", 3.0)])
+@pytest.mark.parametrize("periods", [12.0, 24.0])
+def test_a_wave_that_comes_round_within_a_sample(x64, name, most, periods):
+    """At full speed, by 5.8 and 11.5 rad a sample. If it were taken at samples, the speed would be off by 3 to 24 times
+    what the wave does; of a ripple, whose current ripples as well, some is left."""
+    values = CASES[name].values | {"periods": periods}
+    values[CASES[name].amplitude] /= 5
+    fast = recordings(voltage=24.0, load=0.0, current=2.4, speed=480.0)
+    start, turning = np.array([2.4, 480.0, 0.0]), CASES[name]._replace(values=values)
+    expected = np.concatenate([integrated(turning, run, start, run.time)[1] for run in fast])
+    plain, found = (
+        np.concatenate(simulated(motor, fast))[:, 1]
+        for motor in (LINEAR, with_effect(name, values))
+    )
+    assert np.std(found - expected) < most * np.std(plain - expected)
+
+
 @pytest.mark.parametrize("name", ["resistance_heating", "stribeck_friction"])
 def test_slow_sampling_is_as_exact(x64, name):
     """At 10 ms, in equal steps of a millisecond or less."""

@@ -21,6 +21,7 @@ class Scales(NamedTuple):
 
     current: float  # A
     speed: float  # rad/s
+    slow: float  # rad/s, that of the slowest twentieth of the motion
     voltage: float  # V
     torque: float  # N m
     inertia: float  # kg m^2
@@ -163,7 +164,10 @@ def _periodic(field: str, size: Callable[[Scales], float], *others: Values):
             columns = tuple({field: small, "phase_rad": p, **shape} for p in (0.0, np.pi / 2))
             return Candidate(name, columns, (small, small), build, field, own_phase=True)
 
-        return [candidate(periods, other) for other in others or ({},) for periods in PERIODS]
+        # what comes round within a sample even where the motor is slow, no record shows
+        most = 2 * np.pi / (scales.slow * scales.sample_time)
+        shown = [periods for periods in PERIODS if periods < most]
+        return [candidate(periods, other) for other in others or ({},) for periods in shown]
 
     return rows
 

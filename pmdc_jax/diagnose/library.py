@@ -30,6 +30,8 @@ KNOTS, KNOTS_IN_TIME = 9, 7
 # Periods a turn of a torque that comes round behind a gear; two neighbours differ by half a period in some 500 rad
 BEHIND_GEAR = np.arange(0.02, 0.25, 0.006)
 KNOTS_IN_PERIOD = 25
+# A motor moves above this share of its speed, and is slow for this share of the time that it moves
+MOVING, SLOWEST = 0.02, 0.05
 # Columns that are simulated side by side: the more, the more memory they take
 TOGETHER = 32
 
@@ -220,9 +222,11 @@ def _scales(base: Model) -> Scales:
     current, speed = (
         float(np.quantile(np.abs(seen[counted][:, c][there]), 0.95)) + 1e-9 for c in range(2)
     )
+    speeds = np.append(np.abs(seen[counted][:, 1][there]), speed)
+    slow = float(np.quantile(speeds[speeds > MOVING * speed], SLOWEST))
     value = float(np.quantile(np.abs(np.asarray(tape.value)[counted][there]), 0.95)) + 1e-9
     step = float(np.min(np.asarray(tape.sample_time)))
     longest = max(run.time[-1] - run.time[0] for run in base.given.training)
     driven = bool(np.all(np.asarray(tape.drive.torque) > 0))
     torque = value if driven else float(motor.Kt) * current
-    return Scales(current, speed, value, torque, float(motor.J), step, float(longest))
+    return Scales(current, speed, slow, value, torque, float(motor.J), step, float(longest))

@@ -9,7 +9,8 @@ each of which does nothing unless the effect overrides it:
 - `voltage_drop` and `torque`: smooth terms of the electrical and the mechanical equation
 - `load_at_rotor`: what of the load torque acts on the rotor itself
 - `grip`: a dry, set-valued term that can hold a state at exactly zero (stiction, brush contact)
-- `teeth`, `while_begun` and `loose`: flanks that touch and part (a gear)
+- `teeth` and `loose`: flanks that touch and part (a gear)
+- `over_step`: how it acts on average over a step, or until something switches
 - `states`, `rest` and `derivative`: states of its own, how they begin and how they move
 - `recurrence`: after how much of a state everything is as before
 - `linear`: the linear effect that it is, or nearly is, whose states then join the exact step
@@ -152,9 +153,9 @@ class AbstractEffect(eqx.Module):
         """How its teeth stand, on the side where they are nearer or the one given; needs `twists`."""
         raise NotImplementedError(f"{self.name} has no teeth")
 
-    def while_begun(self, state: State) -> AbstractEffect:
-        """The effect as it stays throughout a step that begins with this state, until its teeth touch or part."""
-        del state
+    def over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
+        """The effect as it acts throughout a step of so many seconds that begins with this state."""
+        del state, seconds
         return self
 
     def loose(self) -> AbstractEffect:

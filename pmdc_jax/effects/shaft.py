@@ -123,7 +123,9 @@ class GearBacklash(_TwoInertias):
         teeth = self.teeth(state)
         return jnp.where(teeth.touch, teeth.side * self.stiffness_Nm_rad * teeth.push, 0.0)
 
-    def while_begun(self, state: State) -> AbstractEffect:
+    def over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
+        """As it stays until its teeth touch or part."""
+        del seconds
         return self._held(self.gap_rad, self.teeth(state))
 
     def stiffens(self, motor: Motor, current: Scalars) -> Scalars:

@@ -195,9 +195,9 @@ def _step(
         along = jax.tree.map(
             lambda a, b: jnp.where(touching, a, b), along._replace(apart=None), along.apart
         )
-        motor = motor.with_effects(e.while_begun(state) for e in motor.effects)
     weights = along.weights
     assert weights is not None
+    motor = motor.with_effects(e.over_step(state, weights.step) for e in motor.effects)
     rate, after = _unswitched(motor, along.whole, weights, drive, state, value, load)
     x, begun, moved = _vector(motor, state), _vector(motor, rate), _vector(motor, after)
     slow = _slow(motor, after)
