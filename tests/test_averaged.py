@@ -5,17 +5,20 @@ from __future__ import annotations
 import attrs
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from benchmarks.naming.plant import Plant, simulate
 from benchmarks.virtual_bench import prbs, staircase
 from pmdc_jax import identify
-from pmdc_jax.identify.averaged import LAST, TWO
+from pmdc_jax.identify.averaged import LAST, TWO, counted_over
 from pmdc_jax.identify.noise import quantum
 from pmdc_jax.recording import Recording
 
 # a motor that speeds up within a few samples
 QUICK = {"R": 0.5, "L": 0.001, "Kb": 0.05, "Kt": 0.05, "J": 5e-5, "f": 1e-4}
 LINES = 8000
+# as strong, in steps, as makes a rounded speed as noisy as counts of the last sample are
+NOISE = 0.5
 
 
 def recorded(kind: str) -> list[Recording]:
@@ -31,6 +34,9 @@ def recorded(kind: str) -> list[Recording]:
             speed = np.diff(count, prepend=count[0]) * 2 * np.pi / LINES / 1e-3
         if kind == "tachometer":
             speed = read[:, 1] + np.std(speed - read[:, 1]) * rng.standard_normal(len(speed))
+        if kind == "rounded":
+            step = 2 * np.pi / LINES / 1e-3
+            speed = step * np.round(read[:, 1] / step + NOISE * rng.standard_normal(len(speed)))
         current = read[:, 0] + 0.1 * rng.standard_normal(len(speed))
         found.append(Recording(name, driven.time, driven.voltage, current, speed, driven.load))
     return found
@@ -40,6 +46,7 @@ OVER = {
     "counts of two samples": TWO.over,
     "counts of the last sample": LAST.over,
     "tachometer": None,
+    "rounded": None,
 }
 
 
@@ -47,7 +54,7 @@ OVER = {
 def test_a_mean_is_taken_for_what_it_is(kind):
     found = identify(recorded(kind), tie=[("Kt", "Kb")])
     means = [m for m in found.messages if "is a mean over" in m]
-    assert [f"over {OVER[kind]}," in m for m in means] == [True] * (kind != "tachometer")
+    assert [f"over {OVER[kind]}," in m for m in means] == [True] * (OVER[kind] is not None)
     for name in ("R", "L", "Kb", "J"):
         estimate = found.parameters[name]
         assert abs(estimate.value - QUICK[name]) < max(3.5 * estimate.stderr, 2e-3 * QUICK[name])
@@ -57,10 +64,23 @@ def late(runs: list[Recording], samples: int) -> list[Recording]:
     return [attrs.evolve(r, speed=np.roll(r.speed, samples)) for r in runs]
 
 
-@pytest.mark.parametrize("kind", ["counts of the last sample", "tachometer"])
-def test_what_is_later_than_a_mean_over_a_sample_is_none(kind):
-    found = identify(late(recorded(kind), 9))
+def test_what_is_later_than_a_mean_over_a_sample_is_none():
+    found = identify(late(recorded("tachometer"), 9))
     assert not any("mean over" in m for m in found.messages)
+
+
+def test_counts_show_by_their_noise_what_they_are_the_mean_of():
+    """Whatever moves the rotor, as long as it is slow beside the samples."""
+    rng = np.random.default_rng(3)
+    speed = 300 * ndimage.gaussian_filter1d(rng.standard_normal(12000), 20.0)
+    counts = np.floor(np.cumsum(speed))
+    assert counted_over([np.diff(counts)]) == (LAST, -np.inf)
+    mean, enough = counted_over([counts[2:] - counts[:-2]])
+    assert mean is TWO and enough < 0
+    assert counted_over([np.round(speed)])[0] is None
+    # noise may be as strong, but is so at all frequencies: the motion itself must tell
+    mean, enough = counted_over([np.round(speed + NOISE * rng.standard_normal(12000))])
+    assert mean is LAST and np.isfinite(enough)
 
 
 def test_counts_without_a_current_may_be_late_by_an_inductance():

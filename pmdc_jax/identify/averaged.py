@@ -1,19 +1,20 @@
 """A speed that is a difference of angles, and so a mean over one sample or two: taken for what it is.
 
 Where the motor speeds up or slows down within some samples such a mean is late, or rounds its motion as a soft shaft
-might. Which one was recorded the fits to all of them tell, and it is undone: the derivative of a cubic spline through
-the same angles is the speed that has this mean.
+might. Counts of an encoder show by their noise which one it is; of other speeds the fits to the one and to the other
+tell. It is undone: the derivative of a cubic spline through the same angles is the speed that has this mean.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import solve_banded
+from scipy.signal import periodogram
 
 from .likelihood import Samples, unlikely
 from .noise import quantum
@@ -21,10 +22,16 @@ from .prepare import Prepared
 from .refine import Polished, polish
 
 # A mean must be this much likelier than the speed itself, by the logarithm; or be no less likely by more, where the
-# speed moves by steps as counts of an encoder do
+# speed is counted like one but other noise would show alike
 LIKELIER = 30.0
 # An encoder has fewer lines, and a whole number of them
 LINES, WHOLE = 2e4, 0.02
+# Power in counts squared, between that of a speed that was rounded to counts, 1/12, and that of such a mean, 1/3
+COUNTED = 1 / 6
+# ... known of a run of so many samples
+ENOUGH = 100
+# ... and the share of it that a mean over two samples has at the highest frequencies, at most: 1/40 and what leaks
+NONE = 1 / 8
 
 
 class Sensed(NamedTuple):
@@ -69,26 +76,53 @@ LATE = Sensed("", lambda x: np.append(x[:1], x[:-1]), lambda x: np.append(x[1:],
 def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     """The runs with the speed itself where a mean was recorded, and the fit to them.
 
-    A mean over the last sample is told from a delay only if the speed is clearly counted, and from an inductance only
-    beside a current; and a speed that comes later than a mean would is late for another reason.
+    A mean over the last sample is told from a delay only if the speed is counted, and from an inductance only beside
+    a current; and a speed that comes later than a mean would is late for another reason.
 
     **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if no mean was found.
     """
-    counted = _is_counted(given)
-    means = [TWO, LAST] if given.problem.samples[0] > 0 else [TWO]
-    tried = [_without(given, fit, mean) for mean in means]
-    left = [unlikely(given, after, mean.of) for mean, (_, after) in zip(means, tried, strict=True)]
-    least = int(np.argmin(left))
-    mean, (undone, better) = means[least], tried[least]
-    if unlikely(given, fit) - left[least] < (-LIKELIER if counted else LIKELIER):
+    counts = _counts(given)
+    mean, enough = counted_over(counts) if counts else (TWO, LIKELIER)
+    if mean is None or (mean is LAST and not given.problem.samples[0] > 0):
         return given, fit
-    if mean is LAST and not counted:
+    undone, better = _without(given, fit, mean)
+    left = unlikely(given, better, mean.of)
+    if not unlikely(given, fit) - left > enough:
         return given, fit
-    # a mean over two samples is in time as it is; undone, it has another noise
-    in_time = fit if mean is TWO else better
-    if _without(given, fit, LATE)[1].refined.fitness < in_time.refined.fitness:
-        return given, fit
+    if not counts:
+        # a mean over two samples is in time as it is; undone, it has another noise than what is but late
+        last, late = (_without(given, fit, sensed)[1] for sensed in (LAST, LATE))
+        if unlikely(given, last, LAST.of) < left or late.refined.fitness < fit.refined.fitness:
+            return given, fit
     return undone, better
+
+
+def counted_over(counts: Sequence[Samples]) -> tuple[Sensed | None, float]:
+    """Of what speeds are the mean that are multiples of a count a sample, if of anything; and how much likelier that
+    must make them, by the logarithm.
+
+    Angles that are rounded to counts have a white noise of 1/12 count squared. Of differences over one sample it is
+    four times as strong at the highest frequency, and twice at half of that; of differences over two samples, counted
+    by halves, it is none at all, and four times.
+    """
+    middle, highest = np.mean([_powers(one) for one in counts], axis=0)
+    if highest > COUNTED:
+        clearly = highest > np.sqrt(2.0) * max(middle, COUNTED)
+        return LAST, -np.inf if clearly else -LIKELIER
+    over_two = middle > COUNTED and highest < NONE * middle
+    return TWO if over_two else None, -LIKELIER
+
+
+def _powers(signal: Samples) -> tuple[float, float]:
+    """The power of a signal about half of its highest frequency, and near the highest, if it were the same at all.
+
+    By second differences: what is slow is so much stronger that it would leak.
+    """
+    share, power = periodogram(np.diff(signal, 2), fs=2.0, window="hann", detrend="constant")
+    white = power[1:] / (2 * np.sin(np.pi * share[1:] / 2)) ** 4
+    bands = ((share[1:] > low) & (share[1:] < high) for low, high in ((0.4, 0.6), (0.9, 1.0)))
+    middle, highest = (float(white[band].mean()) for band in bands)
+    return middle, highest
 
 
 def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, Polished]:
@@ -106,12 +140,16 @@ def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, 
     return given._replace(problem=problem, averaged=sensed.over), polish(problem, fit.refined)
 
 
-def _is_counted(given: Prepared) -> bool:
-    """Whether the speeds of all runs are multiples of what a line of an encoder makes in a sample."""
-    speeds = [(run, run.speed) for run in given.training if run.speed is not None]
-    for run, speed in speeds:
-        step = quantum(np.diff(speed[~np.isnan(speed)]))
+def _counts(given: Prepared) -> list[Samples]:
+    """The speeds of all runs in counts a sample, of an encoder with as many lines; none, if they are no such counts."""
+    counts = []
+    for run in given.training:
+        if run.speed is None:
+            continue
+        speed = run.speed[~np.isnan(run.speed)]
+        step = quantum(np.diff(speed))
         lines = 2 * np.pi / step / np.median(np.diff(run.time)) if step else np.inf
-        if lines > LINES or abs(lines - round(lines)) > WHOLE:
-            return False
-    return bool(speeds)
+        if lines > LINES or abs(lines - round(lines)) > WHOLE or len(speed) < ENOUGH:
+            return []
+        counts.append(speed / step)
+    return counts
