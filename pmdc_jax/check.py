@@ -152,6 +152,15 @@ def excitation(runs: Sequence[Recording]) -> Iterator[Finding]:
                 "whole run",
                 "Record steps of the voltage, and the motor as it starts and stops",
             )
+        elif run.stands_still:
+            yield Finding(
+                run.name,
+                "speed",
+                "note" if turning else "warning",
+                "the rotor never moves: it is taken as held, and the run for what it says of R and L",
+                "whole run",
+                "Record the motor as it turns as well. If only friction held it, leave out the run",
+            )
         elif speed is not None and np.nanstd(speed) <= np.sqrt(2) * _noise(speed):
             noise = _noise(speed)
             what = f"it swings less than its noise of {noise:.3g}" if noise else "it never changes"

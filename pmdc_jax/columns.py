@@ -176,12 +176,15 @@ def understand(header: str) -> Column | None:
 
 
 def looks_like(header: str) -> str | None:
-    """The quantity an unused header begins with, such as speed for `speed_kg`, if any."""
-    for name, unit, _ in _readings(header):
+    """The quantity that an unused header may be, if any: the one that it begins with, such as speed for `speed_kg`;
+    or the load for the unit of a torque, as in `M_Nm`."""
+    readings = [(name, unit) for name, unit, _ in _readings(header) if unit is not None]
+    for name, _ in readings:
         for quantity, known in QUANTITIES.items():
-            if unit is not None and _key(name) in known.names:
+            if _key(name) in known.names:
                 return quantity
-    return None
+    torque = QUANTITIES["load"].units[:1]
+    return "load" if any(_is_unit_of(unit, "load", torque) for _, unit in readings) else None
 
 
 def mixed_axes(found: Mapping[str, Column]) -> tuple[Column, Column] | None:
@@ -246,9 +249,9 @@ def _key(name: str) -> str:
     return re.sub(r"\W+|_+", "_", name).strip("_")
 
 
-def _is_unit_of(unit: str, quantity: str) -> bool:
+def _is_unit_of(unit: str, quantity: str, units: tuple[str, ...] | None = None) -> bool:
     try:
-        conversion(unit, quantity, QUANTITIES[quantity].units)
+        conversion(unit, quantity, units or QUANTITIES[quantity].units)
     except UnitError:
         return False
     return True

@@ -16,15 +16,17 @@ PARAMETERS = {"R": "ohm", "L": "H", "Kb": "V s/rad", "Kt": "N m/A", "J": "kg m^2
 
 
 class Drive(NamedTuple):
-    """What drives the motor over one sample: exactly one of the three shares is 1, the others 0.
+    """What drives the motor over one sample: exactly one of the first three shares is 1, the others 0.
 
     A run with recorded voltage drives the whole motor; one with only current or torque drives the
-    mechanical half, and the electrical equation stands still.
+    mechanical half, and the electrical equation stands still. The mechanical one does where the rotor is
+    not `free` to turn: 1, or 0 where it is held.
     """
 
     voltage: Scalars | float = 1.0
     current: Scalars | float = 0.0
     torque: Scalars | float = 0.0
+    free: Scalars | float = 1.0
 
 
 class Motor(eqx.Module):
@@ -57,15 +59,16 @@ class Motor(eqx.Module):
         """Matrices A, B of dx/dt = A x + B u for the linear motor, equations (7) and (8).
 
         x = (current, speed), u = (drive, load torque). `drive` says whether voltage (the default), current
-        or torque is given; for the latter two the current is not a state and its row is zero.
+        or torque is given; for the latter two the current is not a state and its row is zero, as that of the speed
+        is where the rotor is held.
         """
-        v, c, t = drive or Drive()
-        zero = jnp.zeros_like(self.R)
+        v, c, t, free = drive or Drive()
+        zero, lightness = jnp.zeros_like(self.R), free / self.J
         A = [
             [-v * self.R / self.L, -v * self.Kb / self.L],
-            [v * self.Kt / self.J, -self.f / self.J],
+            [v * self.Kt * lightness, -self.f * lightness],
         ]
-        B = [[v / self.L, zero], [(c * self.Kt + t) / self.J, -1 / self.J]]
+        B = [[v / self.L, zero], [(c * self.Kt + t) * lightness, -lightness]]
         return _matrix(A), _matrix(B)
 
     def transfer_function(
@@ -144,7 +147,7 @@ class Motor(eqx.Module):
         positive motion; `moving`, the directions (-1, 0, 1) of current and speed for which the dry elements
         act, by default those of the state itself.
         """
-        v, c, t = drive or Drive()
+        v, c, t, free = drive or Drive()
         state = state._replace(current=v * state.current + c * value)
         direction_i, direction_w = moving or (jnp.sign(state.current), jnp.sign(state.speed))
         motor, voltage, torque = self.at(state), value, load
@@ -162,7 +165,7 @@ class Motor(eqx.Module):
         armature = voltage - motor.R * state.current - motor.Kb * state.speed - drop
         current_rate = v * armature * (1 / motor.L)
         driving = motor.Kt * state.current + t * value
-        speed_rate = (driving - motor.f * state.speed - torque) * (1 / motor.J)
+        speed_rate = free * (driving - motor.f * state.speed - torque) * (1 / motor.J)
         return State(current_rate, speed_rate, extra)
 
     def grip(self, holds: str, state: State) -> Grip | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from attrs import field, frozen
@@ -60,8 +60,8 @@ class Recording:
 
     **Fields**: `name`, shown in results; `time`, s, (samples,), strictly increasing from any start;
     and, None where not recorded, of the same shape: `voltage` V, `current` A, `speed` rad/s, `load`
-    N m, `angle` rad, `temperature` degrees C, `torque` N m. `source`, the file; `ignored`, headers
-    not used; `notes`, what was assumed while reading.
+    N m, `angle` rad, `temperature` degrees C, `torque` N m. `held`, whether the rotor was locked;
+    `source`, the file; `ignored`, headers not used; `notes`, what was assumed while reading.
 
     **Raises**: `InputError` where nothing could be identified from it.
     """
@@ -75,6 +75,7 @@ class Recording:
     angle: Samples | None = field(default=None, converter=optional(_samples))
     temperature: Samples | None = field(default=None, converter=optional(_samples))
     torque: Samples | None = field(default=None, converter=optional(_samples))
+    held: bool = field(default=False, kw_only=True)
     source: str | None = field(default=None, kw_only=True)
     ignored: tuple[str, ...] = field(default=(), kw_only=True)
     notes: tuple[Finding, ...] = field(default=(), kw_only=True)
@@ -107,8 +108,21 @@ class Recording:
         return "current" if self.torque is None else "torque"
 
     @property
+    def stands_still(self) -> bool:
+        """Whether the rotor never moves in the least, whatever the voltage and the current."""
+        if self.voltage is None or self.current is None or not np.any(np.nan_to_num(self.current)):
+            return False
+        motion = (
+            np.diff(self.angle) if self.speed is None and self.angle is not None else self.speed
+        )
+        return self.held or (motion is not None and not np.any(np.nan_to_num(motion)))
+
+    @property
     def halves(self) -> tuple[Half, ...]:
-        """Which halves of the motor this run informs: both with a voltage, else the mechanical."""
+        """Which halves of the motor this run informs: both with a voltage, else the mechanical; the electrical where
+        the rotor was held."""
+        if self.held:
+            return ("electrical",)
         return ("electrical", "mechanical") if self.drive == "voltage" else ("mechanical",)
 
     def columns(self) -> dict[str, np.ndarray]:
@@ -138,7 +152,7 @@ def read_recording(
     values = {q: numbers[column.header] for q, column in found.items()}
     values = {q: _to_si(column, values[q]) for q, column in found.items()}
     empty = [q for q, v in values.items() if q != "time" and len(v) and np.isnan(v).all()]
-    present = {q: v for q, v in values.items() if q not in empty}
+    present: dict[str, Any] = {q: v for q, v in values.items() if q not in empty}
     _refuse_too_little(present, table, str(path))
     for fault in _faults(present):
         raise _in_file(fault, found, table, str(path))

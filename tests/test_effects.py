@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+import attrs
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -430,6 +431,17 @@ def test_a_wave_that_comes_round_within_a_sample(x64, name, most, periods):
         for motor in (LINEAR, with_effect(name, values))
     )
     assert np.std(found - expected) < most * np.std(plain - expected)
+
+
+@pytest.mark.parametrize("name", sorted(QUICK))
+def test_a_held_rotor_stays_where_it_is(x64, name):
+    """What acts on its winding acts as before: as on a motor too heavy to move."""
+    still = [attrs.evolve(run, speed=0 * run.time) for run in RUNS]
+    held = simulated(with_effect(name), [attrs.evolve(r, speed=None, held=True) for r in still])
+    heavy = simulated(with_effect(name, J=1e9), still)
+    for one, other in zip(held, heavy, strict=True):
+        assert not one[:, 1].any()
+        np.testing.assert_allclose(one[:, 0], other[:, 0], rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["resistance_heating", "stribeck_friction"])

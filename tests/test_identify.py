@@ -253,6 +253,37 @@ def test_current_and_speed_tell_the_mechanical_half():
     assert result.fit["a"].current_rmse is None
 
 
+def held_rotor(seed: int, **columns) -> Recording:
+    """A locked-rotor test, by the closed form of a coil whose voltage holds between samples."""
+    rng = np.random.default_rng(seed)
+    time, voltage = 5e-4 * np.arange(SAMPLES), np.repeat(rng.uniform(-3, 3, 20), SAMPLES // 20)
+    decay = np.exp(-PAPER.R / PAPER.L * 5e-4)
+    current = lfilter([0, (1 - decay) / PAPER.R], [1, -decay], voltage)
+    noise = NOISE.current_A * rng.standard_normal(SAMPLES)
+    return Recording("held", time, voltage, current + noise, **columns)
+
+
+@pytest.mark.parametrize(
+    "columns", [{"speed": np.zeros(SAMPLES)}, {"angle": np.full(SAMPLES, 0.3)}, {"held": True}]
+)
+def test_a_held_rotor_tells_the_electrical_half(columns):
+    found = identify([held_rotor(3, **columns)])
+    for name, true in (("R", PAPER.R), ("L", PAPER.L)):
+        estimate = found.parameters[name]
+        assert abs(estimate.value - true) < 3 * estimate.stderr < 0.01 * true
+    assert {found.parameters[n].status for n in ("Kb", "Kt", "J", "f")} == {"not_identifiable"}
+    assert found.converged
+
+
+def test_a_held_rotor_goes_with_free_ones(runs, found):
+    """It tells more of R and L, and nothing else is worse for it."""
+    more = identify([*runs, held_rotor(4, speed=np.zeros(SAMPLES))])
+    assert_right(more, PAPER)
+    for name in ("R", "L"):
+        assert more.parameters[name].stderr < found.parameters[name].stderr
+    assert any("taken as held" in finding.what for finding in more.findings)
+
+
 def driven_by_torque(name: str, rng: np.random.Generator) -> Recording:
     """Known torque and an encoder: angle by the closed form of J dw/dt = torque - f w."""
     step = 1e-3

@@ -149,6 +149,12 @@ def test_every_way_to_write_a_unit(pattern, name, unit):
     assert (column.quantity, column.scale) == ("speed", pytest.approx(unit[1], rel=1e-14))
 
 
+def test_a_torque_of_unknown_name_is_not_passed_over_in_silence(tmp_path):
+    run = read_text(tmp_path, table("time_s,voltage_V,n_rpm,M_Nm,flag_N", T, T, T, T, T))
+    (note,) = run.notes
+    assert note.column == "M_Nm" and "looks like load" in note.what
+
+
 def test_numbers_become_si_and_the_rest_is_remembered(tmp_path):
     text = table("time_ms,voltage_V,Speed [rpm],flag", 1000 * T, T, 60 + T, T)
     run = read_text(tmp_path, text)

@@ -130,7 +130,7 @@ def _signals(recordings: Sequence[Recording], name: str) -> list[np.ndarray]:
 
 def _untouched(recordings: Sequence[Recording]) -> dict[str, float]:
     """Parameters that no run has anything to do with, at a harmless value."""
-    drives = {r.drive for r in recordings}
-    touched = {"torque": "J f", "current": "Kt J f", "voltage": "R L Kb Kt J f"}
-    known = {name for drive in drives for name in touched[drive].split()}
+    touched = {"held": "R L", "torque": "J f", "current": "Kt J f", "voltage": "R L Kb Kt J f"}
+    kinds = {"held" if r.held else r.drive for r in recordings}
+    known = {name for kind in kinds for name in touched[kind].split()}
     return {name: 1.0 for name in PARAMETERS if name not in known}

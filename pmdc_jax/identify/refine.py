@@ -89,10 +89,10 @@ class Problem(eqx.Module):
         """Which coordinates and which of its own unknowns each run may tell of."""
         tape = self.tape
         first = jnp.argmax(jnp.asarray(tape.run)[None, :] == jnp.arange(tape.runs)[:, None], axis=1)
-        voltage = jnp.asarray(tape.drive.voltage)[jnp.asarray(tape.grid)[first]] > 0
+        drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid][first] > 0, tape.drive)
         angle = self.turnable & self.angular
         load = jnp.asarray(tape.load_unknown)
-        own = jnp.stack([voltage, jnp.ones_like(voltage), load, angle], 1)
+        own = jnp.stack([drive.voltage, drive.free, load, angle], 1)
         return jnp.concatenate([self.free[None, :] & self.counts[:, None], own], 1)
 
 

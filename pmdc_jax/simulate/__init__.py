@@ -34,7 +34,7 @@ def simulate(motor: Motor, recording: Recording) -> Recording:
 
     **Arguments**: `motor`, of scalars; `recording`, whose voltage (or current, or torque), load and time
     stamps are used; its first current and speed, where recorded, are the initial state, otherwise the motor
-    starts at rest. An unknown load is taken as zero.
+    starts at rest. An unknown load is taken as zero, and a rotor that stood still throughout as held.
 
     **Returns**: the recording with current (A) and speed (rad/s) simulated at the same time stamps. A run that
     is not driven by voltage has no simulated current.

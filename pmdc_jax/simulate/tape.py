@@ -26,8 +26,8 @@ BLOCK = 128
 class Tape(eqx.Module):
     """Runs laid end to end; a run begins with a new block, and its last block is filled up with weight 0.
 
-    A sample time and a drive (voltage, current or torque) make a *grid*; blocks of one grid share the exact
-    step. The drive and the load of sample k hold until sample k + 1.
+    A sample time, a drive (voltage, current or torque) and a rotor that is free or held make a *grid*; blocks of
+    one grid share the exact step. The drive and the load of sample k hold until sample k + 1.
     """
 
     value: Float[Samples, "blocks samples"]  # what drives: V, A or N m
@@ -89,16 +89,21 @@ class Tape(eqx.Module):
             first += run.blocks
         # what is filled up begins anew in every block, so that nobody waits for it to be joined
         tape["begins"][first:], tape["turn"][first:] = True, 0.0
-        kinds = np.array([drive for _, drive in grids])
+        kinds, free = np.array([drive for _, drive, _ in grids]), np.array([f for *_, f in grids])
         return cls(
             **tape,
-            sample_time=np.array([sample_time for sample_time, _ in grids]),
-            drive=Drive(*(np.where(kinds == kind, 1.0, 0.0) for kind in Drive._fields)),
+            sample_time=np.array([sample_time for sample_time, *_ in grids]),
+            drive=Drive(
+                *(np.where(kinds == kind, 1.0, 0.0) for kind in Drive._fields[:3]),
+                free=np.where(free, 1.0, 0.0),
+            ),
             initial=np.array([run.initial for run in runs]),
-            load_unknown=np.array([r.load is None and not unloaded for r in recordings]),
+            load_unknown=np.array(
+                [r.load is None and not unloaded and not r.held for r in recordings]
+            ),
             angle=np.array([_first(r.angle) for r in recordings]),
             angle_known=np.array([r.angle is not None for r in recordings]),
-            longest=2.0 ** math.ceil(math.log2(max(s for s, _ in grids) / 1e-3) - 1e-6) * 1e-3,
+            longest=2.0 ** math.ceil(math.log2(max(s for s, *_ in grids) / 1e-3) - 1e-6) * 1e-3,
         )
 
     @property
@@ -136,12 +141,12 @@ class _Run:
             assert i is not None, "Recording guarantees something that drives"
             self.value = np.append((i[:-1] + i[1:]) / 2, i[-1])
         # rounded: two runs of one clock must share a grid, whatever the last bits of their time stamps
-        self.grid = (float(f"{recording.sample_time:.9g}"), drive)
+        self.grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held)
         self.initial = (_first(self.current), _first(self.speed))
 
     def turn(self) -> np.ndarray:
         """Angle over each sample in rad, NaN where the speed is not known."""
-        sample_time, _ = self.grid
+        sample_time, *_ = self.grid
         ahead = np.append(self.speed[1:], self.speed[-1])
         return sample_time * (self.speed + ahead) / 2
 

@@ -18,8 +18,11 @@ def uniform(recording: Recording) -> Recording:
 
     Evenly sampled recordings keep their samples. Otherwise whatever drives and the load, which hold between
     samples, are averaged over each interval of the grid, so that no volt-second is lost, and the outputs are
-    interpolated linearly; inside gaps, and past the end, they are missing (NaN).
+    interpolated linearly; inside gaps, and past the end, they are missing (NaN). A rotor that stands still
+    throughout is held: there is nothing to learn from its speed.
     """
+    if recording.stands_still:
+        recording = attrs.evolve(recording, speed=None, angle=None, held=True)
     if recording.speed is None and recording.angle is not None:
         recording = attrs.evolve(recording, speed=_speed_of(recording.angle, recording.time))
     time = recording.time
