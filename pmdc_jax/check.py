@@ -64,7 +64,8 @@ def jitter(run: Recording) -> Iterator[Finding]:
             "warning",
             f"time stamps jitter by {deviation:.1%} of a step of {np.mean(steps):.4g} s",
             f"worst near {place(run, int(np.argmax(np.abs(np.diff(run.time) - np.mean(steps)))))}",
-            "Export more digits, or the time of the sampling clock instead of the logging computer",
+            "Export more digits, or the time of the sampling clock instead of the logging computer; from a simulation "
+            "of variable steps, samples at fixed ones",
         )
 
 
