@@ -69,8 +69,11 @@ class Seen(NamedTuple):
         return bool(self.left < ALARM and self.by_one_more > MUCH_OF_IT)
 
     def is_another(self) -> bool:
-        """Whether what is left is clearly one more effect, and no formula."""
-        return bool(self.unexplained > FORMULA and self.by_one_more > MOST_OF_IT)
+        """Whether what is left is clearly one more effect, and no formula; a wave may be teeth that meet by chance."""
+        if not self.of_candidates or self.unexplained < FORMULA or self.by_one_more < MOST_OF_IT:
+            return False
+        best = max(self.of_candidates, key=_gain).candidate
+        return best is not None and not best.own_phase
 
     def is_clear(self, model: Model) -> bool:
         """Whether what a model leaves is too much for a formula, and not of the very kind of an effect that it has."""
