@@ -24,7 +24,8 @@ def explain(
             name for name, share in zip(parameters.names, vector, strict=True) if abs(share) > SHARE
         )
         directions.append(Direction(names, *_reason(set(names), recordings)))
-    return tuple(directions)
+    # two directions that move the same parameters are one thing to say
+    return tuple(dict.fromkeys(directions))
 
 
 def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]:
