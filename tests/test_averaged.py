@@ -10,7 +10,7 @@ from scipy import ndimage
 from benchmarks.naming.plant import Plant, simulate
 from benchmarks.virtual_bench import prbs, staircase
 from pmdc_jax import identify
-from pmdc_jax.identify.averaged import LAST, TWO, counted_over
+from pmdc_jax.identify.averaged import LAST, TWO, counted_over, differenced_over
 from pmdc_jax.identify.noise import quantum
 from pmdc_jax.recording import Recording
 
@@ -81,6 +81,16 @@ def test_counts_show_by_their_noise_what_they_are_the_mean_of():
     # noise may be as strong, but is so at all frequencies: the motion itself must tell
     mean, enough = counted_over([np.round(speed + NOISE * rng.standard_normal(12000))])
     assert mean is LAST and np.isfinite(enough)
+
+
+def test_only_differences_over_two_samples_have_nothing_at_the_highest_frequency():
+    rng = np.random.default_rng(4)
+    speed = 300 * ndimage.gaussian_filter1d(rng.standard_normal(4000), 2.0)
+    angle = np.cumsum(speed) + rng.standard_normal(4000)
+    assert differenced_over([angle[2:] - angle[:-2]])[0] is TWO
+    for other in (np.diff(angle), speed + rng.standard_normal(4000), np.repeat(speed[::20], 20)):
+        assert differenced_over([other])[0] is None
+    assert differenced_over([])[0] is None
 
 
 def test_counts_without_a_current_may_be_late_by_an_inductance():

@@ -1,8 +1,8 @@
 """A speed that is a difference of angles, and so a mean over one sample or two: taken for what it is.
 
 Where the motor speeds up or slows down within some samples such a mean is late, or rounds its motion as a soft shaft
-might. Counts of an encoder show by their noise which one it is; of other speeds the fits to the one and to the other
-tell. It is undone: the derivative of a cubic spline through the same angles is the speed that has this mean.
+might. The noise of the angles shows which one it is, and in case of doubt the fits to the one and to the other. It is
+undone: the derivative of a cubic spline through the same angles is the speed that has this mean.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy.linalg import solve_banded
 from scipy.signal import periodogram
 
@@ -29,8 +30,10 @@ LINES, WHOLE = 2e4, 0.02
 # Power in counts squared, between that of a speed that was rounded to counts, 1/12, and that of such a mean, 1/3
 COUNTED = 1 / 6
 # ... known of a run of so many samples
-ENOUGH = 100
-# ... and the share of it that a mean over two samples has at the highest frequencies, at most: 1/40 and what leaks
+ENOUGH = 200
+# Shares of the highest frequency about half of it, near it, and next to it
+BANDS = ((0.4, 0.6), (0.9, 0.95), (0.98, 1.0))
+# A mean over two samples has no more than this share of the power near the highest frequency next to it: in theory 1/40
 NONE = 1 / 8
 
 
@@ -81,8 +84,9 @@ def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polishe
 
     **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if no mean was found.
     """
-    counts = _counts(given)
-    mean, enough = counted_over(counts) if counts else (TWO, LIKELIER)
+    speeds = _speeds(given)
+    counts = _in_counts(speeds)
+    mean, enough = counted_over(counts) if counts else differenced_over([s for s, _ in speeds])
     if mean is None or (mean is LAST and not given.problem.samples[0] > 0):
         return given, fit
     undone, better = _without(given, fit, mean)
@@ -97,7 +101,7 @@ def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polishe
     return undone, better
 
 
-def counted_over(counts: Sequence[Samples]) -> tuple[Sensed | None, float]:
+def counted_over(counts: Sequence[np.ndarray]) -> tuple[Sensed | None, float]:
     """Of what speeds are the mean that are multiples of a count a sample, if of anything; and how much likelier that
     must make them, by the logarithm.
 
@@ -105,24 +109,32 @@ def counted_over(counts: Sequence[Samples]) -> tuple[Sensed | None, float]:
     four times as strong at the highest frequency, and twice at half of that; of differences over two samples, counted
     by halves, it is none at all, and four times.
     """
-    middle, highest = np.mean([_powers(one) for one in counts], axis=0)
+    middle, _, highest = _powers(counts)
     if highest > COUNTED:
         clearly = highest > np.sqrt(2.0) * max(middle, COUNTED)
         return LAST, -np.inf if clearly else -LIKELIER
-    over_two = middle > COUNTED and highest < NONE * middle
-    return TWO if over_two else None, -LIKELIER
+    return differenced_over(counts)[0], -LIKELIER
 
 
-def _powers(signal: Samples) -> tuple[float, float]:
-    """The power of a signal about half of its highest frequency, and near the highest, if it were the same at all.
+def differenced_over(speeds: Sequence[np.ndarray]) -> tuple[Sensed | None, float]:
+    """The same of other speeds: nothing of differences over two samples is at the highest frequency, but of any other
+    signal with noise or steps there is as much as near it."""
+    _, high, highest = _powers(speeds) if speeds else (0.0, 0.0, 0.0)
+    return TWO if highest < NONE * high else None, LIKELIER
+
+
+def _powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
+    """The power of some signals about half of their highest frequency, near it, and next to it, if it were the same at
+    all of them.
 
     By second differences: what is slow is so much stronger that it would leak.
     """
-    share, power = periodogram(np.diff(signal, 2), fs=2.0, window="hann", detrend="constant")
-    white = power[1:] / (2 * np.sin(np.pi * share[1:] / 2)) ** 4
-    bands = ((share[1:] > low) & (share[1:] < high) for low, high in ((0.4, 0.6), (0.9, 1.0)))
-    middle, highest = (float(white[band].mean()) for band in bands)
-    return middle, highest
+    powers = []
+    for signal in signals:
+        share, power = periodogram(np.diff(signal, 2), fs=2.0, window="hann", detrend="constant")
+        white = power[1:] / (2 * np.sin(np.pi * share[1:] / 2)) ** 4
+        powers.append([white[(low < share[1:]) & (share[1:] < high)].mean() for low, high in BANDS])
+    return np.mean(powers, axis=0)
 
 
 def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, Polished]:
@@ -140,16 +152,20 @@ def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, 
     return given._replace(problem=problem, averaged=sensed.over), polish(problem, fit.refined)
 
 
-def _counts(given: Prepared) -> list[Samples]:
-    """The speeds of all runs in counts a sample, of an encoder with as many lines; none, if they are no such counts."""
+def _speeds(given: Prepared) -> list[tuple[np.ndarray, float]]:
+    """The speeds of all runs that are long enough to show their noise, rad/s, and the time between samples, s."""
+    recorded = [(run.speed, np.diff(run.time)) for run in given.training if run.speed is not None]
+    known = [(speed[~np.isnan(speed)], float(np.median(steps))) for speed, steps in recorded]
+    return [(speed, step) for speed, step in known if len(speed) >= ENOUGH]
+
+
+def _in_counts(speeds: Sequence[tuple[np.ndarray, float]]) -> list[np.ndarray]:
+    """The speeds in counts a sample, of an encoder with as many lines; none, if they are no such counts."""
     counts = []
-    for run in given.training:
-        if run.speed is None:
-            continue
-        speed = run.speed[~np.isnan(run.speed)]
+    for speed, sample_time in speeds:
         step = quantum(np.diff(speed))
-        lines = 2 * np.pi / step / np.median(np.diff(run.time)) if step else np.inf
-        if lines > LINES or abs(lines - round(lines)) > WHOLE or len(speed) < ENOUGH:
+        lines = 2 * np.pi / step / sample_time if step else np.inf
+        if lines > LINES or abs(lines - round(lines)) > WHOLE:
             return []
         counts.append(speed / step)
     return counts
