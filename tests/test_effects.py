@@ -19,9 +19,10 @@ from scipy.integrate import solve_ivp
 from benchmarks import virtual_bench as vb
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
+from pmdc_jax.identify.refine import apart
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recording import Recording
-from pmdc_jax.simulate import Tape, free_run, sensitivities, squared_errors
+from pmdc_jax.simulate import LOCAL, Tape, free_run, sensitivities, squared_errors
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 STARTS = ((5.0, 60.0), (-3.0, -8.0), (0.0, 0.0))  # current A, speed rad/s of each run
@@ -509,6 +510,25 @@ def test_converges_to_the_independent_integrator(x64, name):
     assert errors[1] < errors[0] / 6, errors
 
 
+@pytest.mark.parametrize("name", ["shaft_compliance", "gear_backlash"])
+def test_a_run_may_begin_twisted(x64, name):
+    case, tape, twist = CASES[name], Tape.from_recordings(RUNS), 0.02
+    expected = []
+    for run in RUNS:
+        start = np.array(
+            [run.current[0], run.speed[0], *case.start(run.speed[0], run.load[0], case.values)]
+        )
+        start[-1] += twist
+        expected.append(integrated(case, run, start, run.time)[:2])
+    seen = free_run(
+        with_effect(name), tape, jnp.asarray(tape.initial), jnp.zeros(3), None, jnp.full(3, twist)
+    )
+    for k, (run, right) in enumerate(zip(RUNS, expected, strict=True)):
+        for channel in range(2):
+            found = tape.samples_of(k, seen[:, channel], len(run))
+            assert np.max(np.abs(found - right[channel])) < case.tolerance * np.max(right[channel])
+
+
 def zero(name: str) -> dict[str, float]:
     return {**CASES[name].values, **dict.fromkeys(CASES[name].amplitude.split(), 0.0)}
 
@@ -529,11 +549,6 @@ def test_without_amplitude_it_is_the_linear_motor(x64, name):
     assert relative_errors(simulated(with_effect(name, lowest), RUNS), linear)[0] < 1e-4
 
 
-def apart(local: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Initial current and speed, load offset, initial angle."""
-    return local[:, :2], local[:, 2], local[:, 3]
-
-
 @each_simulated
 def test_sensitivities_are_central_differences(x64, name):
     """By every parameter of motor and effect, and each run's own start and load offset."""
@@ -543,18 +558,18 @@ def test_sensitivities_are_central_differences(x64, name):
     scales = zip(parameters.names, parameters.logarithmic, strict=True)
     at = np.array([np.log(truth[n]) if log else truth[n] for n, log in scales])
     tape = Tape.from_recordings(RUNS)
-    local = np.column_stack([tape.initial, np.full(3, 0.01), np.full(3, 0.2)])
+    local = np.column_stack([tape.initial, np.full((3, 3), [0.01, 0.2, 0.02])])
     # away from zero, where a dry element has no derivative
     local[2, :2] = 1.0, 5.0
-    seen, jacobian = sensitivities(parameters, jnp.asarray(at), tape, *apart(local))
+    seen, jacobian = sensitivities(parameters, jnp.asarray(at), tape, *apart(jnp.asarray(local)))
 
     def run(at, local):
-        return np.asarray(free_run(parameters(jnp.asarray(at)), tape, *apart(local)))
+        return np.asarray(free_run(parameters(jnp.asarray(at)), tape, *apart(jnp.asarray(local))))
 
     np.testing.assert_allclose(seen, run(at, local), rtol=1e-9, atol=1e-9)
     count = len(at)
-    for column in range(count + 4):
-        step = np.zeros(count + 4)
+    for column in range(count + LOCAL):
+        step = np.zeros(count + LOCAL)
         step[column] = CASES[name].difference * max(1.0, np.abs(np.r_[at, local.max(0)][column]))
         up, down = (run(at + s * step[:count], local + s * step[count:]) for s in (1, -1))
         expected = (up - down) / (2 * step[column])

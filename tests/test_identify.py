@@ -430,7 +430,7 @@ def problem_of(runs: list[Recording], bounds=None) -> Problem:
 def start_at(problem: Problem, factor: float = 1.0) -> Unknowns:
     """The paper's motor, or some factor off, and each run as it begins in its record."""
     coordinates = np.log([factor * getattr(PAPER, n) for n in PARAMETERS])
-    local = np.concatenate([problem.tape.initial, np.zeros((2, 2))], 1)
+    local = np.concatenate([problem.tape.initial, np.zeros((2, LOCAL - 2))], 1)
     return Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
 
 
@@ -518,7 +518,7 @@ def test_the_rotor_turns_by_its_own_speed_and_not_by_that_of_a_slow_sensor(x64):
     }
     logs = zip(parameters.names, parameters.logarithmic, strict=True)
     coordinates = [np.log(values[n]) if log else values[n] for n, log in logs]
-    local = np.array([[truth["current_A"][0], speed[0], 0.0, 0.0]])
+    local = np.array([[truth["current_A"][0], speed[0], 0.0, 0.0, 0.0]])
     unknowns = Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
     fit = polish(given.problem, Refined(unknowns, np.inf, (), False), steps=0)
     turn = np.asarray(turned(given.problem, fit).tape.turn).reshape(-1)

@@ -94,6 +94,8 @@ class AbstractEffect(eqx.Module):
     holds: ClassVar[Literal["speed", "current"] | None] = None
     # the state by which its teeth come to touch and part
     twists: ClassVar[str | None] = None
+    # the state of a spring, which a run may begin with wound up in any way
+    winds: ClassVar[str | None] = None
     # with it the motor is still a linear system with inputs, as long as no dry element changes direction and no teeth
     # come to touch or part
     affine: ClassVar[bool] = False

@@ -46,7 +46,7 @@ class ShaftCompliance(_TwoInertias):
     (1 - s) J dw/dt = Kt i - f w - T_s,  s J dw_L/dt = T_s - T_load,
     d twist/dt = w - w_L,  T_s = stiffness twist + damping (w - w_L).
 
-    A run begins with both ends at one speed and the shaft twisted by the load.
+    A run begins with both ends at one speed and the shaft twisted by the load; in a fit, as the run itself says.
 
     **Fields**: `stiffness_Nm_rad` in N m/rad, > 0; `damping_Nms_rad` in N m s/rad, > 0; `load_share`, s, the share
     of the inertia behind the shaft, between 0 and 1.
@@ -59,6 +59,7 @@ class ShaftCompliance(_TwoInertias):
     label: ClassVar = "Compliant shaft"
     formula: ClassVar = "T_s = k twist + d (w - w_L), s J dw_L/dt = T_s - T_load"
     states: ClassVar = ("load_speed", "twist")
+    winds: ClassVar = "twist"
     affine: ClassVar = True
     ranges: ClassVar = {
         "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
@@ -85,7 +86,7 @@ class GearBacklash(_TwoInertias):
     As `shaft_compliance`, with T_s = stiffness bite + damping (w - w_L) while the teeth touch, where bite = twist
     -+ gap/2 is how far they are pressed together, and nothing inside the gap; teeth push and never pull. Without gap
     it is nearly a compliant shaft. A run begins with the teeth in contact on the side that the load presses them to,
-    or in the middle without load.
+    or in the middle without load; in a fit, as the run itself says.
 
     **Fields**: `stiffness_Nm_rad` of the teeth in contact in N m/rad, > 0; `damping_Nms_rad` in N m s/rad, > 0;
     `load_share`, s, the share of the inertia behind the gear, between 0 and 1; `gap_rad`, the whole play in rad, > 0,
@@ -103,6 +104,7 @@ class GearBacklash(_TwoInertias):
     states: ClassVar = ("gear_speed", "gear_twist")
     affine: ClassVar = True
     twists: ClassVar = "gear_twist"
+    winds: ClassVar = "gear_twist"
     ranges: ClassVar = {
         "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
         "damping_Nms_rad": ParameterRange("N m s/rad", 1e-11, 1e6),

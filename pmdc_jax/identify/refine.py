@@ -24,9 +24,13 @@ class Unknowns(NamedTuple):
     """What a refinement moves: search coordinates, and what each run does not tell."""
 
     coordinates: Float[Array, " parameters"]
-    local: Float[
-        Array, "runs 4"
-    ]  # initial current A and speed rad/s, load offset N m, initial angle rad
+    # initial current A and speed rad/s, load offset N m, initial angle rad and twist rad
+    local: Float[Array, "runs 5"]
+
+
+def apart(local: Float[Array, "runs 5"]) -> tuple[Array, Array, Array, Array]:
+    """The runs' own unknowns as a simulation takes them."""
+    return local[:, :2], local[:, 2], local[:, 3], local[:, 4]
 
 
 class Refined(NamedTuple):
@@ -78,6 +82,11 @@ class Problem(eqx.Module):
         return any("angle" in effect.states for effect in self.parameters.effects)
 
     @property
+    def winds(self) -> bool:
+        """Whether a spring may be wound up as a run begins."""
+        return any(effect.winds for effect in self.parameters.effects)
+
+    @property
     def turnable(self) -> Bool[Array, " runs"]:
         """Which runs may begin at any angle."""
         known = jnp.asarray(self.tape.angle_known)
@@ -92,14 +101,15 @@ class Problem(eqx.Module):
         drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid][first] > 0, tape.drive)
         angle = self.turnable & self.angular
         load = jnp.asarray(tape.load_unknown)
-        own = jnp.stack([drive.voltage, drive.free, load, angle], 1)
+        twist = self.winds & drive.free
+        own = jnp.stack([drive.voltage, drive.free, load, angle, twist], 1)
         return jnp.concatenate([self.free[None, :] & self.counts[:, None], own], 1)
 
 
 class Evaluation(NamedTuple):
     """A free run, its residuals over the noise, and their derivatives.
 
-    Columns: the coordinates, then the run's own initial current, initial speed, load offset and initial angle.
+    Columns: the coordinates, then the run's own unknowns.
     """
 
     seen: Float[Array, "blocks 2 samples"]
@@ -119,9 +129,7 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
 @eqx.filter_jit
 def _evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     tape, local = problem.tape, unknowns.local
-    seen, jacobian = sensitivities(
-        problem.parameters, unknowns.coordinates, tape, local[:, :2], local[:, 2], local[:, 3]
-    )
+    seen, jacobian = sensitivities(problem.parameters, unknowns.coordinates, tape, *apart(local))
     scale = tape.weight / problem.noise[:, None]
     jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]
     return Evaluation(seen, (seen - tape.measured) * scale, jacobian)

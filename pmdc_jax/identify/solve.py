@@ -118,7 +118,7 @@ def settle(given: Prepared, end: Refined) -> tuple[Prepared, Polished]:
 
 
 def _start(tape: Tape, coordinates: jax.Array | np.ndarray) -> Unknowns:
-    local = np.column_stack([tape.initial, np.zeros(tape.runs), tape.angle])
+    local = np.column_stack([tape.initial, np.zeros(tape.runs), tape.angle, np.zeros(tape.runs)])
     return Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from scipy import fft, ndimage
 
 from ..simulate import free_run
-from .refine import Polished, Problem
+from .refine import Polished, Problem, apart
 
 # Neighbouring frequencies over which the power of a misfit is averaged
 NEIGHBOURS = 33
@@ -25,7 +25,7 @@ def of_rotor(problem: Problem, fit: Polished) -> Float[Array, "blocks 2 samples"
     unknowns = fit.refined.unknowns
     motor, local = problem.parameters(unknowns.coordinates), jnp.asarray(unknowns.local)
     bare = motor.with_effects(effect for effect in motor.effects if effect.equation != "sensor")
-    return free_run(bare, problem.tape, local[:, :2], local[:, 2], local[:, 3])
+    return free_run(bare, problem.tape, *apart(local))
 
 
 def turned(problem: Problem, fit: Polished) -> Problem:

@@ -41,8 +41,9 @@ JOINED = 1e-4
 # rattle in their play. There are as many passes as a run has blocks, and nothing to learn from the derivatives.
 PASSES = 12
 
-# Columns of the sensitivities for a run's own unknowns: initial current, initial speed, load offset, initial angle.
-LOCAL = 4
+# Columns of the sensitivities for a run's own unknowns: initial current, initial speed, load offset, initial angle,
+# and how far a spring is then wound up beyond what the load does.
+LOCAL = 5
 
 Starts = Float[Array, "blocks states"]
 
@@ -63,6 +64,7 @@ class Own(NamedTuple):
     speed: Float[Array, " runs"]
     load_offset: Float[Array, " runs"]
     angle: Float[Array, " runs"]
+    twist: Float[Array, " runs"]
 
 
 @eqx.filter_jit
@@ -72,13 +74,15 @@ def free_run(
     initial: Float[Array, "runs 2"],
     load_offset: Float[Array, " runs"],
     angle: Float[Array, " runs"] | None = None,
+    twist: Float[Array, " runs"] | None = None,
 ) -> Float[Array, "blocks 2 samples"]:
     """Current (A) and speed (rad/s) as the sensors report them, simulated freely from each run's `initial`.
 
     `load_offset` is a constant load in N m on top of each run's recorded one; `angle`, of the rotor in rad as
-    the run starts, matters only to effects that depend on it, and is the recorded one (else 0) unless given.
+    the run starts, matters only to effects that depend on it, and is the recorded one (else 0) unless given; so does
+    `twist`, in rad, by which a shaft is then twisted beyond what the load does, 0 unless given.
     """
-    own = _own(tape, initial, load_offset, angle)
+    own = _own(tape, initial, load_offset, angle, twist)
     prepared = (motor, along_grids(motor, tape))
     begins = _begins(motor, own, tape)
     states = begins.shape[1]
@@ -96,14 +100,15 @@ def sensitivities(
     initial: Float[Array, "runs 2"],
     load_offset: Float[Array, " runs"],
     angle: Float[Array, " runs"] | None = None,
+    twist: Float[Array, " runs"] | None = None,
 ) -> tuple[Float[Array, "blocks 2 samples"], Float[Array, "blocks 2 samples columns"]]:
     """Free run, and its derivatives by `parameters` and then by the run's own initial current, initial speed,
-    load offset and initial angle.
+    load offset, initial angle and initial twist.
 
     `assemble` makes a motor of the parameters; the rest is as in `free_run`. A motor whose runs depend on their
     beginning by chance gives NaN.
     """
-    own = _own(tape, initial, load_offset, angle)
+    own = _own(tape, initial, load_offset, angle, twist)
     count = len(parameters)
     every = count + LOCAL
 
@@ -156,20 +161,23 @@ def _along_columns(function: Callable, primals: tuple, tangents: tuple):
 def _among_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "... columns"]:
     """Derivatives by parameters and load offset, spread out among all columns."""
     zero = jnp.zeros((*own.shape[:-1], 2))
-    return jnp.concatenate([own[..., :count], zero, own[..., count:], zero[..., :1]], -1)
+    return jnp.concatenate([own[..., :count], zero, own[..., count:], zero], -1)
 
 
-def _own(tape: Tape, initial, load_offset, angle) -> Own:
+def _own(tape: Tape, initial, load_offset, angle, twist) -> Own:
     initial = jnp.asarray(initial)
     angle = jnp.asarray(tape.angle if angle is None else angle)
-    return Own(initial[:, 0], initial[:, 1], jnp.asarray(load_offset), angle)
+    twist = jnp.zeros_like(angle) if twist is None else jnp.asarray(twist)
+    return Own(initial[:, 0], initial[:, 1], jnp.asarray(load_offset), angle, twist)
 
 
 def _begins(motor: Motor, own: Own, tape: Tape) -> Starts:
     """How the run of each block begins."""
     first = jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs))
     load = jnp.asarray(tape.load)[first, 0] + own.load_offset
-    return _pack(motor.rest(own.current, own.speed, load, own.angle)).T[tape.run]
+    state = motor.rest(own.current, own.speed, load, own.angle)
+    wound = {e.winds: state.extra[e.winds] + own.twist for e in motor.effects if e.winds}
+    return _pack(state._replace(extra=state.extra | wound)).T[tape.run]
 
 
 def _guess(motor: Motor, own: Own, tape: Tape, begins: Starts) -> Starts:
