@@ -23,8 +23,10 @@ from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
 from pmdc_jax.diagnose.screen import log_chance
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.colour import Series, whitener
+from pmdc_jax.identify.polish import polish
 from pmdc_jax.identify.prepare import prepare
-from pmdc_jax.identify.refine import Refined, Unknowns, polish
+from pmdc_jax.identify.problem import Unknowns
+from pmdc_jax.identify.refine import Refined
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.simulate import LOCAL, Tape, free_run
 

@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 from benchmarks import virtual_bench as vb
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
-from pmdc_jax.identify.refine import apart
+from pmdc_jax.identify.problem import apart
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recording import Recording
 from pmdc_jax.simulate import LOCAL, Tape, free_run, sensitivities, squared_errors

@@ -28,8 +28,10 @@ from pmdc_jax.identify.identification import Identification
 from pmdc_jax.identify.judge import judge
 from pmdc_jax.identify.noise import is_coarse, quantum, white_noise
 from pmdc_jax.identify.parameters import Parameters
+from pmdc_jax.identify.polish import fit_own, polish
 from pmdc_jax.identify.prepare import prepare
-from pmdc_jax.identify.refine import Problem, Refined, Unknowns, evaluate, fit_own, polish, refine
+from pmdc_jax.identify.problem import Problem, Unknowns, evaluate
+from pmdc_jax.identify.refine import Refined, refine
 from pmdc_jax.identify.search import METHODS, Found, search
 from pmdc_jax.identify.sharpen import last_fit, residuals_of
 from pmdc_jax.identify.solve import _distinct, solve

@@ -10,8 +10,9 @@ import numpy as np
 
 from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction
 from ..identify.colour import Series, Whitener
+from ..identify.polish import Polished, polish
 from ..identify.prepare import Prepared
-from ..identify.refine import Polished, Refined, polish
+from ..identify.refine import Refined
 from ..identify.sharpen import (
     last_fit,
     residuals_of,

@@ -10,8 +10,8 @@ from scipy import stats
 
 from ..effects import EFFECTS
 from ..identify.colour import Whitener
+from ..identify.polish import Polished
 from ..identify.prepare import Prepared
-from ..identify.refine import Polished
 from ..identify.solve import Solved
 from .candidates import FULLER
 from .compare import FAR, MARGIN, Comparison, Fitted, plainest

@@ -11,8 +11,10 @@ from jaxtyping import Float
 
 from ..effects import EFFECTS
 from ..identify.colour import Whitener
+from ..identify.polish import polish
 from ..identify.prepare import Prepared
-from ..identify.refine import Refined, Unknowns, polish
+from ..identify.problem import Unknowns
+from ..identify.refine import Refined
 from ..identify.sharpen import sharpened, squares_of
 from ..identify.solve import POOR, Solved, searched
 from ..identify.uncertainty import FLAT

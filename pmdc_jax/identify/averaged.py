@@ -19,8 +19,8 @@ from scipy.signal import periodogram
 
 from .likelihood import Samples, unlikely
 from .noise import quantum
+from .polish import Polished, polish
 from .prepare import Prepared
-from .refine import Polished, polish
 
 # A mean must be this much likelier than the speed itself, by the logarithm; or be no less likely by more, where the
 # speed is counted like one but other noise would show alike

@@ -16,9 +16,11 @@ from .identifiability import explain
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import white_noise
 from .parameters import Parameters, unit_of
+from .polish import Polished, fit_own, polish
 from .prepare import Prepared
+from .problem import Problem
 from .profile import QUADRATIC, profile_interval
-from .refine import Polished, Problem, Refined, fit_own, polish
+from .refine import Refined
 from .solve import SAME, Solved
 from .uncertainty import FLAT, Information, information
 

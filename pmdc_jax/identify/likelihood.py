@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from .colour import Series, whitener
+from .polish import Polished
 from .prepare import Prepared
-from .refine import Polished
 from .sharpen import series_of, training_runs
 
 Samples = Float[np.ndarray, " samples"]

@@ -20,7 +20,7 @@ from .bounds import search_bounds
 from .identification import Role
 from .noise import white_noise
 from .parameters import Parameters, check_names
-from .refine import Problem
+from .problem import Problem
 
 
 class Prepared(NamedTuple):

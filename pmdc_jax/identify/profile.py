@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from .refine import Problem, Unknowns, evaluate, gauss_newton, normal_matrix
+from .polish import gauss_newton
+from .problem import Problem, Unknowns, evaluate, normal_matrix
 
 # A coordinate (natural logarithm) surer than this is as good as quadratic: its profile is not drawn.
 QUADRATIC = 0.05

@@ -15,8 +15,9 @@ import numpy as np
 
 from ..simulate import Tape
 from .colour import Series, Whitener
+from .polish import Polished, polish
 from .prepare import Prepared
-from .refine import Polished, Refined, polish
+from .refine import Refined
 from .whitening import Whitening
 
 # Gauss-Newton steps from one fit to white residuals to another

@@ -16,8 +16,10 @@ from .averaged import without_averaging
 from .bounds import effect_bounds
 from .identification import Search
 from .parameters import Parameters
+from .polish import IDLE, Polished, polish, with_own
 from .prepare import Prepared
-from .refine import IDLE, Polished, Problem, Refined, Unknowns, polish, refine, with_own
+from .problem import Problem, Unknowns
+from .refine import Refined, refine
 from .search import Found
 from .search import search as global_search
 from .turning import turned

@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 from scipy import fft, ndimage
 
 from ..simulate import free_run
-from .refine import Polished, Problem, apart
+from .polish import Polished
+from .problem import Problem, apart
 
 # Neighbouring frequencies over which the power of a misfit is averaged
 NEIGHBOURS = 33

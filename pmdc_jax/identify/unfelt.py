@@ -18,8 +18,9 @@ from jaxtyping import Float
 from ..simulate import Tape
 from .colour import whitener
 from .likelihood import unlikely
+from .polish import Polished, polish
 from .prepare import Prepared
-from .refine import Polished, Problem, polish
+from .problem import Problem
 from .sharpen import series_of
 
 # Noise of a smaller share of the largest value is rounding

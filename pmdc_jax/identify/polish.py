@@ -1,0 +1,212 @@
+"""Gauss-Newton to the bottom of an optimum, each output weighed by what its own residuals turn out to be."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .noise import FLOOR
+from .parameters import Parameters
+from .problem import Evaluation, Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
+from .refine import Refined
+
+# Steps after which a fall of the cost by no more than so much ends the polish: dry elements leave kinks where a
+# straight line foretells more than there is to gain
+PATIENCE, IDLE = 5, 1e-5
+# Gauss-Newton steps of the polish, and the fall of the sum of squares, in noise variances, below which a step is
+# not worth it: the square of 0.03 standard errors.
+POLISH = 20
+WORTH = 1e-3
+# ... and that a step may foretell where none is found that lowers it, at the kinks of dry elements: of 0.3 errors
+AT_KINK = 0.1
+# Curvature added to every coordinate in a step, as if each were known to within a factor of e beforehand:
+# nothing to one that the data see, and it keeps one that they do not see where it is.
+RIDGE = 1.0
+
+
+class Polished(NamedTuple):
+    """The end of the line: where, what is simulated there, and the noise as the residuals show it."""
+
+    refined: Refined
+    evaluation: Evaluation
+    noise: np.ndarray
+
+
+def polish(problem: Problem, end: Refined, steps: int = POLISH) -> Polished:
+    """Gauss-Newton to the bottom, while each output is weighed by what its own residuals turn out to be.
+
+    The claim of convergence is the gradient's: no step within the bounds would lower the sum of squares by
+    more than `WORTH` noise variances (`AT_KINK`, where no step is found that does). A coordinate held at a bound is
+    let go where the gradient points back inside.
+    """
+    low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
+    trial, held, share = end.unknowns, set(end.at_bound), 1.0
+    best, converged = _weighed(problem, trial), False
+    reached, step, gain = best, np.zeros(len(flatten(trial))), np.inf
+    costs = [best.cost]
+    for _ in range(steps):
+        if len(costs) > PATIENCE and costs[-1 - PATIENCE] - costs[-1] < IDLE:
+            break
+        if not np.isfinite(best.cost):
+            break  # what cannot be simulated has no slope to follow
+        if reached.cost > best.cost + 1e-9 and share > 1e-3:
+            share /= 4  # the last step was too long
+        elif reached.cost <= best.cost + 1e-9:
+            best, share = reached, 1.0
+            start = np.asarray(best.unknowns.coordinates)
+            held = {k for k in held if (best.matrix[k, -1] > 0) == (start[k] <= low[k])}
+            step, gain = gauss_newton(best.matrix, held, len(low))
+            if converged := gain <= WORTH * best.matrix[-1, -1] / problem.most_samples:
+                break
+        else:
+            break
+        moved = np.asarray(flatten(best.unknowns)) + _straight(problem.parameters, share * step)
+        inside = np.clip(moved[: len(low)], low, high)
+        held |= set(np.flatnonzero(inside != moved[: len(low)]).tolist())
+        moved[: len(low)] = inside
+        reached = _weighed(problem, unflatten(problem, jnp.asarray(moved)))
+        costs.append(min(reached.cost, best.cost))
+    converged = converged or gain <= AT_KINK * best.matrix[-1, -1] / problem.most_samples
+    refined = Refined(best.unknowns, best.fitness, tuple(sorted(held)), bool(converged))
+    return Polished(refined, best.evaluation, best.noise)
+
+
+def _straight(parameters: Parameters, step: np.ndarray) -> np.ndarray:
+    """A step along which a positive parameter rises on a straight line, and not as an exponential: what is nearly zero,
+    as friction that something else hid, would rise to infinity."""
+    rises = np.zeros(len(step), bool)
+    rises[: len(parameters.names)] = parameters.logarithmic
+    return np.where(rises & (step > 0), np.log1p(np.maximum(step, 0.0)), step)
+
+
+class _Weighed(NamedTuple):
+    """A point, evaluated, each output weighed by its own residuals."""
+
+    unknowns: Unknowns
+    evaluation: Evaluation
+    noise: np.ndarray
+    matrix: np.ndarray
+    # sum of the logarithms of the noise, which the maximum of the likelihood makes least; of white residuals that of
+    # their squares
+    cost: float
+    fitness: float
+
+
+def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
+    evaluation = evaluate(problem, unknowns)
+    with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
+        squares = np.square(np.asarray(evaluation.residuals)[problem.counted]).sum((0, 2))
+        noise, stretch = _own_noise(problem, squares)
+    scaled = _scaled(evaluation, stretch)
+    matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
+    if problem.whitening is not None:
+        cost = float(np.log(np.maximum(squares.sum(), 1e-300)))
+    else:
+        over = squares * stretch**2 / np.maximum(problem.samples, 1.0)
+        cost = float(np.log(np.maximum(noise, 1e-300)).sum() + over.sum() / 2)
+    cost = cost if np.isfinite(cost) else np.inf
+    return _Weighed(
+        unknowns, scaled, noise, matrix, cost, float(squares.sum()) / problem.most_samples
+    )
+
+
+def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unknowns, Evaluation]:
+    """Fit only what belongs to each run: its initial state, and its load where nobody knows it.
+
+    A step that makes a run worse, as where teeth of a gear meet at another time, is taken shorter for that run.
+    """
+    still = eqx.tree_at(lambda p: p.free, problem, jnp.zeros_like(problem.free))
+    run = np.asarray(problem.tape.run)
+    everyone, share = jnp.ones(problem.tape.runs, bool), np.ones(problem.tape.runs)
+
+    def squares_of_runs(evaluation: Evaluation) -> np.ndarray:
+        with np.errstate(over="ignore", invalid="ignore"):
+            of_block = np.square(np.asarray(evaluation.residuals)).sum((1, 2))
+        return np.bincount(run, of_block, problem.tape.runs)
+
+    best = evaluate(still, unknowns)
+    for _ in range(passes):
+        matrix = np.asarray(normal_matrix(best, still.tape, everyone))
+        flat, gain = gauss_newton(matrix, set(), 0)
+        if gain < WORTH * matrix[-1, -1] / problem.most_samples:
+            break
+        step = unflatten(problem, jnp.asarray(flat)).local
+        trial = unknowns._replace(local=unknowns.local + share[:, None] * step)
+        reached = evaluate(still, trial)
+        # not where it cannot be simulated
+        better = squares_of_runs(reached) <= squares_of_runs(best)
+        share = np.where(better, 1.0, share / 4)
+        local = jnp.where(better[:, None], trial.local, unknowns.local)
+        unknowns = unknowns._replace(local=local)
+        best = _taken(jnp.asarray(better[run]), reached, best)
+    return unknowns, best
+
+
+def with_own(problem: Problem, fit: Polished) -> Polished:
+    """A fit in which runs that do not count have found what belongs to each of them, too, where nobody knows a load."""
+    if not np.any(~np.asarray(problem.counts) & np.asarray(problem.tape.load_unknown)):
+        return fit
+    unknowns, evaluation = fit_own(problem, fit.refined.unknowns)
+    counts = jnp.asarray(problem.counts)
+    local = jnp.where(counts[:, None], fit.refined.unknowns.local, unknowns.local)
+    refined = fit.refined._replace(unknowns=unknowns._replace(local=local))
+    scaled = _scaled(evaluation, np.asarray(problem.noise) / fit.noise)
+    return Polished(
+        refined, _taken(jnp.asarray(problem.counted), fit.evaluation, scaled), fit.noise
+    )
+
+
+def _scaled(evaluation: Evaluation, stretch: Float[np.ndarray, "2"]) -> Evaluation:
+    """Residuals and derivatives over another noise."""
+    return evaluation._replace(
+        residuals=evaluation.residuals * stretch[:, None],
+        jacobian=evaluation.jacobian * stretch[:, None, None],
+    )
+
+
+def _taken(blocks: Bool[Array, " blocks"], one: Evaluation, other: Evaluation) -> Evaluation:
+    """One evaluation in some blocks, another one in the others."""
+    return jax.tree.map(jax.vmap(jnp.where), *(Evaluation(*3 * [blocks]), one, other))
+
+
+def gauss_newton(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.ndarray, float]:
+    """The step that lowers the sum of squares most, and by how much.
+
+    **Arguments**: `matrix`, as from `normal_matrix`; `held`, which of the `count` coordinates stay.
+    """
+    gradient, hessian = matrix[:-1, -1].copy(), matrix[:-1, :-1].copy()
+    if not np.all(np.isfinite(matrix)):
+        return np.zeros(len(gradient)), np.inf
+    for k in held:
+        gradient[k] = hessian[k, :] = hessian[:, k] = 0.0
+    hessian[np.arange(count), np.arange(count)] += RIDGE
+    lengths = np.sqrt(np.diag(hessian))
+    moves = lengths > 0
+    lengths = np.where(moves, lengths, 1.0)
+    values, vectors = np.linalg.eigh(hessian / lengths[:, None] / lengths)
+    along = vectors.T @ (gradient / lengths)
+    visible = values > 1e-12 * values.max(initial=1e-300)
+    along = np.where(visible, along, 0.0)
+    shrunk = along / np.where(visible, values, 1.0)
+    # rounding errors would carry away what no residual depends on
+    return -(vectors @ shrunk) / lengths * moves, float(along @ shrunk)
+
+
+def _own_noise(problem: Problem, squares: np.ndarray):
+    """Standard deviation of the residuals of each output, and the old scale over the new; white ones keep theirs.
+
+    At least the share `FLOOR` of what is measured: where there is no noise, the likelihood is greatest if one output
+    is met exactly, whatever becomes of the other.
+    """
+    if problem.whitening is not None:
+        return np.asarray(problem.noise), np.ones(2)
+    noise = np.asarray(problem.noise)
+    ratio = np.sqrt(squares / np.maximum(problem.samples, 1.0))
+    ratio = np.maximum(ratio, FLOOR * problem.sizes / noise)
+    ratio = np.where(ratio == 0, 1.0, ratio)
+    return noise * ratio, 1 / ratio

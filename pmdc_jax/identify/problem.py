@@ -1,0 +1,165 @@
+"""Recordings as a least-squares problem: what may move, and the residuals with their derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..simulate import LOCAL, Tape, sensitivities
+from .parameters import Parameters
+from .whitening import Whitening
+
+
+class Unknowns(NamedTuple):
+    """What a refinement moves: search coordinates, and what each run does not tell."""
+
+    coordinates: Float[Array, " parameters"]
+    # initial current A and speed rad/s, load offset N m, initial angle rad and twist rad
+    local: Float[Array, "runs 5"]
+
+
+def apart(local: Float[Array, "runs 5"]) -> tuple[Array, Array, Array, Array]:
+    """The runs' own unknowns as a simulation takes them."""
+    return local[:, :2], local[:, 2], local[:, 3], local[:, 4]
+
+
+class Problem(eqx.Module):
+    """A least-squares problem: runs on tape, the noise to scale by, what may move and which runs count.
+
+    Runs that do not count (hold-outs) are simulated all the same, and their own unknowns can be fitted.
+    """
+
+    parameters: Parameters
+    tape: Tape
+    noise: Float[Array, "2"]  # standard deviations of current A and speed rad/s
+    free: Bool[Array, " parameters"]
+    counts: Bool[Array, " runs"]
+    whitening: Whitening | None = None  # in place of the noise, where residuals are correlated
+
+    @property
+    def outputs(self) -> int:
+        """How many outputs the runs that count have measured."""
+        return int(np.count_nonzero(np.asarray(self.tape.weight)[self.counted].any((0, 2))))
+
+    @property
+    def counted(self) -> Bool[np.ndarray, " blocks"]:
+        """Which blocks are of runs that count."""
+        return np.asarray(self.counts)[np.asarray(self.tape.run)]
+
+    @property
+    def samples(self) -> Float[np.ndarray, "2"]:
+        """How many samples of each output count."""
+        return np.asarray(self.tape.weight)[self.counted].sum((0, 2))
+
+    @property
+    def most_samples(self) -> float:
+        """How many samples of the output count of which most do, one at least."""
+        return max(float(self.samples.max()), 1.0)
+
+    @property
+    def sizes(self) -> Float[np.ndarray, "2"]:
+        """Root mean square of each output as measured in the runs that count; zero where it was not."""
+        squares = np.square(np.asarray(self.tape.measured)[self.counted]).sum((0, 2))
+        return np.sqrt(squares / np.maximum(self.samples, 1.0))
+
+    @property
+    def angular(self) -> bool:
+        """Whether a torque depends on the rotor's angle."""
+        return any("angle" in effect.states for effect in self.parameters.effects)
+
+    @property
+    def winds(self) -> bool:
+        """Whether a spring may be wound up as a run begins."""
+        return any(effect.winds for effect in self.parameters.effects)
+
+    @property
+    def turnable(self) -> Bool[Array, " runs"]:
+        """Which runs may begin at any angle."""
+        known = jnp.asarray(self.tape.angle_known)
+        # where nobody knows an angle, that of the first run is the zero from which phases count
+        zero = ~jnp.any(known) & (jnp.arange(self.tape.runs) == 0)
+        return ~known & ~zero
+
+    def moves(self) -> Bool[Array, "runs columns"]:
+        """Which coordinates and which of its own unknowns each run may tell of."""
+        tape = self.tape
+        first = jnp.argmax(jnp.asarray(tape.run)[None, :] == jnp.arange(tape.runs)[:, None], axis=1)
+        drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid][first] > 0, tape.drive)
+        angle = self.turnable & self.angular
+        load = jnp.asarray(tape.load_unknown)
+        twist = self.winds & drive.free
+        own = jnp.stack([drive.voltage, drive.free, load, angle, twist], 1)
+        return jnp.concatenate([self.free[None, :] & self.counts[:, None], own], 1)
+
+
+class Evaluation(NamedTuple):
+    """A free run, its residuals over the noise, and their derivatives.
+
+    Columns: the coordinates, then the run's own unknowns.
+    """
+
+    seen: Float[Array, "blocks 2 samples"]
+    residuals: Float[Array, "blocks 2 samples"]
+    jacobian: Float[Array, "blocks 2 samples columns"]
+
+
+def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
+    """Simulate every run of the problem and compare."""
+    # Levenberg-Marquardt traces under an empty mesh; under no mesh at all everything would be traced once more
+    with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+        # whitened apart, for the simulation takes long to compile
+        plain = _evaluate(replace(problem, whitening=None), unknowns)
+        return plain if problem.whitening is None else _whitened(problem, plain)
+
+
+@eqx.filter_jit
+def _evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
+    tape, local = problem.tape, unknowns.local
+    seen, jacobian = sensitivities(problem.parameters, unknowns.coordinates, tape, *apart(local))
+    scale = tape.weight / problem.noise[:, None]
+    jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]
+    return Evaluation(seen, (seen - tape.measured) * scale, jacobian)
+
+
+@eqx.filter_jit
+def _whitened(problem: Problem, plain: Evaluation) -> Evaluation:
+    both = jnp.concatenate([plain.jacobian, plain.residuals[..., None]], -1)
+    assert problem.whitening is not None
+    both = problem.whitening(both * problem.noise[:, None, None], problem.tape.run)
+    return Evaluation(plain.seen, both[..., -1], both[..., :-1])
+
+
+@eqx.filter_jit
+def normal_matrix(
+    evaluation: Evaluation, tape: Tape, counts: Bool[Array, " runs"] | np.ndarray
+) -> Float[Array, "unknowns unknowns"]:
+    """[J r]' [J r] over all unknowns: coordinates, then the locals run by run, then the residual."""
+    _, r, jacobian = evaluation
+    both = jnp.concatenate([jacobian, r[..., None]], -1)
+    of_block = jnp.einsum("bcsi,bcsj->bij", both, both)
+    of_run = jax.ops.segment_sum(of_block, tape.run, tape.runs) * counts[:, None, None]
+    index = _columns(jacobian.shape[-1] - LOCAL, tape.runs)
+    size = index.max() + 1
+    return jnp.zeros((size, size)).at[index[:, :, None], index[:, None, :]].add(of_run)
+
+
+def _columns(count: int, runs: int) -> np.ndarray:
+    """Where each run's columns lie among all unknowns and the residual."""
+    own = count + LOCAL * np.arange(runs)[:, None] + np.arange(LOCAL)
+    shared = np.broadcast_to(np.arange(count), (runs, count))
+    return np.concatenate([shared, own, np.full((runs, 1), count + LOCAL * runs)], 1)
+
+
+def unflatten(problem: Problem, flat: Float[Array, " columns"]) -> Unknowns:
+    count = len(problem.free)
+    return Unknowns(flat[:count], flat[count:].reshape(problem.tape.runs, LOCAL))
+
+
+def flatten(unknowns: Unknowns) -> Float[Array, " columns"]:
+    return jnp.concatenate([unknowns.coordinates, unknowns.local.reshape(-1)])
