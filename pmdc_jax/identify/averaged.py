@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_banded
-from scipy.signal import periodogram
 
 from .likelihood import Samples, unlikely
 from .noise import quantum
@@ -109,11 +108,11 @@ def counted_over(counts: Sequence[np.ndarray]) -> tuple[Sensed | None, float]:
     four times as strong at the highest frequency, and twice at half of that; of differences over two samples, counted
     by halves, it is none at all, and four times.
     """
-    middle, _, highest = _powers(counts)
+    middle, high, highest = _powers(counts)
     if highest > COUNTED:
         clearly = highest > np.sqrt(2.0) * max(middle, COUNTED)
         return LAST, -np.inf if clearly else -LIKELIER
-    return differenced_over(counts)[0], -LIKELIER
+    return TWO if highest < NONE * high else None, -LIKELIER
 
 
 def differenced_over(speeds: Sequence[np.ndarray]) -> tuple[Sensed | None, float]:
@@ -131,9 +130,12 @@ def _powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
     """
     powers = []
     for signal in signals:
-        share, power = periodogram(np.diff(signal, 2), fs=2.0, window="hann", detrend="constant")
-        white = power[1:] / (2 * np.sin(np.pi * share[1:] / 2)) ** 4
-        powers.append([white[(low < share[1:]) & (share[1:] < high)].mean() for low, high in BANDS])
+        bends = np.diff(signal, 2)
+        window = np.hanning(len(bends) + 1)[:-1]
+        power = np.abs(np.fft.rfft((bends - bends.mean()) * window)) ** 2 / (window @ window)
+        share = np.fft.rfftfreq(len(bends), 0.5)[1:]
+        white = power[1:] / (2 * np.sin(np.pi * share / 2)) ** 4
+        powers.append([white[(low < share) & (share < high)].mean() for low, high in BANDS])
     return np.mean(powers, axis=0)
 
 
