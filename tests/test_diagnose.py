@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +14,17 @@ from scipy import stats
 from benchmarks import virtual_bench as vb
 from pmdc_jax import Recording
 from pmdc_jax.diagnose.candidates import FULLER, TABLE, Scales
+from pmdc_jax.diagnose.compare import Fitted
 from pmdc_jax.diagnose.evidence import Block, products
 from pmdc_jax.diagnose.kinship import are_rivals, is_within
 from pmdc_jax.diagnose.library import Library
-from pmdc_jax.diagnose.model import model_of
+from pmdc_jax.diagnose.model import Model, model_of
+from pmdc_jax.diagnose.naming import Namer, Naming
 from pmdc_jax.diagnose.periodic import common_line, spectrum
 from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
 from pmdc_jax.diagnose.screen import log_chance
+from pmdc_jax.diagnose.seen import Seen
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.colour import Series, whitener
 from pmdc_jax.identify.polish import polish
@@ -49,6 +53,33 @@ def test_candidates_are_within_the_ranges(name):
         assert built is not None
         for field, r in EFFECTS[name].ranges.items():
             assert r.scale == "linear" or built[field] > 0
+
+
+class Undecided(Namer):
+    """Two sets of effects, each of which looks better by the filter of the other one."""
+
+    def __init__(self):
+        self.base, self.one, self.other = (Mock(spec=Model, is_possible=True) for _ in range(3))
+        self.passed, self.trials = set(), 0
+        self.comparison = Mock(ranked=lambda models, white: [Mock(spec=Fitted, model=models[-1])])
+
+    def _tried(self, current, found):
+        self.trials += 1
+        assert self.trials < 5
+        return [self.other if current is self.one else self.one]
+
+    _see = staticmethod(lambda model: Mock(spec=Seen))
+    _best = staticmethod(lambda tried, white: tried[0])
+    _spared = staticmethod(lambda model: model)
+    _is_settled = staticmethod(lambda *models: True)
+    _tied = staticmethod(lambda *models: [])
+    _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))
+
+
+def test_what_was_left_for_a_better_model_is_not_come_back_to():
+    namer = Undecided()
+    assert namer.name().chosen is namer.other
+    assert namer.trials == 3
 
 
 def test_only_waves_that_records_show_are_tried():

@@ -799,31 +799,46 @@ def test_bad_arguments_are_refused(runs, call, says):
         call(runs)
 
 
-@pytest.mark.parametrize("gap", [0.05, 0.3])
-def test_what_belongs_to_a_run_is_never_fitted_for_the_worse(gap):
-    """Nobody knows the load of a run behind a gear with play, where straight lines lead anywhere."""
+def behind_a_gear(gap: float, load: float, twist: float = 0.0) -> tuple[Problem, Unknowns]:
+    """The problem of a run of a motor behind a gear with play, and the true coordinates; not what is the run's own."""
     gear = {"stiffness": 500.0, "damping": 0.1, "load_share": 0.4, "gap_rad": gap}
     driven = vb.prbs(np.random.default_rng(0), 1.0)
     motor = {name: getattr(PAPER, name) for name in PARAMETERS}
     plant = Plant(**motor, **gear)
-    seen = simulate(plant, driven.time, driven.voltage, driven.load + 0.1)
+    seen = simulate(plant, driven.time, driven.voltage, driven.load + load, twist=twist)
     run = Recording("gear", driven.time, driven.voltage, seen[:, 0], seen[:, 1])
+    given = prepare([run], [], effects=[EFFECTS["gear_backlash"]], unloaded=not load)
+    names = ("stiffness_Nm_rad", "damping_Nms_rad", "load_share", "gap_rad")
+    truth = {**motor, **dict(zip(names, gear.values(), strict=True))}
+    named = [truth[name.removeprefix("gear_backlash.")] for name in given.problem.parameters.names]
+    logarithmic = np.asarray(given.problem.parameters.logarithmic)
+    coordinates = np.where(logarithmic, np.log(named), named)
+    return given.problem, Unknowns(jnp.asarray(coordinates), jnp.zeros((1, LOCAL)))
+
+
+@pytest.mark.parametrize("gap", [0.05, 0.3])
+def test_what_belongs_to_a_run_is_never_fitted_for_the_worse(gap):
+    """Nobody knows the load of a run behind a gear with play, where straight lines lead anywhere."""
     with jax.enable_x64(True):
-        given = prepare([run], [], effects=[EFFECTS["gear_backlash"]])
-        names = ("stiffness_Nm_rad", "damping_Nms_rad", "load_share", "gap_rad")
-        truth = {**motor, **dict(zip(names, gear.values(), strict=True))}
-        named = [
-            truth[name.removeprefix("gear_backlash.")] for name in given.problem.parameters.names
-        ]
-        logarithmic = np.asarray(given.problem.parameters.logarithmic)
-        coordinates = np.where(logarithmic, np.log(named), named)
-        begun = Unknowns(jnp.asarray(coordinates), jnp.zeros((1, LOCAL)))
+        problem, begun = behind_a_gear(gap, load=0.1)
         squares = [
             float(jnp.square(evaluation.residuals).sum())
             for evaluation in (
-                evaluate(given.problem, begun),
-                *(fit_own(given.problem, begun, passes)[1] for passes in (1, 4)),
+                evaluate(problem, begun),
+                *(fit_own(problem, begun, passes)[1] for passes in (1, 4)),
             )
         ]
     assert squares == sorted(squares, reverse=True)
     assert np.isfinite(squares[-1])
+
+
+@pytest.mark.parametrize("twist", [-0.12, 0.05, 0.14])
+def test_a_run_may_begin_anywhere_in_the_play(twist):
+    with jax.enable_x64(True):
+        problem, begun = behind_a_gear(gap=0.3, load=0.0, twist=twist)
+        truth = begun._replace(local=begun.local.at[0, 4].set(twist))
+        fitted, right = (
+            float(jnp.square(evaluate(problem, own).residuals).sum())
+            for own in (fit_own(problem, begun, 8)[0], truth)
+        )
+    assert fitted < 1.01 * right

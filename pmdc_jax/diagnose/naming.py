@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 from scipy import stats
@@ -67,10 +67,13 @@ class Namer:
         self.comparison = Comparison()
         # by effect: those that did as well when it was added
         self.instead: dict[str, set[str]] = {}
+        # that a better one has replaced, or is to: judged by another filter each may look like the better one
+        self.passed: set[Model] = set()
 
     def name(self) -> Naming:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
         current, found = self.base, self._see(self.base)
+        self.passed.add(current)
         while better := self._better(current, found, self._tried(current, found)):
             again = self._see(better)
             if not self._is_settled(current, found, better):
@@ -82,11 +85,12 @@ class Namer:
                 if better is None or not self._is_settled(current, found, better):
                     break
             current, found = better, self._see(better)
+            self.passed.add(current)
         return self._naming(self._better(current, found, self._tied(current, found)) or current)
 
     def _better(self, current: Model, found: Seen, tried: Sequence[Model | None]) -> Model | None:
         """The best of some models in place of the current one, if it is better, without what it can do without."""
-        possible = [model for model in tried if model is not None and model.is_possible]
+        possible = [model for model in tried if self._is_new(model)]
         if not possible:
             return None
         best = self._best(possible, found.screen.white)
@@ -95,6 +99,10 @@ class Namer:
         if plainest(self.comparison.ranked([current, best], found.screen.white)) is current:
             return None
         return self._spared(best)
+
+    def _is_new(self, model: Model | None) -> TypeGuard[Model]:
+        """Whether a model is possible, and none that was left for a better one."""
+        return model is not None and model.is_possible and model not in self.passed
 
     def _is_settled(self, current: Model, found: Seen, better: Model) -> bool:
         """Whether a better model is more than a way to mend the formula of what the current one has.
@@ -143,14 +151,23 @@ class Namer:
             foreign = found.is_foreign(current)
             one_more = shortlist if foreign else richer
             return self._with(current, found, one_more(current, found))
+        harder = [] if found.is_another() else self._in_harder_form(current, found, here)
+        if any(self._is_enough(model) for model in harder):
+            return harder
         tried = []
         if found.asks_for_more():
             tried += self._with(current, found, shortlist(current, found))
         if found.left < ALARM and not here and not tried:
             tried += self._sought(current, found)
-        if not found.is_another():
-            tried += self._in_harder_form(current, found, here)
-        return tried
+        return tried + harder
+
+    def _is_enough(self, model: Model | None) -> bool:
+        """Whether a model leaves nothing that is worth a trial: what teeth that meet by chance leave of a simple form
+        may look like many an effect beside it."""
+        if model is None or not model.is_possible:
+            return False
+        found = self._see(model)
+        return found.left >= ALARM or found.is_trace(model)
 
     def _sought(self, current: Model, found: Seen) -> list[Model | None]:
         """The motor with dry friction, searched for anew, if that may explain a misfit of which no first-order response
@@ -228,6 +245,8 @@ class Namer:
 
     def _best(self, tried: Sequence[Model], white: Whitener) -> Model:
         """The best of some refits, by the filter of what the one that leaves least leaves."""
+        if len(tried) == 1:
+            return tried[0]
         least = self.comparison.ranked(tried, white)[0].model
         ranked = self.comparison.ranked(tried, self.comparison.white(least))
         best = plainest(ranked)
@@ -250,14 +269,14 @@ class Namer:
         for effect in model.effects[:-1]:
             smaller = self.refits.without(model, effect, white)
             if (
-                smaller.is_possible
+                self._is_new(smaller)
                 and self.comparison.ranked([model, smaller], white)[0].model is smaller
             ):
                 return self._spared(smaller)
         for effect in model.effects:
             for simple in sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys()):
                 simpler = self.refits.in_place(model, white, effect, simple)
-                if simpler and self._does_as_well(simpler, model):
+                if self._is_new(simpler) and self._does_as_well(simpler, model):
                     return self._spared(simpler)
                 two = simpler and self._beside(simpler, model, effect)
                 if two and self._is_far_better(two, model, white):

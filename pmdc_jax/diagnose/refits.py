@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..effects import EFFECTS
 from ..identify.colour import Whitener
-from ..identify.polish import polish
+from ..identify.polish import polish, stood
 from ..identify.prepare import Prepared
 from ..identify.problem import Unknowns
 from ..identify.refine import Refined
@@ -145,10 +145,12 @@ class Refits:
         given, ends = starts[0][0], []
         for first in range(0, len(starts), CORES):
             ends += side_by_side(_roughly, starts[first : first + CORES])
-            best, *others = sorted(end.fitness for end in ends)
-            if best < POOR * given.problem.outputs or (others and others[0] < AGREED * best):
+            least, *others = sorted(end.fitness for end in ends)
+            if least < POOR * given.problem.outputs or (others and others[0] < AGREED * least):
                 break
-        return settled(effects, given, min(ends, key=lambda end: end.fitness), white)
+        best = min(ends, key=lambda end: end.fitness)
+        unknowns = stood(given.problem, best.unknowns, starts[0][1].unknowns.local)
+        return settled(effects, given, best._replace(unknowns=unknowns), white)
 
     def _refitted(
         self,

@@ -155,6 +155,10 @@ class AbstractEffect(eqx.Module):
         """How its teeth stand, on the side where they are nearer or the one given; needs `twists`."""
         raise NotImplementedError(f"{self.name} has no teeth")
 
+    def play(self) -> Scalars | float:
+        """By how much its teeth can be apart, rad."""
+        return 0.0
+
     def over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
         """The effect as it acts throughout a step of so many seconds that begins with this state."""
         del state, seconds

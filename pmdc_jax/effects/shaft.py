@@ -125,6 +125,9 @@ class GearBacklash(_TwoInertias):
         teeth = self.teeth(state)
         return jnp.where(teeth.touch, teeth.side * self.stiffness_Nm_rad * teeth.push, 0.0)
 
+    def play(self) -> Scalars:
+        return self.gap_rad
+
     def over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
         """As it stays until its teeth touch or part."""
         del seconds

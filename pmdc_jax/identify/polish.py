@@ -24,6 +24,8 @@ POLISH = 20
 WORTH = 1e-3
 # ... and that a step may foretell where none is found that lowers it, at the kinks of dry elements: of 0.3 errors
 AT_KINK = 0.1
+# By which shares of the play of its teeth a run is tried to begin twisted, from where its load presses them to
+STANDS = np.linspace(-1.0, 1.0, 9)
 # Curvature added to every coordinate in a step, as if each were known to within a factor of e beforehand:
 # nothing to one that the data see, and it keeps one that they do not see where it is.
 RIDGE = 1.0
@@ -115,6 +117,34 @@ def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
     )
 
 
+def stood(problem: Problem, unknowns: Unknowns, begun: Float[Array, "runs 5"]) -> Unknowns:
+    """Every run's own unknowns as they are, or as they had `begun` with the teeth of its gear elsewhere in their play,
+    whichever fits best.
+
+    No slope leads there: when teeth first meet changes all that follows, and a run that begins at rest may be fitted as
+    well as it goes by a speed that it never had.
+    """
+    motor = problem.parameters(unknowns.coordinates)
+    play = sum(float(effect.play()) for effect in motor.effects)
+    if not play:
+        return unknowns
+    local, least = unknowns.local, _squares_of_runs(problem, evaluate(problem, unknowns))
+    for share in STANDS:
+        trial = begun.at[:, 4].set(share * play)
+        squares = _squares_of_runs(problem, evaluate(problem, unknowns._replace(local=trial)))
+        local = jnp.where((squares < least)[:, None], trial, local)
+        least = np.minimum(squares, least)
+    return unknowns._replace(local=local)
+
+
+def _squares_of_runs(problem: Problem, evaluation: Evaluation) -> Float[np.ndarray, " runs"]:
+    """What each run leaves; infinitely much where it cannot be simulated."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        of_block = np.square(np.asarray(evaluation.residuals)).sum((1, 2))
+    sound = np.nan_to_num(of_block, nan=np.inf)
+    return np.bincount(np.asarray(problem.tape.run), sound, problem.tape.runs)
+
+
 def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unknowns, Evaluation]:
     """Fit only what belongs to each run: its initial state, and its load where nobody knows it.
 
@@ -124,11 +154,7 @@ def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unkn
     run = np.asarray(problem.tape.run)
     everyone, share = jnp.ones(problem.tape.runs, bool), np.ones(problem.tape.runs)
 
-    def squares_of_runs(evaluation: Evaluation) -> np.ndarray:
-        with np.errstate(over="ignore", invalid="ignore"):
-            of_block = np.square(np.asarray(evaluation.residuals)).sum((1, 2))
-        return np.bincount(run, of_block, problem.tape.runs)
-
+    unknowns = stood(still, unknowns, unknowns.local)
     best = evaluate(still, unknowns)
     for _ in range(passes):
         matrix = np.asarray(normal_matrix(best, still.tape, everyone))
@@ -139,7 +165,7 @@ def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unkn
         trial = unknowns._replace(local=unknowns.local + share[:, None] * step)
         reached = evaluate(still, trial)
         # not where it cannot be simulated
-        better = squares_of_runs(reached) <= squares_of_runs(best)
+        better = _squares_of_runs(problem, reached) <= _squares_of_runs(problem, best)
         share = np.where(better, 1.0, share / 4)
         local = jnp.where(better[:, None], trial.local, unknowns.local)
         unknowns = unknowns._replace(local=local)
