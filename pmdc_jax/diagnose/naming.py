@@ -21,7 +21,7 @@ from .model import Model, ended
 from .periodic import Line, line_of
 from .refits import Refits
 from .screen import Screen, Signal, beyond_curves, screen, signals
-from .seen import ALARM, HARDER, Seen, chance_of_nothing
+from .seen import ALARM, HARDER, Seen, chance_of_nothing, clearest_of
 from .shortlist import COMPARABLE, SHORTLIST, clear, effect_of, richer, shortlist
 
 # What is missed by a smaller share of what is measured is nothing: one simulation meets another no closer
@@ -241,7 +241,15 @@ class Namer:
         if model.effects:
             base, mine = (self.comparison.left(m, found.white) for m in (self.base, model))
             explained = base.squares - mine.squares
-        return Seen(found, of_candidates, of_curves, left, explained)
+        plainly = self._plainly(model, found, clearest_of(of_candidates, of_curves))
+        return Seen(found, of_candidates, of_curves, left, explained, plainly)
+
+    def _plainly(self, model: Model, found: Screen, clearest: Signal) -> float:
+        """What a signal would take away of what is measured, no filter between, over what the model takes away."""
+        before, after = (m.polished.refined.fitness for m in (self.base, model))
+        rest = found.unfiltered.regress([clearest.block]).squares
+        share = 1 - rest / found.unfiltered.regress().squares
+        return float(share * after / (before - after)) if after < before else np.inf
 
     def _best(self, tried: Sequence[Model], white: Whitener) -> Model:
         """The best of some refits, by the filter of what the one that leaves least leaves."""
@@ -318,7 +326,7 @@ class Namer:
         )
         rest = self._see(model)
         margin = MARGIN + (rest.clearest.gain if rest.left < ALARM else 0.0)
-        return plain < rich + margin or self._see(simpler).left >= ALARM
+        return bool(plain < rich + margin) or self._see(simpler).left >= ALARM
 
     def _without(self, chosen: Model, white: Whitener) -> dict[str, float]:
         chances = {}

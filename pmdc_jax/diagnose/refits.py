@@ -10,16 +10,16 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import EFFECTS
-from ..identify.colour import Whitener
+from ..identify.colour import Whitener, whitener
 from ..identify.polish import polish, stood
 from ..identify.prepare import Prepared
 from ..identify.problem import Unknowns
 from ..identify.refine import Refined
-from ..identify.sharpen import sharpened, squares_of
+from ..identify.sharpen import residuals_of, sharpened, squares_of, whitened
 from ..identify.solve import POOR, Solved, searched
 from ..identify.uncertainty import FLAT
 from ..threads import CORES, side_by_side
-from .candidates import FULLER, STARTS, Values
+from .candidates import AROUND, FULLER, STARTS, Values
 from .kinship import CONTAINS, spelt_out
 from .library import Library
 from .model import Model, model_of, settled
@@ -150,7 +150,10 @@ class Refits:
                 break
         best = min(ends, key=lambda end: end.fitness)
         unknowns = stood(given.problem, best.unknowns, starts[0][1].unknowns.local)
-        return settled(effects, given, best._replace(unknowns=unknowns), white)
+        begun = best._replace(unknowns=unknowns)
+        if effects[-1] in AROUND:
+            return _best_around(effects, given, begun)
+        return settled(effects, given, begun, white)
 
     def _refitted(
         self,
@@ -246,9 +249,29 @@ class Refits:
 
 
 def _roughly(start: Start) -> Refined:
-    """A few steps of a refit."""
+    """A few steps of a refit; infinitely bad where it cannot be simulated."""
     given, begun = start
-    return polish(given.problem, begun, ROUGHLY).refined
+    end = polish(given.problem, begun, ROUGHLY).refined
+    return end if np.isfinite(end.fitness) else end._replace(fitness=np.inf)
+
+
+def _best_around(effects: tuple[str, ...], given: Prepared, begun: Refined) -> Model:
+    """The best refit from a start and from around where that ends, where the last effect has many optima, by the filter
+    of what the start leaves."""
+    white = whitener(residuals_of(given, polish(given.problem, begun, steps=0)))
+    model, sharp = settled(effects, given, begun, white), whitened(given, white)
+    here = polish(sharp.problem, model.polished.refined, steps=0).refined
+    effect, names = effects[-1], sharp.problem.parameters.names
+    columns = {field: names.index(f"{effect}.{field}") for field in EFFECTS[effect].ranges}
+    coordinates = np.asarray(here.unknowns.coordinates)
+    starts = []
+    for values in AROUND[effect]({f: float(np.exp(coordinates[k])) for f, k in columns.items()}):
+        elsewhere = coordinates.copy()
+        elsewhere[[columns[field] for field in values]] = np.log(list(values.values()))
+        unknowns = here.unknowns._replace(coordinates=jnp.asarray(elsewhere))
+        starts.append((sharp, Refined(unknowns, np.inf, (), False)))
+    best = min(side_by_side(_roughly, starts), key=lambda end: end.fitness)
+    return settled(effects, given, best, white) if best.fitness < here.fitness else model
 
 
 def _turns(model: Model, effect: str) -> list[np.ndarray | None]:

@@ -39,6 +39,11 @@ def chance_of_nothing(
     return float(min(1.0, np.exp(smallest + np.log(count))))
 
 
+def clearest_of(of_candidates: Sequence[Signal], of_curves: Sequence[Signal]) -> Signal:
+    """The signal with the largest gain."""
+    return max((*of_candidates, *of_curves), key=_gain)
+
+
 class Seen(NamedTuple):
     """The evidence against a model, read once."""
 
@@ -47,11 +52,14 @@ class Seen(NamedTuple):
     of_curves: list[Signal]
     left: float  # chance of it if nothing more were missing
     explained: float  # how much of what the motor without effects leaves the model takes away
+    plainly: (
+        float  # what the clearest signal would take away over that, of what is measured as it is
+    )
 
     @property
     def clearest(self) -> Signal:
-        """The signal with the largest gain."""
-        return max((*self.of_candidates, *self.of_curves), key=_gain)
+        """The signal that would take away most."""
+        return clearest_of(self.of_candidates, self.of_curves)
 
     @property
     def unexplained(self) -> float:
@@ -80,9 +88,14 @@ class Seen(NamedTuple):
         return bool(self.unexplained > FORMULA and not self._is_more_of(model))
 
     def is_formula(self, model: Model) -> bool:
-        """Whether what is left may well be that of the model's effects by formulas of nature's own."""
-        if not model.effects or self.unexplained < FORMULA:
-            return bool(model.effects)
+        """Whether what is left may well be that of the model's effects by formulas of nature's own.
+
+        Not where that is more than they explain of what is measured: then a filter took for noise what is missing.
+        """
+        if not model.effects or self.plainly > 1:
+            return False
+        if self.unexplained < FORMULA:
+            return True
         clearest = self.clearest.of
         own = isinstance(clearest, Curve) and _is_own(clearest, model)
         return self._is_more_of(model) or bool(own and self.unexplained < OWN_FORMULA)

@@ -8,7 +8,7 @@ from .candidates import STARTS
 from .kinship import CONTAINS, spelt_out
 from .model import Model
 from .screen import Signal
-from .seen import ALARM, FORMULA, MOST_OF_IT, Seen
+from .seen import ALARM, FORMULA, MOST_OF_IT, MUCH_OF_IT, Seen
 
 # So many candidates for one effect are refitted in full simulation
 SHORTLIST = 3
@@ -41,12 +41,17 @@ def shortlist(current: Model, found: Seen) -> list[Signal]:
 
 
 def clear(found: Seen) -> list[Signal]:
-    """The most significant shape of every effect that chance would not bring about."""
+    """The most significant shape of every effect that chance would not bring about.
+
+    A torque may look like slow noise because another one is missing beside it: what takes away much of the clearest
+    curve counts, if that one is clear.
+    """
     best: dict[str, Signal] = {}
     for s in found.of_candidates:
         best.setdefault(effect_of(s), s)
-    enough = np.log(ALARM / len(found.screen.candidates))
-    return [s for s in best.values() if s.log_p < enough]
+    enough, curve = np.log(ALARM / len(found.screen.candidates)), found.of_curves[0]
+    much = MUCH_OF_IT * curve.gain if curve.log_p < enough else np.inf
+    return [s for s in best.values() if s.log_p < enough or s.gain > much]
 
 
 def richer(current: Model, found: Seen) -> list[Signal]:
