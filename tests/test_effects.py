@@ -529,6 +529,20 @@ def test_a_run_may_begin_twisted(x64, name):
             assert np.max(np.abs(found - right[channel])) < case.tolerance * np.max(right[channel])
 
 
+def test_teeth_in_many_short_blocks_are_joined(x64):
+    """A slow small wave at 0.2 ms: some sixty blocks, each half as long as the motor remembers how it began."""
+    time = 2e-4 * np.arange(8000)
+    volts, still = 4 * np.sin(2 * np.pi * 2 * time), np.zeros(len(time))
+    tape = Tape.from_recordings([Recording("wave", time, volts, still, still, load=still)])
+    values = {"stiffness_Nm_rad": 770.0, "damping_Nms_rad": 0.162, "load_share": 0.647}
+    gear = EFFECTS["gear_backlash"](**jax.tree.map(jnp.asarray, {**values, "gap_rad": 0.0765}))
+    numbers = (4.47, 0.0011, 0.1294, 0.131, 2.11e-4, 8.3e-5)
+    motor = Motor(*map(jnp.asarray, numbers), effects=(gear,))
+    start = jnp.zeros((1, 2)), jnp.zeros(1)
+    seen, _ = sensitivities(lambda nothing: motor, jnp.zeros(1), tape, *start)
+    assert np.max(np.abs(seen - free_run(motor, tape, *start))) < 1e-4 * np.max(np.abs(seen))
+
+
 def zero(name: str) -> dict[str, float]:
     return {**CASES[name].values, **dict.fromkeys(CASES[name].amplitude.split(), 0.0)}
 

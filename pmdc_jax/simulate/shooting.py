@@ -39,7 +39,7 @@ JOINED = 1e-4
 
 # Passes after which a fit gives up on a motor, whose blocks hardly depend on how they begin but by chance: teeth that
 # rattle in their play. There are as many passes as a run has blocks, and nothing to learn from the derivatives.
-PASSES = 12
+PASSES = 32
 
 # Columns of the sensitivities for a run's own unknowns: initial current, initial speed, load offset, initial angle,
 # and how far a spring is then wound up beyond what the load does.
