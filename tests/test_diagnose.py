@@ -16,6 +16,7 @@ from pmdc_jax import Recording
 from pmdc_jax.diagnose.candidates import FULLER, TABLE, Scales
 from pmdc_jax.diagnose.compare import Fitted
 from pmdc_jax.diagnose.evidence import Block, products
+from pmdc_jax.diagnose.experiment import difference
 from pmdc_jax.diagnose.kinship import are_rivals, is_within
 from pmdc_jax.diagnose.library import Library
 from pmdc_jax.diagnose.model import Model, model_of
@@ -80,6 +81,17 @@ def test_what_was_left_for_a_better_model_is_not_come_back_to():
     namer = Undecided()
     assert namer.name().chosen is namer.other
     assert namer.trials == 3
+
+
+def test_a_motor_that_cannot_be_simulated_suggests_no_run(x64):
+    time, rest = 1e-3 * np.arange(1000), np.zeros(500)
+    volts = np.append(rest, 10 + rest)
+    unstable = {**PAPER, "L": -1e-6}
+    motors = [Motor(**{n: np.asarray(x) for n, x in m.items()}) for m in (PAPER, unstable)]
+    assert difference([motors[0], motors[0]], time, volts, np.ones(2)) == 0
+    assert difference(motors, time, volts, np.ones(2)) == 0
+    other = Motor(**{n: np.asarray(x) for n, x in {**PAPER, "R": 1.0}.items()})
+    assert difference([motors[0], other], time, volts, np.ones(2)) > 1
 
 
 def test_only_waves_that_records_show_are_tried():

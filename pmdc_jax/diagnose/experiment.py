@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from scipy import stats
 
+from ..errors import InputError
 from ..motor import Motor
 from ..recording import Recording
 from ..simulate import simulate
@@ -64,12 +65,14 @@ def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExpe
     time = STEP * np.arange(int(DURATION / STEP))
     ranked = sorted(
         (
-            (_difference(motors, time, limit * waveform(time), noise), name)
+            (difference(motors, time, limit * waveform(time), noise), name)
             for name, waveform in WAVEFORMS.items()
         ),
         reverse=True,
     )
     difference, name = ranked[0]
+    if not difference:
+        return None
     power = float(stats.norm.cdf(SHARED * difference - stats.norm.isf(LEVEL)))
     sets = (" + ".join(sorted(m.effects)) for m in (naming.chosen, rival))
     return NextExperiment(
@@ -81,11 +84,15 @@ def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExpe
     )
 
 
-def _difference(motors: list[Motor], time, voltage, noise) -> float:
-    """Root of the summed squares of what two motors answer differently, over the noise."""
+def difference(motors: list[Motor], time, voltage, noise) -> float:
+    """Root of the summed squares of what two motors answer differently, over the noise; 0 where one cannot be
+    simulated, as fitted to other runs it may be unstable in this one."""
     start = np.zeros_like(time)
     run = Recording("next", time, voltage, current=start, speed=start, load=start)
-    one, other = (simulate(motor, run) for motor in motors)
+    try:
+        one, other = (simulate(motor, run) for motor in motors)
+    except InputError:
+        return 0.0
     parts = [
         (getattr(one, c) - getattr(other, c)) / s
         for c, s in zip(("current", "speed"), noise, strict=True)
