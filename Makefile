@@ -14,12 +14,15 @@ BIN := .venv/bin
 demo: .venv/ready
 	@$(BIN)/pmdc demo --out demo_out
 
-# a file's tests stay in one process, where they share what JAX has compiled
+# a file's tests stay in one process, where they share what JAX has compiled; in the order of their names, for by the
+# number of tests the few long ones would come last, and alone
+TESTS := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
+
 test: lint
-	@$(BIN)/pytest -n 2 --dist loadfile
+	@$(TESTS)
 
 test-all: lint
-	@$(BIN)/pytest -n 2 --dist loadfile -m ''
+	@$(TESTS) -m ''
 
 lint: .venv/ready
 	@$(BIN)/ruff check .
