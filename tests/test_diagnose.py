@@ -16,7 +16,7 @@ from pmdc_jax import Recording
 from pmdc_jax.diagnose.candidates import FULLER, TABLE, Scales
 from pmdc_jax.diagnose.compare import Fitted
 from pmdc_jax.diagnose.evidence import Block, products
-from pmdc_jax.diagnose.experiment import difference
+from pmdc_jax.diagnose.experiment import difference_between
 from pmdc_jax.diagnose.kinship import are_rivals, is_within
 from pmdc_jax.diagnose.library import Library
 from pmdc_jax.diagnose.model import Model, model_of
@@ -88,10 +88,10 @@ def test_a_motor_that_cannot_be_simulated_suggests_no_run(x64):
     volts = np.append(rest, 10 + rest)
     unstable = {**PAPER, "L": -1e-6}
     motors = [Motor(**{n: np.asarray(x) for n, x in m.items()}) for m in (PAPER, unstable)]
-    assert difference([motors[0], motors[0]], time, volts, np.ones(2)) == 0
-    assert difference(motors, time, volts, np.ones(2)) == 0
+    assert difference_between([motors[0], motors[0]], time, volts, np.ones(2)) == 0
+    assert difference_between(motors, time, volts, np.ones(2)) == 0
     other = Motor(**{n: np.asarray(x) for n, x in {**PAPER, "R": 1.0}.items()})
-    assert difference([motors[0], other], time, volts, np.ones(2)) > 1
+    assert difference_between([motors[0], other], time, volts, np.ones(2)) > 1
 
 
 def test_only_waves_that_records_show_are_tried():

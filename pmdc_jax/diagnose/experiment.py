@@ -65,7 +65,7 @@ def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExpe
     time = STEP * np.arange(int(DURATION / STEP))
     ranked = sorted(
         (
-            (difference(motors, time, limit * waveform(time), noise), name)
+            (difference_between(motors, time, limit * waveform(time), noise), name)
             for name, waveform in WAVEFORMS.items()
         ),
         reverse=True,
@@ -84,7 +84,7 @@ def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExpe
     )
 
 
-def difference(motors: list[Motor], time, voltage, noise) -> float:
+def difference_between(motors: list[Motor], time, voltage, noise) -> float:
     """Root of the summed squares of what two motors answer differently, over the noise; 0 where one cannot be
     simulated, as fitted to other runs it may be unstable in this one."""
     start = np.zeros_like(time)
