@@ -21,7 +21,7 @@ from .model import Model, ended
 from .periodic import Line, line_of
 from .refits import Refits
 from .screen import Screen, Signal, beyond_curves, screen, signals
-from .seen import ALARM, HARDER, Seen, chance_of_nothing, clearest_of
+from .seen import ALARM, HARDER, Seen, chance_of_nothing
 from .shortlist import COMPARABLE, SHORTLIST, clear, effect_of, richer, shortlist
 
 # What is missed by a smaller share of what is measured is nothing: one simulation meets another no closer
@@ -241,15 +241,8 @@ class Namer:
         if model.effects:
             base, mine = (self.comparison.left(m, found.white) for m in (self.base, model))
             explained = base.squares - mine.squares
-        plainly = self._plainly(model, found, clearest_of(of_candidates, of_curves))
-        return Seen(found, of_candidates, of_curves, left, explained, plainly)
-
-    def _plainly(self, model: Model, found: Screen, clearest: Signal) -> float:
-        """What a signal would take away of what is measured, no filter between, over what the model takes away."""
-        before, after = (m.polished.refined.fitness for m in (self.base, model))
-        rest = found.unfiltered.regress([clearest.block]).squares
-        share = 1 - rest / found.unfiltered.regress().squares
-        return float(share * after / (before - after)) if after < before else np.inf
+        removed = self.base.polished.refined.fitness - model.polished.refined.fitness
+        return Seen(found, of_candidates, of_curves, left, explained, removed)
 
     def _best(self, tried: Sequence[Model], white: Whitener) -> Model:
         """The best of some refits, by the filter of what the one that leaves least leaves."""

@@ -39,11 +39,6 @@ def chance_of_nothing(
     return float(min(1.0, np.exp(smallest + np.log(count))))
 
 
-def clearest_of(of_candidates: Sequence[Signal], of_curves: Sequence[Signal]) -> Signal:
-    """The signal with the largest gain."""
-    return max((*of_candidates, *of_curves), key=_gain)
-
-
 class Seen(NamedTuple):
     """The evidence against a model, read once."""
 
@@ -52,14 +47,12 @@ class Seen(NamedTuple):
     of_curves: list[Signal]
     left: float  # chance of it if nothing more were missing
     explained: float  # how much of what the motor without effects leaves the model takes away
-    plainly: (
-        float  # what the clearest signal would take away over that, of what is measured as it is
-    )
+    removed: float  # the same of the misfit as it is, no filter between
 
     @property
     def clearest(self) -> Signal:
-        """The signal that would take away most."""
-        return clearest_of(self.of_candidates, self.of_curves)
+        """The signal with the largest gain."""
+        return max((*self.of_candidates, *self.of_curves), key=_gain)
 
     @property
     def unexplained(self) -> float:
@@ -92,13 +85,22 @@ class Seen(NamedTuple):
 
         Not where that is more than they explain of what is measured: then a filter took for noise what is missing.
         """
-        if not model.effects or self.plainly > 1:
+        if not model.effects or self._unexplained_plainly(model) > 1:
             return False
         if self.unexplained < FORMULA:
             return True
         clearest = self.clearest.of
         own = isinstance(clearest, Curve) and _is_own(clearest, model)
         return self._is_more_of(model) or bool(own and self.unexplained < OWN_FORMULA)
+
+    def _unexplained_plainly(self, model: Model) -> float:
+        """What the clearest signal would still take away of the misfit as it is, over what the model does."""
+        if not self.removed > 0:
+            return np.inf
+        unfiltered = self.screen.unfiltered
+        rest = unfiltered.regress([self.clearest.block]).squares
+        share = 1 - rest / unfiltered.regress().squares
+        return float(share * model.polished.refined.fitness / self.removed)
 
     def _is_more_of(self, model: Model) -> bool:
         """Whether the clearest signal is that of an effect which the model has."""
