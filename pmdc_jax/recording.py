@@ -18,7 +18,6 @@ from .errors import InputError
 from .tables import Table, open_table
 
 Samples = Float[np.ndarray, " samples"]
-Half = Literal["electrical", "mechanical"]
 
 MIN_SAMPLES = 10
 MAX_MISSING = 0.2  # share of an output's samples that may be missing
@@ -116,14 +115,6 @@ class Recording:
             np.diff(self.angle) if self.speed is None and self.angle is not None else self.speed
         )
         return self.held or (motion is not None and not np.any(np.nan_to_num(motion)))
-
-    @property
-    def halves(self) -> tuple[Half, ...]:
-        """Which halves of the motor this run informs: both with a voltage, else the mechanical; the electrical where
-        the rotor was held."""
-        if self.held:
-            return ("electrical",)
-        return ("electrical", "mechanical") if self.drive == "voltage" else ("mechanical",)
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays that there are, by quantity."""

@@ -374,7 +374,7 @@ def test_whitening_is_its_formula_sample_by_sample():
 
 
 def _last_fit(given, plainly):
-    return last_fit(given, plainly, plainly.refined, whitener(residuals_of(given, plainly)))
+    return last_fit(given, plainly, plainly, whitener(residuals_of(given, plainly)))
 
 
 def test_torque_noise_is_filtered_out():

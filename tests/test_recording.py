@@ -256,23 +256,21 @@ def test_missing_outputs_are_nan(tmp_path, cell):
 def test_an_empty_column_counts_as_absent(tmp_path):
     lines = ["time_s,voltage_V,current_A,speed_rad_s", *[f"{t},,1,{t}" for t in T]]
     run = read_text(tmp_path, "\n".join(lines))
-    assert run.voltage is None and run.drive == "current" and run.halves == ("mechanical",)
+    assert run.voltage is None and run.drive == "current"
     assert [note.column for note in run.notes] == ["voltage_V"]
 
 
 @pytest.mark.parametrize(
-    ("quantities", "drive", "halves"),
+    ("quantities", "drive"),
     [
-        ("voltage current speed", "voltage", ("electrical", "mechanical")),
-        ("voltage angle", "voltage", ("electrical", "mechanical")),
-        ("voltage current", "voltage", ("electrical", "mechanical")),
-        ("current angle", "current", ("mechanical",)),
-        ("current torque speed", "torque", ("mechanical",)),
+        ("voltage current speed", "voltage"),
+        ("voltage angle", "voltage"),
+        ("current angle", "current"),
+        ("current torque speed", "torque"),
     ],
 )
-def test_what_a_run_can_say(quantities, drive, halves):
-    run = Recording("run", T, **dict.fromkeys(quantities.split(), T))
-    assert (run.drive, run.halves) == (drive, halves)
+def test_what_drives_a_run(quantities, drive):
+    assert Recording("run", T, **dict.fromkeys(quantities.split(), T)).drive == drive
 
 
 @pytest.mark.parametrize("shape", [(-1,), (-1, 1), (1, -1)])

@@ -14,6 +14,8 @@ from .model import Model
 
 # Models whose criterion is nearer than this are not told apart
 MARGIN = 8.0
+# Squares, in noise variances, for which no model is fitted another step
+WORTH = 0.1
 # A model that leaves so many times the squares of another one is no match for it, whatever a filter makes of either
 FAR = 3.0
 
@@ -53,7 +55,7 @@ class Comparison:
         """A model fitted to what a filter makes white of what it leaves."""
         key = model, id(white)
         if key not in self._fitted:
-            given, polished = sharpened(model.given, model.polished.refined, white)
+            given, polished = sharpened(model.given, model.polished, white, WORTH)
             squares = squares_of(given, polished)
             samples = np.count_nonzero(given.problem.tape.weight)
             price = len(given.problem.parameters.names) * np.log(samples)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction
 from ..identify.colour import Series, Whitener
-from ..identify.polish import Polished, polish
+from ..identify.polish import Polished, polish, taken_over
 from ..identify.prepare import Prepared
 from ..identify.refine import Refined
 from ..identify.sharpen import (
@@ -105,7 +105,9 @@ def model_of(effects: tuple[str, ...], given: Prepared, polished: Polished) -> M
 
 def ended(model: Model, white: Whitener) -> tuple[Prepared, Polished]:
     """The last fit of a model."""
-    return last_fit(*settle(model.given, model.polished.refined), model.polished.refined, white)
+    known = taken_over(model.given.problem, model.polished)
+    plainly = settle(model.given, model.polished.refined, known)
+    return last_fit(*plainly, model.polished, white)
 
 
 class Fit(NamedTuple):

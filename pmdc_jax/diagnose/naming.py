@@ -62,9 +62,9 @@ class Namer:
     def __init__(self, base: Model, solved: Solved, report):
         """`base` is the motor without effects, and `solved` how it was found."""
         self.base, self.library = base, Library(base)
-        self.refits = Refits(base, solved, self.library, report)
-        self.seen: dict[Model, Seen] = {}
         self.comparison = Comparison()
+        self.refits = Refits(base, solved, self.library, self.comparison, report)
+        self.seen: dict[Model, Seen] = {}
         # by effect: those that did as well when it was added
         self.instead: dict[str, set[str]] = {}
         # that a better one has replaced, or is to: judged by another filter each may look like the better one

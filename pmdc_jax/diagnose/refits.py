@@ -15,11 +15,12 @@ from ..identify.polish import polish, stood
 from ..identify.prepare import Prepared
 from ..identify.problem import Unknowns
 from ..identify.refine import Refined
-from ..identify.sharpen import residuals_of, sharpened, squares_of, whitened
+from ..identify.sharpen import residuals_of, whitened
 from ..identify.solve import POOR, Solved, searched
 from ..identify.uncertainty import FLAT
 from ..threads import CORES, side_by_side
 from .candidates import AROUND, FULLER, STARTS, Values
+from .compare import Comparison
 from .kinship import CONTAINS, spelt_out
 from .library import Library
 from .model import Model, model_of, settled
@@ -40,8 +41,11 @@ Start = tuple[Prepared, Refined]
 class Refits:
     """The models that were fitted so far; `solved` is how the motor without effects was found."""
 
-    def __init__(self, base: Model, solved: Solved, library: Library, report):
+    def __init__(
+        self, base: Model, solved: Solved, library: Library, comparison: Comparison, report
+    ):
         self.library, self.solved, self.report = library, solved, report
+        self.comparison = comparison
         self.models: dict[frozenset[str], Model] = {frozenset(): base}
         self.begun: dict[str, Values] = {}  # where each effect was first begun to be fitted
 
@@ -168,20 +172,14 @@ class Refits:
         noise was what is missing."""
         given, begun = start
         model = settled(effects, given, begun, white)
-        before, after = (
-            squares_of(*sharpened(m.given, m.polished.refined, white)) for m in (current, model)
-        )
+        before, after = (self.comparison.left(m, white).squares for m in (current, model))
         if before - after > KEPT * signal.gain:
             return model
         plain = polish(given.problem, begun)
         if plain.refined.fitness < KEPT * model.polished.refined.fitness:
             return model_of(effects, given, plain)
         plainly = settled(effects, given, plain.refined, white)
-        return (
-            plainly
-            if squares_of(*sharpened(plainly.given, plainly.polished.refined, white)) < after
-            else model
-        )
+        return plainly if self.comparison.left(plainly, white).squares < after else model
 
     def _pointed_at(
         self,

@@ -121,19 +121,22 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     white = found.evidence is not found.unfiltered
     drift, waver = (_drift(found), _waver(found)) if white else (None, None)
 
-    def signal(of: Candidate | Curve, block: Block, gain: float) -> Signal:
+    def signal(of: Candidate | Curve, block: Block, gain: float, common: float = 0.0) -> Signal:
         noise = 1.0
         if drift is not None and _is_slow_torque(of):
             noise = _beside(found, block, drift)
         if waver is not None and _is_voltage(of):
             noise = _beside(found, block, waver)
-        return Signal(gain, log_chance(gain / noise, found.evidence.freedom(block)), of, block)
+        chance = log_chance(max(gain - common, 0.0) / noise, found.evidence.freedom(block))
+        return Signal(gain, chance, of, block)
 
-    of_candidates = []
+    possible = []
     for candidate, block in zip(found.candidates, found.of_candidate, strict=True):
         fit = found.evidence.regress([block])
         if found.possible(candidate, fit.coefficients[0]):
-            of_candidates.append(signal(candidate, block, max(base - fit.squares, 0.0)))
+            possible.append((candidate, block, max(base - fit.squares, 0.0)))
+    common = _common_to_waves(found, possible)
+    of_candidates = [signal(c, b, gain, common.get(c.effect, 0.0)) for c, b, gain in possible]
     gains = np.array([max(base - _left(found, block), 0.0) for block in found.of_curve])
     waves = np.array([curve.shapes is not None for curve in found.curves])
     gains[waves] /= _dispersion(found, gains[waves], found.of_curve[-1])
@@ -199,6 +202,18 @@ def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> float:
     """
     level = float(np.quantile(gains, 0.25) / stats.chi2.ppf(0.25, found.evidence.freedom(wave)))
     return SLOWEST_WAVES * max(level, 1.0)
+
+
+def _common_to_waves(
+    found: Screen, gained: Sequence[tuple[Candidate, Block, float]]
+) -> dict[str, float]:
+    """By effect that is a wave: what most periods gain alike, beyond chance, which is no evidence for one of them."""
+    by_period: dict[str, list[float]] = {}
+    for candidate, block, gain in gained:
+        if candidate.own_phase:
+            beyond = gain - stats.chi2.median(found.evidence.freedom(block))
+            by_period.setdefault(candidate.effect, []).append(max(beyond, 0.0))
+    return {effect: float(np.median(beyond)) for effect, beyond in by_period.items()}
 
 
 def _log_p(signal: Signal) -> float:

@@ -59,7 +59,7 @@ def identify(
     report("judging the uncertainty", solved.polished.refined.fitness)
     plainly = solved.polished
     white = whitener(residuals_of(given, plainly))
-    given, polished = last_fit(given, plainly, plainly.refined, white)
+    given, polished = last_fit(given, plainly, plainly, white)
     found = judge(given, solved._replace(polished=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
     return attrs.evolve(found, seconds=seconds)

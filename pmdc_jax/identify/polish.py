@@ -12,7 +12,16 @@ from jaxtyping import Array, Bool, Float
 
 from .noise import FLOOR
 from .parameters import Parameters
-from .problem import Evaluation, Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
+from .problem import (
+    Evaluation,
+    Problem,
+    Unknowns,
+    evaluate,
+    flatten,
+    normal_matrix,
+    unflatten,
+    weighed,
+)
 from .refine import Refined
 
 # Steps after which a fall of the cost by no more than so much ends the polish: dry elements leave kinks where a
@@ -39,16 +48,22 @@ class Polished(NamedTuple):
     noise: np.ndarray
 
 
-def polish(problem: Problem, end: Refined, steps: int = POLISH) -> Polished:
+def polish(
+    problem: Problem,
+    end: Refined,
+    steps: int = POLISH,
+    worth: float = WORTH,
+    known: Evaluation | None = None,
+) -> Polished:
     """Gauss-Newton to the bottom, while each output is weighed by what its own residuals turn out to be.
 
     The claim of convergence is the gradient's: no step within the bounds would lower the sum of squares by
-    more than `WORTH` noise variances (`AT_KINK`, where no step is found that does). A coordinate held at a bound is
-    let go where the gradient points back inside.
+    more than what a step is `worth`, in noise variances (`AT_KINK`, where no step is found that does). A coordinate
+    held at a bound is let go where the gradient points back inside. The evaluation at the start may be `known`.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
     trial, held, share = end.unknowns, set(end.at_bound), 1.0
-    best, converged = _weighed(problem, trial), False
+    best, converged = _weighed(problem, trial, known), False
     reached, step, gain = best, np.zeros(len(flatten(trial))), np.inf
     costs = [best.cost]
     for _ in range(steps):
@@ -63,7 +78,7 @@ def polish(problem: Problem, end: Refined, steps: int = POLISH) -> Polished:
             start = np.asarray(best.unknowns.coordinates)
             held = {k for k in held if (best.matrix[k, -1] > 0) == (start[k] <= low[k])}
             step, gain = gauss_newton(best.matrix, held, len(low))
-            if converged := gain <= WORTH * best.matrix[-1, -1] / problem.most_samples:
+            if converged := gain <= worth * best.matrix[-1, -1] / problem.most_samples:
                 break
         else:
             break
@@ -99,8 +114,13 @@ class _Weighed(NamedTuple):
     fitness: float
 
 
-def _weighed(problem: Problem, unknowns: Unknowns) -> _Weighed:
-    evaluation = evaluate(problem, unknowns)
+def taken_over(problem: Problem, fit: Polished) -> Evaluation:
+    """The evaluation at a fit to plain residuals, as a problem with another noise weighs it."""
+    return weighed(problem, _scaled(fit.evaluation, fit.noise / np.asarray(problem.noise)))
+
+
+def _weighed(problem: Problem, unknowns: Unknowns, known: Evaluation | None = None) -> _Weighed:
+    evaluation = evaluate(problem, unknowns) if known is None else known
     with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
         squares = np.square(np.asarray(evaluation.residuals)[problem.counted]).sum((0, 2))
         noise, stretch = _own_noise(problem, squares)

@@ -114,8 +114,12 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     # Levenberg-Marquardt traces under an empty mesh; under no mesh at all everything would be traced once more
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
         # whitened apart, for the simulation takes long to compile
-        plain = _evaluate(replace(problem, whitening=None), unknowns)
-        return plain if problem.whitening is None else _whitened(problem, plain)
+        return weighed(problem, _evaluate(replace(problem, whitening=None), unknowns))
+
+
+def weighed(problem: Problem, plain: Evaluation) -> Evaluation:
+    """A free run with its residuals over the noise, those made white where the problem asks for it."""
+    return plain if problem.whitening is None else _whitened(problem, plain)
 
 
 @eqx.filter_jit

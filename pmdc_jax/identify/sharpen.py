@@ -15,9 +15,8 @@ import numpy as np
 
 from ..simulate import Tape
 from .colour import Series, Whitener
-from .polish import Polished, polish
+from .polish import WORTH, Polished, polish, taken_over
 from .prepare import Prepared
-from .refine import Refined
 from .whitening import Whitening
 
 # Gauss-Newton steps from one fit to white residuals to another
@@ -27,7 +26,7 @@ NEAR = 1.1
 
 
 def last_fit(
-    given: Prepared, plainly: Polished, near: Refined, white: Whitener
+    given: Prepared, plainly: Polished, near: Polished, white: Whitener
 ) -> tuple[Prepared, Polished]:
     """The fit to residuals that a filter makes white, found from a fit `near` it, if plain least squares asks for it.
 
@@ -41,10 +40,13 @@ def last_fit(
     return sharp if as_it_is < NEAR * plainly.refined.fitness else (given, plainly)
 
 
-def sharpened(given: Prepared, near: Refined, white: Whitener) -> tuple[Prepared, Polished]:
-    """The problem of fitting to residuals that a filter makes white, and its solution from a fit nearby."""
+def sharpened(
+    given: Prepared, near: Polished, white: Whitener, worth: float = WORTH
+) -> tuple[Prepared, Polished]:
+    """The problem of fitting to residuals that a filter makes white, and its solution from a plain fit nearby."""
     given = whitened(given, white)
-    return given, polish(given.problem, near, STEPS)
+    known = taken_over(given.problem, near)
+    return given, polish(given.problem, near.refined, STEPS, worth, known)
 
 
 def squares_of(given: Prepared, polished: Polished) -> float:

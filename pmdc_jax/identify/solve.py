@@ -18,7 +18,7 @@ from .identification import Search
 from .parameters import Parameters
 from .polish import IDLE, Polished, polish, with_own
 from .prepare import Prepared
-from .problem import Problem, Unknowns
+from .problem import Evaluation, Problem, Unknowns
 from .refine import Refined, refine
 from .search import Found
 from .search import search as global_search
@@ -107,9 +107,11 @@ def _where_effects_show(given: Prepared) -> Parameters:
     return given.parameters(effects, effect_bounds(effects, given.training))
 
 
-def settle(given: Prepared, end: Refined) -> tuple[Prepared, Polished]:
+def settle(
+    given: Prepared, end: Refined, known: Evaluation | None = None
+) -> tuple[Prepared, Polished]:
     """Polish; again, as long as it helps, where a torque depends on how the better motor turns."""
-    polished = polish(given.problem, end)
+    polished = polish(given.problem, end, known=known)
     for _ in range(TURNINGS if given.problem.angular else 0):
         again = given._replace(problem=turned(given.problem, polished))
         better = polish(again.problem, polished.refined)
