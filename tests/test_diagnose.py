@@ -24,7 +24,7 @@ from pmdc_jax.diagnose.naming import Namer, Naming
 from pmdc_jax.diagnose.periodic import common_line, spectrum
 from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
-from pmdc_jax.diagnose.screen import log_chance
+from pmdc_jax.diagnose.screen import common_to_waves, log_chance
 from pmdc_jax.diagnose.seen import Seen
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.colour import Series, whitener
@@ -183,6 +183,26 @@ def test_chance_far_out_meets_the_exact_one(freedom):
     for gain in (520.0, 700.0):
         exact = stats.chi2.logsf(gain, freedom)
         assert log_chance(gain, freedom) == pytest.approx(exact, abs=0.1 * freedom)
+
+
+def test_what_waves_of_any_period_gain_is_evidence_for_none():
+    """As where the residuals are slow: one period of cogging is asked for by what it gains beyond the others."""
+    found = Mock(evidence=evidence_of(*random_evidence(0)))
+    cogging = TABLE["cogging_torque"]("cogging_torque", SCALES)
+    others = TABLE["constant_load"]("constant_load", SCALES)
+    freedom = 2 * 3  # cosine and sine in each of three runs
+    blocks = [Block((0, 1), own=True)] * len(cogging)
+
+    def common(gains):
+        loads = [(load, Block((2,)), 1000.0) for load in others]
+        return common_to_waves(found, [*zip(cogging, blocks, gains, strict=True), *loads])
+
+    rng = np.random.default_rng(1)
+    by_chance = stats.chi2.rvs(freedom, size=len(cogging), random_state=rng)
+    assert common(by_chance)["cogging_torque"] < 2.0
+    slow = 40.0 + by_chance
+    slow[3] = 500.0  # one that is there raises the median by nothing
+    assert common(slow) == {"cogging_torque": pytest.approx(40.0, abs=2.0)}
 
 
 # ---------------------------------------------------------------------------------- the noise

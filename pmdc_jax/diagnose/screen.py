@@ -135,7 +135,7 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
         fit = found.evidence.regress([block])
         if found.possible(candidate, fit.coefficients[0]):
             possible.append((candidate, block, max(base - fit.squares, 0.0)))
-    common = _common_to_waves(found, possible)
+    common = common_to_waves(found, possible)
     of_candidates = [signal(c, b, gain, common.get(c.effect, 0.0)) for c, b, gain in possible]
     gains = np.array([max(base - _left(found, block), 0.0) for block in found.of_curve])
     waves = np.array([curve.shapes is not None for curve in found.curves])
@@ -204,7 +204,7 @@ def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> float:
     return SLOWEST_WAVES * max(level, 1.0)
 
 
-def _common_to_waves(
+def common_to_waves(
     found: Screen, gained: Sequence[tuple[Candidate, Block, float]]
 ) -> dict[str, float]:
     """By effect that is a wave: what most periods gain alike, beyond chance, which is no evidence for one of them."""
