@@ -187,7 +187,7 @@ def test_chance_far_out_meets_the_exact_one(freedom):
 
 def test_what_waves_of_any_period_gain_is_evidence_for_none():
     """As where the residuals are slow: one period of cogging is asked for by what it gains beyond the others."""
-    found = Mock(evidence=evidence_of(*random_evidence(0)))
+    evidence = evidence_of(*random_evidence(0))
     cogging = TABLE["cogging_torque"]("cogging_torque", SCALES)
     others = TABLE["constant_load"]("constant_load", SCALES)
     freedom = 2 * 3  # cosine and sine in each of three runs
@@ -195,7 +195,7 @@ def test_what_waves_of_any_period_gain_is_evidence_for_none():
 
     def common(gains):
         loads = [(load, Block((2,)), 1000.0) for load in others]
-        return common_to_waves(found, [*zip(cogging, blocks, gains, strict=True), *loads])
+        return common_to_waves(evidence, [*zip(cogging, blocks, gains, strict=True), *loads])
 
     rng = np.random.default_rng(1)
     by_chance = stats.chi2.rvs(freedom, size=len(cogging), random_state=rng)

@@ -135,7 +135,7 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
         fit = found.evidence.regress([block])
         if found.possible(candidate, fit.coefficients[0]):
             possible.append((candidate, block, max(base - fit.squares, 0.0)))
-    common = common_to_waves(found, possible)
+    common = common_to_waves(found.evidence, possible)
     of_candidates = [signal(c, b, gain, common.get(c.effect, 0.0)) for c, b, gain in possible]
     gains = np.array([max(base - _left(found, block), 0.0) for block in found.of_curve])
     waves = np.array([curve.shapes is not None for curve in found.curves])
@@ -205,13 +205,13 @@ def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> float:
 
 
 def common_to_waves(
-    found: Screen, gained: Sequence[tuple[Candidate, Block, float]]
+    evidence: Evidence, gained: Sequence[tuple[Candidate, Block, float]]
 ) -> dict[str, float]:
     """By effect that is a wave: what most periods gain alike, beyond chance, which is no evidence for one of them."""
     by_period: dict[str, list[float]] = {}
     for candidate, block, gain in gained:
         if candidate.own_phase:
-            beyond = gain - stats.chi2.median(found.evidence.freedom(block))
+            beyond = gain - stats.chi2.median(evidence.freedom(block))
             by_period.setdefault(candidate.effect, []).append(max(beyond, 0.0))
     return {effect: float(np.median(beyond)) for effect, beyond in by_period.items()}
 
