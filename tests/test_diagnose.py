@@ -22,12 +22,14 @@ from pmdc_jax.diagnose.library import Library
 from pmdc_jax.diagnose.model import Model, model_of
 from pmdc_jax.diagnose.naming import Namer, Naming
 from pmdc_jax.diagnose.periodic import common_line, spectrum
+from pmdc_jax.diagnose.pipeline import may_be_none
 from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
 from pmdc_jax.diagnose.screen import common_to_waves, log_chance
 from pmdc_jax.diagnose.seen import Seen
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.colour import Series, whitener
+from pmdc_jax.identify.identification import Estimate, Identification
 from pmdc_jax.identify.polish import polish
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Unknowns
@@ -183,6 +185,22 @@ def test_chance_far_out_meets_the_exact_one(freedom):
     for gain in (520.0, 700.0):
         exact = stats.chi2.logsf(gain, freedom)
         assert log_chance(gain, freedom) == pytest.approx(exact, abs=0.1 * freedom)
+
+
+@pytest.mark.parametrize(
+    ("effect", "field", "interval", "nothing"),
+    [
+        ("torque_ripple", "amplitude", (2e-5, 0.64), True),
+        ("torque_ripple", "amplitude", (0.1, 0.64), False),
+        ("torque_ripple", "amplitude", None, False),
+        ("constant_load", "torque_Nm", (-0.1, 0.8), True),
+        ("constant_load", "torque_Nm", (1e-3, 0.8), False),
+    ],
+)
+def test_an_amplitude_that_may_be_next_to_nothing(effect, field, interval, nothing):
+    estimate = Estimate(0.35, 0.1, interval, "", "identified")
+    found = Mock(spec=Identification, parameters={f"{effect}.{field}": estimate})
+    assert may_be_none(found, effect, field) is nothing
 
 
 def test_what_waves_of_any_period_gain_is_evidence_for_none():

@@ -115,6 +115,10 @@ def _either(*rows: Callable[[str, Scales], list[Candidate]]):
     return lambda name, scales: [c for of_one in rows for c in of_one(name, scales)]
 
 
+# The speeds by which a peak of friction falls off, over the largest
+PEAKS = (0.01, 0.016, 0.025, 0.04, 0.06, 0.1, 0.15, 0.25)
+
+
 def _stribeck(name: str, scales: Scales) -> list[Candidate]:
     small = SMALL * scales.torque
 
@@ -130,7 +134,7 @@ def _stribeck(name: str, scales: Scales) -> list[Candidate]:
         peak = {"coulomb_Nm": NOTHING, "static_Nm": small, "speed_rad_s": speed}
         return Candidate(name, (flat, peak), (small, small), build, "static_Nm")
 
-    return [candidate(share * scales.speed) for share in (0.01, 0.025, 0.06, 0.15)]
+    return [candidate(share * scales.speed) for share in PEAKS]
 
 
 def _asymmetric(name: str, scales: Scales) -> list[Candidate]:
@@ -174,8 +178,8 @@ def _periodic(field: str, size: Callable[[Scales], float], *others: Values):
 
 PERIODS = (*range(1, 17), 18, 20, 21, 22, 24, 26, 28, 30, 32, 36, 40, 42, 48)
 
-# How often a compliant shaft rings, in Hz
-RINGING = (6.0, 12.0, 25.0, 50.0, 100.0, 200.0, 400.0)
+# How often a compliant shaft rings, in Hz: what rings at another frequency takes little of it away
+RINGING = (6.0, 9.0, 12.0, 18.0, 25.0, 35.0, 50.0, 70.0, 100.0, 140.0, 200.0, 280.0, 400.0)
 SHARE = 0.5
 
 

@@ -21,7 +21,7 @@ from .model import Model, ended
 from .periodic import Line, line_of
 from .refits import Refits
 from .screen import Screen, Signal, beyond_curves, screen, signals
-from .seen import ALARM, HARDER, Seen, chance_of_nothing
+from .seen import ALARM, HARDER, MUCH_OF_IT, Seen, chance_of_nothing
 from .shortlist import COMPARABLE, SHORTLIST, clear, effect_of, richer, shortlist
 
 # What is missed by a smaller share of what is measured is nothing: one simulation meets another no closer
@@ -183,7 +183,7 @@ class Namer:
 
     def _in_other_form(self, model: Model, found: Seen, added: set[str]) -> list[Model | None]:
         """The model with what was added to it in a richer or a harder form."""
-        fuller = [s for s in richer(model, found) if CONTAINS[effect_of(s)] & added]
+        fuller = [s for s in richer(model, found, MUCH_OF_IT) if CONTAINS[effect_of(s)] & added]
         return self._with(model, found, fuller) + self._in_harder_form(model, found, added)
 
     def _tied(self, current: Model, found: Seen) -> list[Model | None]:

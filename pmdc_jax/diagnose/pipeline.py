@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 CLEAR = 4.0
 # By this chance of the runs without it an effect is there, however little else they tell of it
 CERTAIN = 1e-30
+# ... and none if its amplitude may as well be so small a share of what was found
+NOTHING = 1e-2
 
 
 @double_precision
@@ -123,7 +125,7 @@ def _idle(naming: Naming, final: Identification, library: Library) -> str | None
         effect: chance
         for effect, chance in naming.without.items()
         if chance > ALARM
-        or (effect in amplitude and _may_be_none(final, effect, amplitude[effect]))
+        or (effect in amplitude and may_be_none(final, effect, amplitude[effect]))
         or (
             chance > CERTAIN
             and all(final.parameters[f"{effect}.{f}"].ci95 is None for f in EFFECTS[effect].ranges)
@@ -132,11 +134,13 @@ def _idle(naming: Naming, final: Identification, library: Library) -> str | None
     return max(idle, key=lambda effect: idle[effect], default=None)
 
 
-def _may_be_none(final: Identification, effect: str, amplitude: str) -> bool:
-    interval = final.parameters[f"{effect}.{amplitude}"].ci95
-    about = EFFECTS[effect].ranges[amplitude]
-    nothing = about.lower * (1 + 1e-6) if about.scale == "log" else 0.0
-    return interval is not None and interval[0] <= nothing <= interval[1]
+def may_be_none(final: Identification, effect: str, amplitude: str) -> bool:
+    """Whether the interval of an effect's amplitude reaches to nothing, or next to it where none is negative."""
+    found, about = final.parameters[f"{effect}.{amplitude}"], EFFECTS[effect].ranges[amplitude]
+    if found.value is None or found.ci95 is None:
+        return False
+    nothing = max(about.lower, NOTHING * found.value) if about.scale == "log" else 0.0
+    return found.ci95[0] <= nothing <= found.ci95[1]
 
 
 def _verdict(naming: Naming) -> Verdict:

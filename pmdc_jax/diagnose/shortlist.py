@@ -54,10 +54,10 @@ def clear(found: Seen) -> list[Signal]:
     return [s for s in best.values() if s.log_p < enough or s.gain > much]
 
 
-def richer(current: Model, found: Seen) -> list[Signal]:
-    """An effect that contains one which is there, and explains most of what is left; if there is one."""
+def richer(current: Model, found: Seen, share: float = MOST_OF_IT) -> list[Signal]:
+    """An effect that contains one which is there, and explains such a share of what is left; if there is one."""
     here = spelt_out(set(current.effects))
-    enough = MOST_OF_IT * found.clearest.gain
+    enough = share * found.clearest.gain
     return [
         s
         for s in clear(found)
