@@ -62,7 +62,9 @@ class Undecided(Namer):
     """Two sets of effects, each of which looks better by the filter of the other one."""
 
     def __init__(self):
-        self.base, self.one, self.other = (Mock(spec=Model, is_possible=True) for _ in range(3))
+        self.base, self.one, self.other = (
+            Mock(spec=Model, is_possible=True, effects=()) for _ in range(3)
+        )
         self.passed, self.trials = set(), 0
         self.comparison = Mock(ranked=lambda models, white: [Mock(spec=Fitted, model=models[-1])])
 

@@ -74,7 +74,10 @@ class Namer:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
         current, found = self.base, self._see(self.base)
         self.passed.add(current)
-        while better := self._better(current, found, self._tried(current, found)):
+        while better := (
+            self._better(current, found, self._tried(current, found))
+            or self._settling(current, found)
+        ):
             again = self._see(better)
             if not self._is_settled(current, found, better):
                 # a simple form may be but a step to the one that is there
@@ -111,8 +114,12 @@ class Namer:
         """
         if (set(better.effects) - set(current.effects)) & set(HARDER.values()):
             return True
+        return found.is_clear(current) or self._leaves_little(current, better)
+
+    def _leaves_little(self, current: Model, better: Model) -> bool:
+        """Whether a better model leaves little beside what it takes away."""
         again = self._see(better)
-        if found.is_clear(current) or again.left >= ALARM:
+        if again.left >= ALARM:
             return True
         white, grown = self.comparison.white(better), len(better.effects) > len(current.effects)
         gained = (
@@ -120,6 +127,16 @@ class Namer:
             - self.comparison.left(better, white).squares
         )
         return bool(again.clearest.gain < (NEXT_TO_NOTHING if grown else LITTLE) * gained)
+
+    def _settling(self, current: Model, found: Seen) -> Model | None:
+        """The current model with the effect that promises most, however little, if it settles what no formula explains:
+        beside one that was fitted wrongly for want of it, it does more than it promises."""
+        if not 0 < len(current.effects) < MOST or found.left >= ALARM or found.is_formula(current):
+            return None
+        others = [s for s in clear(found) if effect_of(s) not in current.effects]
+        most = sorted(others, key=lambda s: -s.gain)[:1]
+        better = self._better(current, found, self._with(current, found, most))
+        return better if better and self._leaves_little(current, better) else None
 
     def without(self, named: Naming, effect: str) -> Naming:
         """The set without one of its effects."""
