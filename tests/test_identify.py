@@ -842,3 +842,29 @@ def test_a_run_may_begin_anywhere_in_the_play(twist):
             for own in (fit_own(problem, begun, 8)[0], truth)
         )
     assert fitted < 1.01 * right
+
+
+@pytest.mark.parametrize("turned_by", [0.0, 0.2, 0.45, -0.3])
+def test_a_run_may_begin_at_any_angle(turned_by):
+    """By a share of the period of its cogging: a slope leads there from nearby alone."""
+    motor, periods = {name: getattr(PAPER, name) for name in PARAMETERS}, 7.0
+    wave = {"amplitude_Nm": 0.03, "phase_rad": 0.0, "periods": periods}
+    plant = Plant(**motor, cogging_Nm=wave["amplitude_Nm"], cogging_periods=periods)
+    driven, angle = vb.staircase(3.0), 2 * np.pi / periods * turned_by
+    runs = []
+    for name, begins in (("first", 0.0), ("second", angle)):
+        seen = simulate(plant, driven.time, driven.voltage, driven.load, angle=begins)
+        runs.append(Recording(name, driven.time, driven.voltage, seen[:, 0], seen[:, 1]))
+    with jax.enable_x64(True):
+        problem = prepare(runs, [], effects=[EFFECTS["cogging_torque"]], unloaded=True).problem
+        truth = motor | {f"cogging_torque.{field}": x for field, x in wave.items()}
+        named = zip(problem.parameters.names, problem.parameters.logarithmic, strict=True)
+        coordinates = [np.log(truth[name]) if log else truth[name] for name, log in named]
+        begun = Unknowns(jnp.asarray(coordinates), jnp.zeros((2, LOCAL)))
+        right = begun._replace(local=begun.local.at[1, 3].set(angle))
+        ended = fit_own(problem, begun)[1]
+        fitted, least = (
+            float(jnp.square(evaluation.residuals).sum())
+            for evaluation in (ended, evaluate(problem, right))
+        )
+    assert fitted < 1.01 * least

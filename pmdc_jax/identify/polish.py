@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -35,6 +36,8 @@ WORTH = 1e-3
 AT_KINK = 0.1
 # By which shares of the play of its teeth a run is tried to begin twisted, from where its load presses them to
 STANDS = np.linspace(-1.0, 1.0, 9)
+# At how many angles of the period of a torque a rotor is tried to begin, and at most
+ANGLES, MOST_ANGLES = 8, 32
 # Curvature added to every coordinate in a step, as if each were known to within a factor of e beforehand:
 # nothing to one that the data see, and it keeps one that they do not see where it is.
 RIDGE = 1.0
@@ -146,11 +149,34 @@ def stood(problem: Problem, unknowns: Unknowns, begun: Float[Array, "runs 5"]) -
     """
     motor = problem.parameters(unknowns.coordinates)
     play = sum(float(effect.play()) for effect in motor.effects)
-    if not play:
+    trials = [begun.at[:, 4].set(share * play) for share in STANDS] if play else []
+    return _whichever_fits(problem, unknowns, trials)
+
+
+def faced(problem: Problem, unknowns: Unknowns) -> Unknowns:
+    """Every run's own unknowns as they are, or with the rotor at another angle as it began, whichever fits best.
+
+    From half a period away slopes lead to another optimum, or nowhere.
+    """
+    waves = [e.recurrence() for e in problem.parameters(unknowns.coordinates).effects]
+    periods = [float(wave["angle"]) for wave in waves if "angle" in wave]
+    turnable = np.asarray(problem.turnable)
+    if not periods or not turnable.any():
+        return unknowns
+    count = min(round(ANGLES * max(periods) / min(periods)), MOST_ANGLES)
+    turns = np.arange(1, count) / count * max(periods)
+    trials = [unknowns.local.at[:, 3].add(turn * turnable) for turn in turns]
+    return _whichever_fits(problem, unknowns, trials)
+
+
+def _whichever_fits(
+    problem: Problem, unknowns: Unknowns, trials: Sequence[Float[Array, "runs 5"]]
+) -> Unknowns:
+    """Every run's own unknowns as they are, or those of the trial that fits it best."""
+    if not trials:
         return unknowns
     local, least = unknowns.local, _squares_of_runs(problem, evaluate(problem, unknowns))
-    for share in STANDS:
-        trial = begun.at[:, 4].set(share * play)
+    for trial in trials:
         squares = _squares_of_runs(problem, evaluate(problem, unknowns._replace(local=trial)))
         local = jnp.where((squares < least)[:, None], trial, local)
         least = np.minimum(squares, least)
@@ -174,7 +200,7 @@ def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unkn
     run = np.asarray(problem.tape.run)
     everyone, share = jnp.ones(problem.tape.runs, bool), np.ones(problem.tape.runs)
 
-    unknowns = stood(still, unknowns, unknowns.local)
+    unknowns = faced(still, stood(still, unknowns, unknowns.local))
     best = evaluate(still, unknowns)
     for _ in range(passes):
         matrix = np.asarray(normal_matrix(best, still.tape, everyone))
