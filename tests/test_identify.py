@@ -845,7 +845,7 @@ def test_a_run_may_begin_anywhere_in_the_play(twist):
 
 
 @pytest.mark.parametrize("turned_by", [0.0, 0.2, 0.45, -0.3])
-def test_a_run_may_begin_at_any_angle(turned_by):
+def test_a_hold_out_may_begin_at_any_angle(turned_by):
     """By a share of the period of its cogging: a slope leads there from nearby alone."""
     motor, periods = {name: getattr(PAPER, name) for name in PARAMETERS}, 7.0
     wave = {"amplitude_Nm": 0.03, "phase_rad": 0.0, "periods": periods}
@@ -856,7 +856,8 @@ def test_a_run_may_begin_at_any_angle(turned_by):
         seen = simulate(plant, driven.time, driven.voltage, driven.load, angle=begins)
         runs.append(Recording(name, driven.time, driven.voltage, seen[:, 0], seen[:, 1]))
     with jax.enable_x64(True):
-        problem = prepare(runs, [], effects=[EFFECTS["cogging_torque"]], unloaded=True).problem
+        given = prepare(runs[:1], runs[1:], effects=[EFFECTS["cogging_torque"]], unloaded=True)
+        problem = given.problem
         truth = motor | {f"cogging_torque.{field}": x for field, x in wave.items()}
         named = zip(problem.parameters.names, problem.parameters.logarithmic, strict=True)
         coordinates = [np.log(truth[name]) if log else truth[name] for name, log in named]

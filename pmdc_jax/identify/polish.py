@@ -154,19 +154,24 @@ def stood(problem: Problem, unknowns: Unknowns, begun: Float[Array, "runs 5"]) -
 
 
 def faced(problem: Problem, unknowns: Unknowns) -> Unknowns:
-    """Every run's own unknowns as they are, or with the rotor at another angle as it began, whichever fits best.
+    """The own unknowns of runs that do not count as they are, or with the rotor at another angle as they began,
+    whichever fits best; of several waves, first within the longest period, then by whole periods of each.
 
     From half a period away slopes lead to another optimum, or nowhere.
     """
     waves = [e.recurrence() for e in problem.parameters(unknowns.coordinates).effects]
     periods = [float(wave["angle"]) for wave in waves if "angle" in wave]
-    turnable = np.asarray(problem.turnable)
+    turnable = np.asarray(problem.turnable & ~jnp.asarray(problem.counts))
     if not periods or not turnable.any():
         return unknowns
     count = min(round(ANGLES * max(periods) / min(periods)), MOST_ANGLES)
-    turns = np.arange(1, count) / count * max(periods)
-    trials = [unknowns.local.at[:, 3].add(turn * turnable) for turn in turns]
-    return _whichever_fits(problem, unknowns, trials)
+    turns = [np.arange(1, count) / count * max(periods)]
+    if len(periods) > 1:
+        turns += [np.arange(1, round(2 * np.pi / period)) * period for period in periods]
+    for some in turns:
+        trials = [unknowns.local.at[:, 3].add(turn * turnable) for turn in some]
+        unknowns = _whichever_fits(problem, unknowns, trials)
+    return unknowns
 
 
 def _whichever_fits(
