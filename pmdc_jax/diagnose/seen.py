@@ -116,10 +116,11 @@ class Seen(NamedTuple):
         or over another variable. Of when teeth meet there is no telling what it leaves."""
         if _is_hard(model) or self.left >= ALARM or self.by_one_more < MOST_OF_IT:
             return False
-        curve = max(self.of_curves, key=_gain).of
-        effect = max(self.of_candidates, key=_gain).candidate
-        assert isinstance(curve, Curve) and effect is not None
-        return not (_is_own(curve, model) or _is_own(EFFECTS[effect.effect], model))
+        best, effect = max(self.of_curves, key=_gain), max(self.of_candidates, key=_gain).candidate
+        assert isinstance(best.of, Curve) and effect is not None
+        # a curve that takes away little of what is left is not what is left
+        curve_is_own = _is_own(best.of, model) and best.gain > MUCH_OF_IT * self.clearest.gain
+        return not (curve_is_own or _is_own(EFFECTS[effect.effect], model))
 
 
 def _gain(signal: Signal) -> float:
