@@ -265,6 +265,7 @@ def test_an_empty_column_counts_as_absent(tmp_path):
     [
         ("voltage current speed", "voltage"),
         ("voltage angle", "voltage"),
+        ("voltage current", "voltage"),
         ("current angle", "current"),
         ("current torque speed", "torque"),
     ],

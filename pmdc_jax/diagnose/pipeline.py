@@ -139,7 +139,8 @@ def may_be_none(final: Identification, effect: str, amplitude: str) -> bool:
     found, about = final.parameters[f"{effect}.{amplitude}"], EFFECTS[effect].ranges[amplitude]
     if found.value is None or found.ci95 is None:
         return False
-    nothing = max(about.lower, NOTHING * found.value) if about.scale == "log" else 0.0
+    least = about.lower * (1 + 1e-6)  # as its logarithm gives it back
+    nothing = max(least, NOTHING * found.value) if about.scale == "log" else 0.0
     return found.ci95[0] <= nothing <= found.ci95[1]
 
 
