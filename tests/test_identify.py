@@ -235,6 +235,29 @@ def test_voltage_and_speed_alone_do_not_tell_back_emf_from_friction():
     assert any({"Kb", "f"} <= set(d.parameters) for d in result.unidentified_directions)
 
 
+def test_voltage_and_current_alone_tell_the_armature_and_ratios(runs):
+    """Speeds of twice the size, with half of Kb, J and f, make the same current."""
+    result = identify([attrs.evolve(run, speed=None) for run in runs])
+    assert result.fit["loaded"].current_rmse == pytest.approx(NOISE.current_A, rel=0.1)
+    assert_right(result, PAPER, ("R", "L", "Kt"), percent=2.0)
+    for name in ("Kb", "J", "f"):
+        assert result.parameters[name].status == "not_identifiable"
+    assert any("speed" in d.why for d in result.unidentified_directions)
+    m = result.motor
+    assert float(m.J / m.Kb) == pytest.approx(PAPER.J / PAPER.Kb, rel=0.02)
+    # and with Kb tied to Kt, which the known load shows, everything is there
+    tied = identify([attrs.evolve(run, speed=None) for run in runs], tie=[("Kb", "Kt")])
+    assert {p.status for p in tied.parameters.values()} <= {"identified", "tied"}
+
+
+def test_without_voltage_a_tie_tells_nothing():
+    """Kb has nothing to do with such runs, so that Kt = Kb leaves Kt as open as it was."""
+    light = [attrs.evolve(run, voltage=None) for run in unloaded(3)]
+    result = identify(light, tie=[("Kt", "Kb")])
+    assert {p.status for p in result.parameters.values()} == {"not_identifiable"}
+    assert any("voltage" in d.why for d in result.unidentified_directions)
+
+
 def test_current_and_speed_tell_the_mechanical_half():
     """Without voltage: sampled fast enough for the current to be a straight line between samples.
 

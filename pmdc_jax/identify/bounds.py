@@ -114,6 +114,9 @@ def _motion(recordings: Sequence[Recording], Kt: float):
         if run.speed is not None:
             speed.append(_rms(run.speed))
             change.append(float(np.nanstd(run.speed)))
+        elif run.voltage is not None and not run.held:  # as if it ran light
+            speed.append(_rms(run.voltage) / Kt)
+            change.append(_rms(run.voltage) / Kt)
     step = min(run.sample_time for run in recordings)
     duration = max(run.time[-1] - run.time[0] for run in recordings)
     return max(torque), max(speed), max(change), step, duration

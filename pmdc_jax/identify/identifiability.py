@@ -32,14 +32,26 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
     loads = [r.load for r in recordings if r.load is not None]
     loaded = any(np.ptp(load) > 0 or np.any(load != 0) for load in loads)
     electrical = any(r.voltage is not None for r in recordings)
+    driven = any(r.torque is not None for r in recordings)
     measured = any(r.voltage is not None and r.current is not None for r in recordings)
+    turning = any(r.speed is not None or r.angle is not None for r in recordings if not r.held)
     listed = _listed(sorted(names))
     if electrical and not measured and names & {"R", "L", "Kb", "Kt"}:
         return (
             f"No run has both voltage and current, so {listed} trade off against each other",
             "Record the current too, or give values with --known",
         )
-    if {"Kt", "J"} <= names and not loaded and not any(r.torque is not None for r in recordings):
+    if not turning and names & {"Kb", "Kt", "J", "f"}:
+        return (
+            f"No run of a rotor that turns has a speed or an angle, so {listed} trade off against each other",
+            "Record the speed or the angle too, or give values with --known",
+        )
+    if {"J", "f"} <= names and not electrical and not loaded and not driven:
+        return (
+            "No run has a voltage or a known load torque, so only the ratios of Kt, J and f are seen",
+            "Record the voltage too, add a run with a known load torque, or give Kt with --known",
+        )
+    if {"Kt", "J"} <= names and not loaded and not driven:
         return (
             "No run has a known load torque, so only the ratios of Kt, J and f are seen",
             "Add a run with a known load torque, or tie Kt = Kb with --tie Kt=Kb",

@@ -81,7 +81,7 @@ def prepare(
     runs = [uniform(r) for r in (*recordings, *holdout)]
     training = runs[: len(recordings)]
     noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in ("current", "speed")])
-    untouched = _untouched(training)
+    untouched = _untouched(training, tie)
     parameters = Parameters.of(search_bounds(training), effects, untouched | dict(known or {}), tie)
     # hold-outs lie on the tape too, but do not count: only what is their own is fitted to them
     problem = Problem(
@@ -128,9 +128,10 @@ def _signals(recordings: Sequence[Recording], name: str) -> list[np.ndarray]:
     return [signal for r in recordings if (signal := getattr(r, name)) is not None]
 
 
-def _untouched(recordings: Sequence[Recording]) -> dict[str, float]:
-    """Parameters that no run has anything to do with, at a harmless value."""
+def _untouched(recordings: Sequence[Recording], tie: Sequence[tuple[str, str]]) -> dict[str, float]:
+    """Parameters that no run has anything to do with, not even by a tie, at a harmless value."""
     touched = {"held": "R L", "torque": "J f", "current": "Kt J f", "voltage": "R L Kb Kt J f"}
     kinds = {"held" if r.held else r.drive for r in recordings}
     known = {name for kind in kinds for name in touched[kind].split()}
+    known |= {source for target, source in tie if target in known}
     return {name: 1.0 for name in PARAMETERS if name not in known}
