@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
@@ -69,7 +70,8 @@ class CsvTable:
     """Text with a header line; separated by comma, semicolon or tab.
 
     Lines that begin with # and empty lines are skipped. Numbers may have a decimal comma unless the
-    comma separates.
+    comma separates. A second line of units belongs to the header. Dates with times are read as seconds since the
+    first of them.
     """
 
     def __init__(self, path: Path):
@@ -77,7 +79,10 @@ class CsvTable:
         self._raw = _text(path)
         header, self._header_line, self._start = _find_header(self._raw, path)
         self._separator = next((s for s in "\t;" if s in header), ",")
-        self.headers = tuple(name.strip() for name in _fields(header, self._separator))
+        names = [name.strip() for name in _fields(header, self._separator)]
+        units, start = _find_units(self._raw, self._start, self._separator, len(names))
+        self._start = _past_empty_lines(self._raw, start)
+        self.headers = tuple(map(_with_unit, names, units)) if units else tuple(names)
         _refuse_duplicates(self.headers, path)
         self._kept: np.ndarray | None = None
 
@@ -148,14 +153,13 @@ class CsvTable:
         plain = text.str.replace(",", ".", literal=True) if comma else text
         numbers = plain.cast(pl.Float64, strict=False)
         wrong = (numbers.is_null() & text.is_not_null()).arg_true()
-        if len(wrong):
-            row = int(wrong[0])
-            mend = NUMBERS_ONLY
-            if row == 0:
-                mend += ". A second line of units belongs into the header, as in Speed [rpm]"
-            where = f"{self._path}, {self.place(row)}, column {header}"
-            raise InputError(where, f"'{text[row]}' is not a number", mend)
-        return numbers
+        if not len(wrong):
+            return numbers
+        if numbers.null_count() == len(numbers) and (stamps := _stamps(text)) is not None:
+            return _seconds(stamps)
+        row = int(wrong[0])
+        where = f"{self._path}, {self.place(row)}, column {header}"
+        raise InputError(where, f"'{text[row]}' is not a number", NUMBERS_ONLY)
 
     def _lines(self) -> Iterator[tuple[int, bytes]]:
         """Number and text of each line that polars makes a row of."""
@@ -198,7 +202,9 @@ class ParquetTable:
             raise InputError(str(self._path), "it is damaged", "Export it again") from None
         for header in headers:
             kind = frame.schema[header]
-            if not kind.is_numeric() and kind != pl.Null:
+            if isinstance(kind, pl.Datetime):
+                frame = frame.with_columns(_seconds(frame[header]))
+            elif not kind.is_numeric() and kind != pl.Null:
                 where = f"{self._path}, column {header}"
                 raise InputError(where, f"it holds {kind}, not numbers", NUMBERS_ONLY)
         return {h: frame[h].cast(pl.Float64).to_numpy().astype(float) for h in headers}
@@ -290,6 +296,46 @@ def _find_header(raw: bytes, path: Path) -> tuple[str, int, int]:
         comment = line.removeprefix("#")
         start, number = end + 1, number + 1
     raise InputError(str(path), "it holds no header and no rows", "Export the recording again")
+
+
+def _find_units(raw: bytes, start: int, separator: str, count: int) -> tuple[list[str] | None, int]:
+    """The units in the line below the header, if it holds nothing else, and the byte where the rows begin."""
+    start = _past_empty_lines(raw, start)
+    end = raw.find(b"\n", start) + 1 or len(raw)
+    line = raw[start:end].decode().strip("\r\n")
+    fields = [field.strip() for field in _fields(line, separator)]
+    if len(fields) != count or any(_is_numbers(f.replace(",", ".")) for f in fields if f):
+        return None, start
+    units = [field.strip("()[]") for field in fields]
+    return (units, end) if any(units) else (None, start)
+
+
+def _past_empty_lines(raw: bytes, start: int) -> int:
+    """The next byte that does not end a line; polars would take an empty first line for a column."""
+    found = re.compile(rb"[\r\n]*").match(raw, start)
+    return found.end() if found else start
+
+
+def _with_unit(name: str, unit: str) -> str:
+    """A header with the unit below it, unless it says that by itself, as speed_rad_s does of rad/s."""
+    said, new = (re.sub(r"\W+|_+", "_", text).strip("_") for text in (name, unit))
+    return name if not new or said.endswith(f"_{new}") else f"{name} [{unit}]"
+
+
+def _stamps(text: pl.Series) -> pl.Series | None:
+    """Dates with times, None if a text is none."""
+    import polars as pl
+
+    try:
+        return text.str.to_datetime(time_unit="ns")
+    except pl.exceptions.PolarsError:
+        return None
+
+
+def _seconds(stamps: pl.Series) -> pl.Series:
+    """Seconds since the first of some dates with times."""
+    first = stamps.drop_nulls().first()
+    return (stamps - first).dt.cast_time_unit("ns").dt.total_nanoseconds() / 1e9
 
 
 def _is_numbers(line: str) -> bool:

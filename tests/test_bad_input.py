@@ -145,7 +145,9 @@ def cases() -> Iterator[Case]:
         "text in a column", edited(7, "0.05,1,oops,2"), "line 7, column current_A: 'oops' is not"
     )
     yield Case(
-        "line of units", csv(HEADER, "s,V,A,rad/s", *rows()), "line 2, column time_s: 's' is not"
+        "line of wrong units",
+        csv("time,voltage,current,speed", "s,V,A,furlong", *rows()),
+        "column speed [furlong]: unknown unit 'furlong'",
     )
     yield Case("clock time", edited(2, "12:00:01,1,2,3"), "line 2, column time_s: '12:00:01'")
     yield Case(

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 import time as clock
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -170,6 +171,31 @@ def test_names_without_a_unit_are_taken_as_si_and_noted(tmp_path):
     (note,) = run.notes
     assert (note.column, note.severity) == ("speed", "note")
     assert "taken as rad/s" in note.what
+
+
+@pytest.mark.parametrize(
+    "units", ["ms,V,,rpm\n", "(ms),(V),(),(rpm)\n\n", "\n[ms],[V],-,[1/min]\n# begin\n"]
+)
+def test_a_second_line_may_hold_the_units(tmp_path, units):
+    head, *numbers = table("Time,voltage_V,flag,speed", 1000 * T, T, T, 60 + T).splitlines()
+    run = read_text(tmp_path, f"{head}\n{units}" + "\n".join(numbers))
+    np.testing.assert_allclose(run.time, T, atol=1e-15)
+    np.testing.assert_allclose(run.voltage, T)
+    np.testing.assert_allclose(run.speed, 2 * np.pi + T * RPM)
+    assert run.notes == ()
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f", "parquet"])
+def test_dates_are_seconds_since_the_first(tmp_path, form):
+    stamps = [datetime(2026, 2, 28, 23, 59, 59, 950_000) + timedelta(seconds=t) for t in T]
+    if form == "parquet":
+        path = tmp_path / "run.parquet"
+        pl.DataFrame({"time": stamps, "voltage_V": T, "speed_rpm": T}).write_parquet(path)
+        run = read_recording(path)
+    else:
+        lines = [f"{s.strftime(form)},{x},{x}" for s, x in zip(stamps, T, strict=True)]
+        run = read_text(tmp_path, "\n".join(["time,voltage_V,speed_rpm", *lines]))
+    np.testing.assert_allclose(run.time, T, atol=1e-9)
 
 
 def test_an_unused_look_alike_is_noted(tmp_path):

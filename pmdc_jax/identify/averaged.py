@@ -53,7 +53,7 @@ def _over_two(speed: Samples) -> Samples:
     return mean
 
 
-def _two_undone(mean: Samples) -> Samples:
+def two_undone(mean: Samples) -> Samples:
     bands = np.repeat([[1 / 6], [4 / 6], [1 / 6]], len(mean), axis=1)
     bands[1, [0, -1]], bands[0, 1], bands[2, -2] = 1.0, 0.0, 0.0
     return solve_banded((1, 1), bands, mean)
@@ -67,10 +67,10 @@ def _over_last(speed: Samples) -> Samples:
 def _last_undone(mean: Samples) -> Samples:
     """Two means over one sample are one over two; the last sample goes on as straight as the one before it."""
     ahead = np.append(mean[1:], 2 * mean[-1] - mean[-2:-1].sum())
-    return _two_undone((mean + ahead) / 2)
+    return two_undone((mean + ahead) / 2)
 
 
-TWO = Sensed("the last and the next sample", _over_two, _two_undone)
+TWO = Sensed("the last and the next sample", _over_two, two_undone)
 LAST = Sensed("the last sample", _over_last, _last_undone)
 LATE = Sensed("", lambda x: np.append(x[:1], x[:-1]), lambda x: np.append(x[1:], x[-1:]))
 
@@ -146,7 +146,7 @@ def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, 
     for run in range(tape.runs):
         mine = np.asarray(tape.run) == run
         known = np.asarray(tape.weight)[mine, 1].ravel() > 0
-        if known.sum() > 2:
+        if known.sum() > 2 and not given.differentiated[run]:
             speed = measured[mine, 1].ravel()
             speed[known] = sensed.undone(speed[known])
             measured[mine, 1] = speed.reshape(-1, measured.shape[2])
@@ -156,7 +156,11 @@ def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, 
 
 def _speeds(given: Prepared) -> list[tuple[np.ndarray, float]]:
     """The speeds of all runs that are long enough to show their noise, rad/s, and the time between samples, s."""
-    recorded = [(run.speed, np.diff(run.time)) for run in given.training if run.speed is not None]
+    recorded = [
+        (run.speed, np.diff(run.time))
+        for run, ours in zip(given.training, given.differentiated, strict=False)
+        if run.speed is not None and not ours
+    ]
     known = [(speed[~np.isnan(speed)], float(np.median(steps))) for speed, steps in recorded]
     return [(speed, step) for speed, step in known if len(speed) >= ENOUGH]
 

@@ -201,22 +201,25 @@ def _fits(
     seen: np.ndarray,
     local: np.ndarray,
 ) -> dict[str, RunFit]:
+    # as it was fitted, less what its sensor put into it
+    fitted = np.where(np.asarray(tape.weight) > 0, tape.measured, np.nan)[:, 1]
     fits = {}
     for index, (run, role) in enumerate(zip(even, roles, strict=True)):
         current, speed = (tape.samples_of(index, seen[:, c], len(run.time)) for c in range(2))
         driven = run.drive == "voltage"
+        measured = None if run.speed is None else tape.samples_of(index, fitted, len(run.time))
         fits[run.name] = RunFit(
             role=role,
             current_rmse=_rmse(run.current, current) if driven else None,
-            speed_rmse=_rmse(run.speed, speed),
+            speed_rmse=_rmse(measured, speed),
             current_fit_percent=_fit_percent(run.current, current) if driven else None,
-            speed_fit_percent=_fit_percent(run.speed, speed),
+            speed_fit_percent=_fit_percent(measured, speed),
             load_offset=float(local[index, 2]) if tape.load_unknown[index] else None,
             time=run.time,
             voltage=run.voltage,
             current=run.current,
             current_simulated=current if driven else None,
-            speed=run.speed,
+            speed=measured,
             speed_simulated=speed,
             load=run.load,
         )

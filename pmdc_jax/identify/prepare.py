@@ -35,6 +35,8 @@ class Prepared(NamedTuple):
     problem: Problem
     # by run: standard deviation of what was taken out of the record of its drive, for the motor did not feel it
     unfelt: Mapping[str, float] = MappingProxyType({})
+    # which runs have a speed by a spline through their angles
+    differentiated: tuple[bool, ...] = ()
     # over which samples the speeds were means, and are undone; empty, if they were none
     averaged: str = ""
 
@@ -92,7 +94,18 @@ def prepare(
         counts=jnp.arange(len(runs)) < len(recordings),
     )
     roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
-    return Prepared(runs, roles, findings, untouched, dict(known or {}), tuple(tie), problem)
+    return Prepared(
+        runs,
+        roles,
+        findings,
+        untouched,
+        dict(known or {}),
+        tuple(tie),
+        problem,
+        differentiated=tuple(
+            r.speed is None and r.angle is not None for r in (*recordings, *holdout)
+        ),
+    )
 
 
 def _refuse(recordings, holdout, tie, known) -> None:

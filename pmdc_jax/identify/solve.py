@@ -15,6 +15,7 @@ from ..threads import CORES, beside, side_by_side
 from .averaged import without_averaging
 from .bounds import effect_bounds
 from .identification import Search
+from .kinks import without_kinks
 from .parameters import Parameters
 from .polish import IDLE, Polished, polish, with_own
 from .prepare import Prepared
@@ -54,11 +55,12 @@ def solve(
 ) -> tuple[Prepared, Solved]:
     """The best fit of a search, to runs less what their sensors put into them that is no motion of the motor.
 
-    **Returns**: the problem as `searched`, `without_unfelt` and `without_averaging` leave it, and the fit.
+    **Returns**: the problem as `searched` leaves it, and then whatever takes out such a thing, and the fit.
     """
     given, solved = searched(given, search, seed, progress)
     given, polished = without_unfelt(given, with_own(given.problem, solved.polished))
     given, polished = without_averaging(given, polished)
+    given, polished = without_kinks(given, polished)
     return given, solved._replace(polished=polished)
 
 

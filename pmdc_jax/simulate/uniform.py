@@ -24,7 +24,7 @@ def uniform(recording: Recording) -> Recording:
     if recording.stands_still:
         recording = attrs.evolve(recording, speed=None, angle=None, held=True)
     if recording.speed is None and recording.angle is not None:
-        recording = attrs.evolve(recording, speed=_speed_of(recording.angle, recording.time))
+        recording = attrs.evolve(recording, speed=speed_by_spline(recording.angle, recording.time))
     time = recording.time
     steps = np.arange(len(time))
     step = (time[-1] - time[0]) / (len(time) - 1)
@@ -63,8 +63,8 @@ def _interpolate(time: np.ndarray, samples: np.ndarray, grid: np.ndarray) -> np.
     return values
 
 
-def _speed_of(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """The derivative of a cubic spline: a difference would be a mean over two steps, which looks like a lag."""
+def speed_by_spline(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """The derivative of a cubic spline, rad/s: a difference would be a mean over two steps, which looks like a lag."""
     from scipy.interpolate import CubicSpline  # late, for it takes long to load
 
     known = ~np.isnan(angle)
