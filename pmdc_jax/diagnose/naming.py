@@ -21,15 +21,23 @@ from .model import Model, ended
 from .periodic import Line, line_of
 from .refits import Refits
 from .screen import Screen, Signal, beyond_curves, screen, signals
-from .seen import ALARM, HARDER, MUCH_OF_IT, Seen, chance_of_nothing
-from .shortlist import COMPARABLE, SHORTLIST, clear, effect_of, richer, shortlist
+from .seen import ALARM, FORMULA, HARDER, MUCH_OF_IT, Seen, chance_of_nothing
+from .shortlist import (
+    COMPARABLE,
+    SHORTLIST,
+    clear,
+    effect_of,
+    promising,
+    richer,
+    shortlist,
+)
 
 # What is missed by a smaller share of what is measured is nothing: one simulation meets another no closer
 CLOSE = 1e-4
 # At most so many effects are named
 MOST = 3
 # What the clearest signal would take away after one more effect, over what that effect takes away, at most; the larger
-# one after a richer form of what was there
+# one after a richer form of what was there, or where that cannot have left it
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
 # A fuller form of an effect is ruled out if it leaves so many squares more: two standard errors
 RULED_OUT = 4.0
@@ -74,10 +82,7 @@ class Namer:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
         current, found = self.base, self._see(self.base)
         self.passed.add(current)
-        while better := (
-            self._better(current, found, self._tried(current, found))
-            or self._settling(current, found)
-        ):
+        while better := self._step(current, found):
             again = self._see(better)
             if not self._is_settled(current, found, better):
                 # a simple form may be but a step to the one that is there
@@ -90,6 +95,16 @@ class Namer:
             current, found = better, self._see(better)
             self.passed.add(current)
         return self._naming(self._better(current, found, self._tied(current, found)) or current)
+
+    def _step(self, current: Model, found: Seen) -> Model | None:
+        """A better model than the current one, with one effect more or another one, if there is one."""
+        swallowed = found.unexplained < FORMULA and self._by_plain_squares(current, found)
+        return (
+            swallowed
+            or self._better(current, found, self._tried(current, found))
+            or self._settling(current, found)
+            or self._by_plain_squares(current, found)
+        )
 
     def _better(self, current: Model, found: Seen, tried: Sequence[Model | None]) -> Model | None:
         """The best of some models in place of the current one, if it is better, without what it can do without."""
@@ -126,7 +141,8 @@ class Namer:
             self.comparison.left(current, white).squares
             - self.comparison.left(better, white).squares
         )
-        return bool(again.clearest.gain < (NEXT_TO_NOTHING if grown else LITTLE) * gained)
+        share = NEXT_TO_NOTHING if grown and not self._see(current).is_foreign(current) else LITTLE
+        return bool(again.clearest.gain < share * gained)
 
     def _settling(self, current: Model, found: Seen) -> Model | None:
         """The current model with the effect that promises most, however little, if it settles what no formula explains:
@@ -137,6 +153,19 @@ class Namer:
         most = sorted(others, key=lambda s: -s.gain)[:1]
         better = self._better(current, found, self._with(current, found, most))
         return better if better and self._leaves_little(current, better) else None
+
+    def _by_plain_squares(self, current: Model, found: Seen) -> Model | None:
+        """The current model with one of the effects that take away most of what is left, no filter between, if that
+        leaves far less: a filter takes for noise what lasts as long as a short run."""
+        far = current.polished.refined.fitness / FAR
+        full = len(current.effects) == MOST
+        if full or found.left >= ALARM or far < current.given.problem.outputs:
+            return None
+        pointed = found.screen._replace(evidence=found.screen.unfiltered)
+        most = promising(found.plainly(), set(current.effects))
+        tried = [self.refits.with_signal(current, s, pointed) for s in most]
+        better = [m for m in tried if m is not None and m.polished.refined.fitness < far]
+        return self._better(current, found, better)
 
     def without(self, named: Naming, effect: str) -> Naming:
         """The set without one of its effects."""

@@ -47,6 +47,7 @@ class Refits:
         self.library, self.solved, self.report = library, solved, report
         self.comparison = comparison
         self.models: dict[frozenset[str], Model] = {frozenset(): base}
+        self.begun_from: set[tuple[frozenset[str], Model]] = set()  # sets, each with a model
         self.begun: dict[str, Values] = {}  # where each effect was first begun to be fitted
 
     def with_signal(self, current: Model, signal: Signal, found: Screen) -> Model | None:
@@ -72,7 +73,29 @@ class Refits:
                 return self._best_of(effects, [start, *others], found.white)
             return self._refitted(effects, start, current, signal, found.white)
 
-        return self._once(effects, current, refit)
+        model = self._once(effects, current, refit)
+        if not self._keeps(model, current, signal, found.white):
+            model = self._better_from(effects, current, refit)
+        return model
+
+    def _keeps(self, model: Model | None, current: Model, signal: Signal, white: Whitener) -> bool:
+        """Whether a refit keeps enough of what the evidence against the current model promised."""
+        if model is None:
+            return False
+        before, after = (self.comparison.left(m, white).squares for m in (current, model))
+        return bool(before - after > KEPT * signal.gain)
+
+    def _better_from(
+        self, effects: Sequence[str], current: Model, refit: Callable[[], Model | None]
+    ) -> Model | None:
+        """The better one of a model as it was fitted from another one and as it is fitted from the current one."""
+        key = frozenset(effects)
+        before = self.models.get(key)
+        if (key, current) not in self.begun_from:
+            again = self._fitted(key, current, refit)
+            if again and (not before or _fitness(again) < _fitness(before)):
+                self.models[key] = again
+        return self.models.get(key)
 
     def in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
         """The current model with an effect in place of another: a fuller form of it, or one that has starts of its own,
@@ -119,12 +142,19 @@ class Refits:
         return self._start(current, effects, {fuller.effect: values})
 
     def without(self, model: Model, effect: str, white: Whitener) -> Model:
-        """The model without one of its effects."""
+        """The model without one of its effects; fitted once more if it does better with the parameters of the larger
+        one than where it ended."""
         rest = tuple(e for e in model.effects if e != effect)
-        smaller = self._once(
-            rest, model, lambda: settled(rest, *self._start(model, rest, {}), white)
-        )
+        given, begun = self._start(model, rest, {})
+
+        def refit() -> Model:
+            return settled(rest, given, begun, white)
+
+        smaller = self._once(rest, model, refit)
         assert smaller is not None
+        here = polish(given.problem, begun, steps=0).refined.fitness
+        if here < _fitness(smaller):
+            smaller = self._better_from(rest, model, refit) or smaller
         return smaller
 
     def _once(
@@ -132,12 +162,18 @@ class Refits:
     ) -> Model | None:
         key = frozenset(effects)
         if key not in self.models:
-            self.report(f"trying {' + '.join(sorted(key))}", current.polished.refined.fitness)
-            found = refit()
+            found = self._fitted(key, current, refit)
             if found is None:
                 return None
             self.models[key] = found
         return self.models[key]
+
+    def _fitted(
+        self, key: frozenset[str], current: Model, refit: Callable[[], Model | None]
+    ) -> Model | None:
+        self.report(f"trying {' + '.join(sorted(key))}", _fitness(current))
+        self.begun_from.add((key, current))
+        return refit()
 
     def _starts(self, current: Model, effects: tuple[str, ...]) -> list[Start]:
         """Where else to begin refitting the last of some effects."""
@@ -172,14 +208,14 @@ class Refits:
         noise was what is missing."""
         given, begun = start
         model = settled(effects, given, begun, white)
-        before, after = (self.comparison.left(m, white).squares for m in (current, model))
-        if before - after > KEPT * signal.gain:
+        if self._keeps(model, current, signal, white):
             return model
         plain = polish(given.problem, begun)
-        if plain.refined.fitness < KEPT * model.polished.refined.fitness:
+        if plain.refined.fitness < KEPT * _fitness(model):
             return model_of(effects, given, plain)
         plainly = settled(effects, given, plain.refined, white)
-        return plainly if self.comparison.left(plainly, white).squares < after else model
+        left = self.comparison.left
+        return min((model, plainly), key=lambda m: left(m, white).squares)
 
     def _pointed_at(
         self,
@@ -244,6 +280,10 @@ class Refits:
             model.given.problem.counted, ..., column
         ]
         return float(np.square(seen).sum()) < 1 / FLAT**2
+
+
+def _fitness(model: Model) -> float:
+    return model.polished.refined.fitness
 
 
 def _roughly(start: Start) -> Refined:

@@ -93,6 +93,14 @@ class Seen(NamedTuple):
         own = isinstance(clearest, Curve) and _is_own(clearest, model)
         return self._is_more_of(model) or bool(own and self.unexplained < OWN_FORMULA)
 
+    def plainly(self) -> list[Signal]:
+        """The candidates' signals with what each takes away of the misfit as it is, no filter between."""
+        plain = self.screen.unfiltered
+        whole = plain.regress().squares
+        return [
+            s._replace(gain=whole - plain.regress([s.block]).squares) for s in self.of_candidates
+        ]
+
     def _unexplained_plainly(self, model: Model) -> float:
         """What the clearest signal would still take away of the misfit as it is, over what the model does."""
         if not self.removed > 0:

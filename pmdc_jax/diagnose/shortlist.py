@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from .candidates import STARTS
@@ -38,6 +40,16 @@ def shortlist(current: Model, found: Seen) -> list[Signal]:
     ranked = [s for s in ranked if s.gain > share * ranked[0].gain]
     least = ranked[:SHORTLIST][-1].gain if ranked else 0.0
     return [s for s in ranked if s.gain >= (1 - TIED) * least]
+
+
+def promising(signals: Sequence[Signal], here: set[str]) -> list[Signal]:
+    """Of each of the few effects that gain most, but for those that are `here`, the shape that does."""
+    best: dict[str, Signal] = {}
+    for s in sorted(signals, key=lambda s: -s.gain):
+        if effect_of(s) not in here:
+            best.setdefault(effect_of(s), s)
+    ranked = list(best.values())[:SHORTLIST]
+    return [s for s in ranked if s.gain > COMPARABLE * ranked[0].gain]
 
 
 def clear(found: Seen) -> list[Signal]:
