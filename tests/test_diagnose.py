@@ -73,7 +73,8 @@ class Undecided(Namer):
         assert self.trials < 5
         return [self.other if current is self.one else self.one]
 
-    _see = staticmethod(lambda model: Mock(spec=Seen))
+    _see = staticmethod(lambda model: Mock(spec=Seen, unexplained=np.inf))
+    _by_plain_squares = staticmethod(lambda *models: None)
     _best = staticmethod(lambda tried, white: tried[0])
     _spared = staticmethod(lambda model: model)
     _is_settled = staticmethod(lambda *models: True)

@@ -83,6 +83,19 @@ def test_nothing_is_found_where_nothing_is_missing(noise):
     assert 0 < by_name["coulomb_friction"].amplitude < 0.05
 
 
+def test_a_voltage_recorded_by_ten_bits_hides_no_dead_zone():
+    """Levels are off by half a bit each, which lasts as long as they do; the motor feels the real ones."""
+    rng, bit, runs = np.random.default_rng(21), 48 / 1024, []
+    for name, driven in {
+        "staircase": vb.staircase(4.0, amplitude=13.3),
+        "prbs": vb.prbs(rng, 4.0, amplitude=5.1, offset=5.1),
+    }.items():
+        columns = vb.record(vb.BenchMotor(**PAPER), driven, rng, vb.Noise(0.05, 0.2))
+        columns["voltage_V"] = bit * np.trunc(columns["voltage_V"] / bit)
+        runs.append(Recording(name, *(columns[q] for q in QUANTITIES), load=0 * driven.time))
+    assert diagnose(runs).verdict == "none_detected"
+
+
 def test_a_constant_load_would_not_have_shown_beside_a_load_that_nobody_knows():
     """Nor Coulomb friction, of a motor that turns one way."""
     _, triangle, _ = recorded(vb.BenchMotor(**PAPER), 1, NOISE)

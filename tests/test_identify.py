@@ -26,7 +26,7 @@ from pmdc_jax.identify.bounds import effect_bounds
 from pmdc_jax.identify.colour import whitener
 from pmdc_jax.identify.identification import Identification
 from pmdc_jax.identify.judge import judge
-from pmdc_jax.identify.noise import is_coarse, quantum, white_noise
+from pmdc_jax.identify.noise import is_coarse, quantum, resolution, white_noise
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.polish import fit_own, polish
 from pmdc_jax.identify.prepare import prepare
@@ -372,6 +372,20 @@ def test_a_smooth_or_a_noisy_signal_has_no_quantum():
     assert quantum(np.diff(smooth)) == 0.0
     assert quantum(np.diff(smooth + rng.normal(size=5000))) == 0.0
     assert white_noise([smooth + rng.normal(size=5000)]) == pytest.approx(1.0, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("values", "step"),
+    [
+        ([0.0, 9.5625, -19.171875, 28.78125], 3 / 64),  # 48 V by 1,024
+        ([12.0, -24.0, 6.0], 6.0),
+        ([0.1, 0.3, 0.7000000001], 0.1),
+        ([np.pi, np.e, 1.0], 0.0),
+        ([0.0, 0.0], 0.0),
+    ],
+)
+def test_a_converter_resolves_what_all_values_are_multiples_of(values, step):
+    assert resolution(np.array(values)) == pytest.approx(step, rel=1e-6)
 
 
 def test_whitening_is_its_formula_sample_by_sample():

@@ -11,7 +11,7 @@ from scipy import special, stats
 
 from ..effects import EFFECTS
 from ..identify.colour import Series, Whitener, plain, whitener
-from ..identify.noise import quantum
+from ..identify.noise import quantum, resolution
 from ..simulate import LOCAL
 from .candidates import Candidate
 from .evidence import Block, Evidence, blocks_of, products
@@ -24,6 +24,10 @@ SLOWEST_WAVES = 1.5
 # How much stronger the noise of a torque may be over the few knots of a curve over time than a filter makes of it,
 # where it keeps for 0.2 s and runs take some seconds
 SLOWER = 4.0
+# So many standard errors are clearly more than nothing
+CLEARLY = 3.0
+# Of the largest voltage, what a converter of seven bits and more resolves
+OF_CONVERTER = 0.01
 # What a torque that drifts gains in white noise, over its degrees of freedom, at most: of some forty
 BY_CHANCE = 1.25
 
@@ -88,10 +92,20 @@ def screen(model: Model, library: Library) -> Screen:
 
 
 def _traces(model: Model) -> dict[str, float]:
-    """What is left of noise that was taken out of the recorded voltage, and half of what a current moves by."""
-    currents = [run.current for run in model.given.training if run.current is not None]
+    """What is left of noise that was taken out of the recorded voltage, or what that was rounded to; and half of what a
+    current moves by."""
+    training = model.given.training
+    currents = [run.current for run in training if run.current is not None]
     rounded = max((quantum(np.diff(current)) / 2 for current in currents), default=0.0)
-    return {"V": max(model.given.unfelt.values(), default=0.0), "A": rounded}
+    unfelt = max(model.given.unfelt.values(), default=0.0)
+    volts = [run.voltage for run in training if run.voltage is not None]
+    return {"V": max(unfelt, _rounded_to(np.concatenate(volts or [np.zeros(1)]))), "A": rounded}
+
+
+def _rounded_to(volts: np.ndarray) -> float:
+    """What a converter rounds to or cuts off; zero for round numbers of a programme, which are far larger."""
+    step = resolution(volts)
+    return step if step < OF_CONVERTER * np.max(np.abs(volts)) else 0.0
 
 
 def beyond_curves(found: Screen) -> float:
@@ -146,10 +160,21 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
             gains[k] = _left(found, drift) - _left(found, drift, found.of_curve[k])
         elif found.of_curve[k] is drift:
             gains[k] /= SLOWER
-        elif curve.noise:
+        elif curve.noise or _is_trace(found, curve, found.of_curve[k]):
             gains[k] = 0.0
     of_curves = [signal(*one) for one in zip(found.curves, found.of_curve, gains, strict=True)]
     return sorted(of_candidates, key=_log_p), sorted(of_curves, key=_log_p)
+
+
+def _is_trace(found: Screen, curve: Curve, block: Block) -> bool:
+    """Whether a curve of a voltage is nowhere clearly larger than what a sensor makes of it."""
+    trace = found.traces["V"]
+    if not trace or not _is_voltage(curve):
+        return False
+    fit = found.evidence.regress([block], visible=1e-3)
+    runs = zip(np.atleast_2d(fit.coefficients[0]), np.atleast_2d(fit.errors[0]), strict=True)
+    beyond = [np.abs(curve.values(c)) - CLEARLY * curve.errors(e) for c, e in runs]
+    return bool(np.max(beyond) < trace)
 
 
 def _left(found: Screen, *blocks: Block) -> float:

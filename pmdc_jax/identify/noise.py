@@ -11,6 +11,8 @@ from jaxtyping import Float
 FLOOR = 1e-5
 # Steps that are this share of the largest one are none
 ROUNDING = 1e-9
+# Numbers that differ by this share of the largest one are equal, and of 20 bits nobody knows the last
+MULTIPLE, RESOLVED = 1e-8, 1e-6
 
 
 def white_noise(signals: Sequence[np.ndarray]) -> float | None:
@@ -38,6 +40,19 @@ def is_coarse(signal: np.ndarray) -> bool:
 def _rounding(signals: Sequence[np.ndarray]) -> float:
     """Standard deviation of what rounding to the quanta of the sensor does."""
     return quantum(np.concatenate([np.diff(s) for s in signals])) / np.sqrt(12.0)
+
+
+def resolution(values: Float[np.ndarray, " values"]) -> float:
+    """The largest number of which all values are multiples, zero if there is none: by Euclid, of both signs."""
+    sizes = np.unique(np.abs(values))
+    least, found = MULTIPLE * sizes[-1], 0.0
+    for size in sizes[sizes > least]:
+        rest = float(size)
+        while rest > least:
+            found, rest = rest, abs(found - rest * np.round(found / rest))
+        if found < RESOLVED * sizes[-1]:
+            return 0.0
+    return found
 
 
 def quantum(steps: Float[np.ndarray, " steps"]) -> float:
