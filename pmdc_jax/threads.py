@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import ParamSpec, TypeVar
@@ -20,6 +20,18 @@ CORES = os.cpu_count() or 1
 def side_by_side(function: Callable[[A], T], items: Iterable[A]) -> list[T]:
     """What a function makes of every item, as many at a time as there are cores. Not to be nested."""
     return [future.result() for future in [beside(function, item) for item in items]]
+
+
+def side_by_side_until(
+    function: Callable[[A], T], items: Sequence[A], enough: Callable[[list[T]], bool]
+) -> list[T]:
+    """The same, until what was made so far is `enough`."""
+    made: list[T] = []
+    for first in range(0, len(items), CORES):
+        made += side_by_side(function, items[first : first + CORES])
+        if enough(made):
+            break
+    return made
 
 
 def beside(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:

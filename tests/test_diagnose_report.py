@@ -155,7 +155,18 @@ def test_what_is_not_in_the_library_in_words():
     assert "over speed, clearest with −30.0 mN·m at 40.0 rad/s" in told
     part = words(evolve(not_in_library(), effects=named().effects))
     assert "Stribeck friction (" in part
-    assert "explains part of it and was added" in part
+    assert "explains part of it and was added; what is left is no effect of the library." in part
+    gap = {"train": Gap(4.0, 1.0, 1.0), "holdout": Gap(5.0, 3.0, 1.0)}
+    held_out = words(evolve(not_in_library(), effects=named().effects, gap=gap))
+    assert "explains part of it and was added." in held_out
+    assert "Held-out runs are missed by 3.00 times what the fitted ones are" in held_out
+
+
+@pytest.mark.parametrize(("after", "beyond"), [(2.4, None), (2.6, 2.6)])
+def test_hold_outs_tell_what_fitted_runs_do_not(after, beyond):
+    gap = {"train": Gap(4.0, 1.0, 1.0), "holdout": Gap(5.0, after, 1.0)}
+    assert named(gap=gap).beyond_fitted == beyond
+    assert named(gap={"train": gap["train"]}).beyond_fitted is None
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,10 @@ from ..identify.identification import Estimate, Identification, Role
 Verdict = Literal["none_detected", "named", "ambiguous", "not_in_library"]
 
 
+# Hold-outs that are missed by so many times what the fitted runs are show what those do not
+BEYOND = 2.5
+
+
 @frozen
 class EffectFound:
     """An effect that the data ask for: its parameters, and how sure it is that it is there."""
@@ -95,3 +99,15 @@ class Diagnosis:
     final: Identification  # with the effects that were found
     p_nothing: float  # of the data if nothing were missing
     seconds: Mapping[str, float]
+
+    @property
+    def beyond_fitted(self) -> float | None:
+        """By how many times more the hold-outs are missed than the fitted runs, where that is too much to be the same
+        motor; else None."""
+        return beyond_fitted(self.gap)
+
+
+def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:
+    """See `Diagnosis.beyond_fitted`."""
+    ratio = gap["holdout"].after / gap["train"].after if "holdout" in gap else 1.0
+    return ratio if ratio > BEYOND else None

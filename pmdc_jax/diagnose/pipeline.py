@@ -26,6 +26,7 @@ from .diagnosis import (
     LearnedCurve,
     Region,
     Verdict,
+    beyond_fitted,
 )
 from .evidence import Block
 from .experiment import next_experiment
@@ -86,13 +87,15 @@ def diagnose(
         final = _judged(naming, solved)
     verdict = _verdict(naming)
     gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
+    total = _total(gaps, base)
+    if beyond_fitted(total):
+        verdict = "not_in_library"
     seconds = {
         "identify": identified - began,
         "name": named - identified,
         "total": time.perf_counter() - began,
     }
     final = attrs.evolve(final, seconds=seconds)
-    total = _total(gaps, base)
     return Diagnosis(
         verdict=verdict,
         effects=_effects(naming, final),

@@ -18,7 +18,7 @@ from ..identify.refine import Refined
 from ..identify.sharpen import residuals_of, whitened
 from ..identify.solve import POOR, Solved, searched
 from ..identify.uncertainty import FLAT
-from ..threads import CORES, side_by_side
+from ..threads import side_by_side, side_by_side_until
 from .candidates import AROUND, FULLER, STARTS, Values
 from .compare import Comparison
 from .kinship import CONTAINS, spelt_out
@@ -182,12 +182,14 @@ class Refits:
 
     def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener) -> Model:
         """The best refit of several, begun one after another until one is as good as the noise or found twice."""
-        given, ends = starts[0][0], []
-        for first in range(0, len(starts), CORES):
-            ends += side_by_side(_roughly, starts[first : first + CORES])
+        given = starts[0][0]
+
+        def enough(ends: list[Refined]) -> bool:
             least, *others = sorted(end.fitness for end in ends)
-            if least < POOR * given.problem.outputs or (others and others[0] < AGREED * least):
-                break
+            good = least < POOR * given.problem.outputs
+            return bool(good or (others and others[0] < AGREED * least))
+
+        ends = side_by_side_until(_roughly, starts, enough)
         best = min(ends, key=lambda end: end.fitness)
         unknowns = stood(given.problem, best.unknowns, starts[0][1].unknowns.local)
         begun = best._replace(unknowns=unknowns)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..simulate import Tape
-from ..threads import CORES, beside, side_by_side
+from ..threads import beside, side_by_side_until
 from .averaged import without_averaging
 from .bounds import effect_bounds
 from .identification import Search
@@ -149,13 +149,11 @@ def _distinct(found: Found, parameters: Parameters) -> list[np.ndarray]:
 def _refine_all(problem: Problem, found: Found) -> list[Refined]:
     """Refine the best distinct candidates of a search, one a core at a time, until they agree; the best first."""
     starts = [_start(problem.tape, candidate) for candidate in _distinct(found, problem.parameters)]
-    ends: list[Refined] = []
-    for first in range(0, len(starts), CORES):
-        now = starts[first : first + CORES]
-        ends = sorted([*ends, *side_by_side(lambda s: refine(problem, s), now)], key=_fitness)
-        if _agreed(ends, problem.outputs):
-            break
-    return ends
+
+    def agreed(ends: list[Refined]) -> bool:
+        return _agreed(sorted(ends, key=_fitness), problem.outputs)
+
+    return sorted(side_by_side_until(lambda s: refine(problem, s), starts, agreed), key=_fitness)
 
 
 def _fitness(end: Refined) -> float:

@@ -87,10 +87,8 @@ def _ambiguous(diagnosis: Diagnosis) -> list[str]:
 def _not_in_library(diagnosis: Diagnosis) -> list[str]:
     sentences = [_disagreement(diagnosis)]
     if diagnosis.effects:
-        sentences.append(
-            f"{_capital(_found(diagnosis))} explains part of it and was added; what is left is no"
-            " effect of the library."
-        )
+        rest = "" if diagnosis.beyond_fitted else "; what is left is no effect of the library"
+        sentences.append(f"{_capital(_found(diagnosis))} explains part of it and was added{rest}.")
     else:
         sentences.append("Something is missing that no effect of the library explains.")
     if diagnosis.curves:
@@ -103,6 +101,11 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
             f"Drawn by the data it looks most like a {kind} over {curve.variable}, clearest"
             f" with {amount(curve.value[peak], curve.unit)} {place(curve.variable, curve.x[peak])}"
             f" ({chance(curve.p_value)})."
+        )
+    if beyond := diagnosis.beyond_fitted:
+        sentences.append(
+            f"Held-out runs are missed by {significant(beyond)} times what the fitted ones are: something shows there"
+            " that the fitted ones do not tell of. Fit one of them, too."
         )
     return sentences
 
