@@ -12,6 +12,7 @@ from .recording import Finding, Recording
 
 GAP = 3.0  # median steps
 JITTER = 0.02  # of a step, root mean square
+LEAP = 0.2  # of the range
 FLAT_TOP = 1e-9  # probability that a run of equal extreme values is chance
 
 
@@ -138,6 +139,24 @@ def constant_load(run: Recording) -> Iterator[Finding]:
         )
 
 
+def leaps(run: Recording) -> Iterator[Finding]:
+    """A current that drives, and leaps from one sample to the next: half way between is but a guess."""
+    if run.drive != "current" or run.current is None:
+        return
+    steps = np.abs(np.diff(run.current))
+    row = int(np.argmax(steps))
+    if steps[row] > LEAP * np.ptp(run.current) and steps[row] > 10 * _noise(run.current):
+        yield Finding(
+            run.name,
+            "current",
+            "note",
+            f"it leaps by up to {steps[row]:.3g} A between samples: what it did there is not known, and may look like a"
+            " missing effect",
+            place(run, row),
+            "Sample faster, or record the voltage as well",
+        )
+
+
 def excitation(runs: Sequence[Recording]) -> Iterator[Finding]:
     """Runs, or all runs together, in which nothing moves."""
     still = [run for run in runs if not any(_moves(y) for y in _outputs(run).values())]
@@ -182,6 +201,7 @@ LOOKS = (
     clipped,
     wrapped_angle,
     constant_load,
+    leaps,
     signs,
     angle_against_speed,
     alignment,

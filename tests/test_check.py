@@ -97,6 +97,16 @@ def test_good_data_pass_in_silence(seed):
     assert told([evolve(run, angle=angle), evolve(run, angle=angle, speed=None)]) == []
 
 
+def test_a_current_that_leaps_is_known_only_beside_a_voltage():
+    steps = good_run(0)
+    leaping = evolve(steps, current=np.repeat([1.0, -2.0], [700, len(steps) - 700]), voltage=None)
+    (note,) = [f for f in check([leaping]) if "leaps" in f.what]
+    assert "by up to 3 A" in note.what and "sample 700 " in note.where
+    smooth = evolve(leaping, current=np.sin(0.01 * np.arange(len(steps))))
+    beside = evolve(leaping, voltage=steps.voltage)
+    assert not any("leaps" in f.what for run in (smooth, beside) for f in check([run]))
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.03])
 @pytest.mark.parametrize("kind", EXCITATIONS)
 def test_clean_and_very_noisy_data_pass_in_silence(kind, noise):
