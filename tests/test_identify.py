@@ -250,6 +250,29 @@ def test_voltage_and_current_alone_tell_the_armature_and_ratios(runs):
     assert {p.status for p in tied.parameters.values()} <= {"identified", "tied"}
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_simulation_without_noise_is_met_exactly(seed):
+    """And the fit says so: what is left are rounding errors, of which no gradient vanishes."""
+    exact = identify(light_and_loaded(seed, noise=vb.Noise(0.0, 0.0)))
+    assert exact.converged
+    for name in PARAMETERS:
+        assert exact.parameters[name].value == pytest.approx(getattr(PAPER, name), rel=1e-6)
+
+
+def test_a_short_circuit_from_full_speed_tells_ratios_alone():
+    """Nothing but the decay: of R, L and Kb, as of J, f and Kt, only how one is to the others."""
+    rng, time = np.random.default_rng(4), 1e-3 * np.arange(SAMPLES)
+    A = [[-PAPER.R / PAPER.L, -PAPER.Kb / PAPER.L], [PAPER.Kt / PAPER.J, -PAPER.f / PAPER.J]]
+    zero = np.zeros(SAMPLES)
+    _, y, _ = lsim((A, np.zeros((2, 1)), np.eye(2), np.zeros((2, 1))), zero, time, [0.0, 300.0])
+    noise = np.array([0.1, 0.5]) * rng.standard_normal((SAMPLES, 2))
+    result = identify([Recording("short", time, zero, *(y + noise).T, zero)])
+    assert {p.status for p in result.parameters.values()} == {"not_identifiable"}
+    m = result.motor
+    assert float(m.Kb / m.R) == pytest.approx(PAPER.Kb / PAPER.R, rel=0.02)
+    assert float(m.Kt / m.J) == pytest.approx(PAPER.Kt / PAPER.J, rel=0.02)
+
+
 def test_without_voltage_a_tie_tells_nothing():
     """Kb has nothing to do with such runs, so that Kt = Kb leaves Kt as open as it was."""
     light = [attrs.evolve(run, voltage=None) for run in unloaded(3)]

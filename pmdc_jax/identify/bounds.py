@@ -11,6 +11,8 @@ from ..recording import Recording
 
 # How far a crude estimate may be off, as a factor either way. Wide: the search is cheap.
 CRUDE = 30.0
+# Back-EMF constant, V s/rad, where nothing tells of it
+USUAL = 0.05
 # By how much what an effect does may be smaller than what drives the motor, and still show
 DECADES = 1e3
 
@@ -84,7 +86,8 @@ def _armature(recordings: Sequence[Recording]) -> tuple[float, float]:
         inputs = np.stack([current, speed], 1)
         scale = np.linalg.norm(inputs, axis=0) + 1e-300
         R, Kb = np.linalg.lstsq(inputs / scale, voltage, rcond=1e-6)[0] / scale
-        steady = np.linalg.norm(voltage) / scale
+        # short-circuited, it shows no more than how one is to the other
+        steady = (np.linalg.norm(voltage) or USUAL * scale[1]) / scale
         # a motor that only stalls, or only runs light, shows one of the two: then the other is open
         return (R if R > 0 else steady[0]), (Kb if Kb > 0 else steady[1])
     gains = [
@@ -97,7 +100,7 @@ def _armature(recordings: Sequence[Recording]) -> tuple[float, float]:
         for r in recordings
         if r.voltage is not None and r.current is not None
     ]
-    Kb = float(np.median(gains)) if gains else 0.05
+    Kb = float(np.median(gains)) if gains else USUAL
     return (float(np.median(loads)) / 3 if loads else 1.0), Kb
 
 

@@ -81,7 +81,7 @@ def polish(
             start = np.asarray(best.unknowns.coordinates)
             held = {k for k in held if (best.matrix[k, -1] > 0) == (start[k] <= low[k])}
             step, gain = gauss_newton(best.matrix, held, len(low))
-            if converged := gain <= worth * best.matrix[-1, -1] / problem.most_samples:
+            if converged := gain <= worth * _variance(problem, best):
                 break
         else:
             break
@@ -91,7 +91,7 @@ def polish(
         moved[: len(low)] = inside
         reached = _weighed(problem, unflatten(problem, jnp.asarray(moved)))
         costs.append(min(reached.cost, best.cost))
-    converged = converged or gain <= AT_KINK * best.matrix[-1, -1] / problem.most_samples
+    converged = converged or gain <= AT_KINK * _variance(problem, best)
     refined = Refined(best.unknowns, best.fitness, tuple(sorted(held)), bool(converged))
     return Polished(refined, best.evaluation, best.noise)
 
@@ -115,6 +115,13 @@ class _Weighed(NamedTuple):
     # their squares
     cost: float
     fitness: float
+
+
+def _variance(problem: Problem, best: _Weighed) -> float:
+    """Mean square of the weighed residuals; at least the noise that they are weighed by, of which a simulation without
+    any leaves next to nothing."""
+    mean = best.matrix[-1, -1] / problem.most_samples
+    return mean if problem.whitening is not None else max(mean, 1.0)
 
 
 def taken_over(problem: Problem, fit: Polished) -> Evaluation:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..simulate import Tape
 from .colour import Series, Whitener
+from .noise import FLOOR
 from .polish import WORTH, Polished, polish, taken_over
 from .prepare import Prepared
 from .whitening import Whitening
@@ -33,11 +34,17 @@ def last_fit(
     Not where it is far from reproducing the runs as they are, as where the motor has an effect that the model lacks
     or a formula is not quite nature's: the filter then takes what is missing for noise.
     """
-    if white.is_plain:
+    if white.is_plain or _is_exact(given, plainly):
         return given, plainly
     sharp = sharpened(given, near, white)
     as_it_is = polish(given.problem, sharp[1].refined, steps=0).refined.fitness
     return sharp if as_it_is < NEAR * plainly.refined.fitness else (given, plainly)
+
+
+def _is_exact(given: Prepared, fit: Polished) -> bool:
+    """Whether nothing is left but rounding errors, as of a simulation without noise."""
+    there = given.problem.samples > 0
+    return bool(np.all(fit.noise[there] < 2 * FLOOR * given.problem.sizes[there]))
 
 
 def sharpened(
