@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..effects import EFFECTS
 from .candidates import STARTS
 from .kinship import CONTAINS, spelt_out
 from .model import Model
@@ -24,12 +25,14 @@ def shortlist(current: Model, found: Seen) -> list[Signal]:
     """The most significant shape of each of the few effects that explain most.
 
     If that is an effect which is there already and little is left, its own formula is what is left to be desired,
-    or else an effect that does more than its columns show. One that contains an effect which is there, and explains
-    most of what is left, needs no other beside it.
+    or else an effect that does more than its columns show; but a sensor's formula is exact. One that contains an
+    effect which is there, and explains most of what is left, needs no other beside it.
     """
     obvious = clear(found)
     ranked = [s for s in obvious if effect_of(s) not in current.effects]
-    if obvious and effect_of(obvious[0]) in current.effects and found.unexplained < FORMULA:
+    own = bool(obvious) and effect_of(obvious[0]) in current.effects
+    exact = own and EFFECTS[effect_of(obvious[0])].equation == "sensor"
+    if own and not exact and found.unexplained < FORMULA:
         ranked = [s for s in ranked if effect_of(s) in STARTS]
     elif fuller := richer(current, found):
         return fuller
