@@ -21,7 +21,7 @@ from .model import Model, ended
 from .periodic import Line, line_of
 from .refits import Refits
 from .screen import Screen, Signal, beyond_curves, screen, signals
-from .seen import ALARM, FORMULA, HARDER, MUCH_OF_IT, Seen, chance_of_nothing
+from .seen import ALARM, HARDER, MUCH_OF_IT, Seen, chance_of_nothing
 from .shortlist import (
     COMPARABLE,
     SHORTLIST,
@@ -39,6 +39,8 @@ MOST = 3
 # What the clearest signal would take away after one more effect, over what that effect takes away, at most; the larger
 # one after a richer form of what was there, or where that cannot have left it
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
+# A filter that swallows an effect shows no larger share of it, over what the model explains
+SWALLOWED = 1e-2
 # A fuller form of an effect is ruled out if it leaves so many squares more: two standard errors
 RULED_OUT = 4.0
 # The simplest effect by which a rotor sticks
@@ -98,13 +100,14 @@ class Namer:
 
     def _step(self, current: Model, found: Seen) -> Model | None:
         """A better model than the current one, with one effect more or another one, if there is one."""
-        swallowed = found.unexplained < FORMULA and self._by_plain_squares(current, found)
-        return (
-            swallowed
-            or self._better(current, found, self._tried(current, found))
-            or self._settling(current, found)
-            or self._by_plain_squares(current, found)
-        )
+        ways = [self._by_evidence, self._settling, self._by_plain_squares]
+        if found.unexplained < SWALLOWED:
+            ways = [self._by_plain_squares, self._by_evidence, self._settling]
+        return next(filter(None, (way(current, found) for way in ways)), None)
+
+    def _by_evidence(self, current: Model, found: Seen) -> Model | None:
+        """The best of the models that the evidence asks to be tried."""
+        return self._better(current, found, self._tried(current, found))
 
     def _better(self, current: Model, found: Seen, tried: Sequence[Model | None]) -> Model | None:
         """The best of some models in place of the current one, if it is better, without what it can do without."""

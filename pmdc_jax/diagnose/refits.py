@@ -28,6 +28,8 @@ from .screen import Screen, Signal
 
 # Share of the gain foretold by the evidence that a refit keeps, or else is tried in another way
 KEPT = 0.5
+# Another refit of a set takes the place of one that leaves more by this share
+BETTER = 1e-3
 # Steps of a refit that is one of several
 ROUGHLY = 8
 # ... and of which two have ended alike if their misfits differ by no more
@@ -47,7 +49,8 @@ class Refits:
         self.library, self.solved, self.report = library, solved, report
         self.comparison = comparison
         self.models: dict[frozenset[str], Model] = {frozenset(): base}
-        self.begun_from: set[tuple[frozenset[str], Model]] = set()  # sets, each with a model
+        # sets, each with a model from which it was fitted, or need not be
+        self.begun_from: set[tuple[frozenset[str], Model]] = set()
         self.begun: dict[str, Values] = {}  # where each effect was first begun to be fitted
 
     def with_signal(self, current: Model, signal: Signal, found: Screen) -> Model | None:
@@ -93,7 +96,7 @@ class Refits:
         before = self.models.get(key)
         if (key, current) not in self.begun_from:
             again = self._fitted(key, current, refit)
-            if again and (not before or _fitness(again) < _fitness(before)):
+            if again and (not before or _fitness(again) < (1 - BETTER) * _fitness(before)):
                 self.models[key] = again
         return self.models.get(key)
 
@@ -152,9 +155,11 @@ class Refits:
 
         smaller = self._once(rest, model, refit)
         assert smaller is not None
-        here = polish(given.problem, begun, steps=0).refined.fitness
-        if here < _fitness(smaller):
-            smaller = self._better_from(rest, model, refit) or smaller
+        if (frozenset(rest), model) not in self.begun_from:
+            here = polish(given.problem, begun, steps=0).refined.fitness
+            if here < (1 - BETTER) * _fitness(smaller):
+                smaller = self._better_from(rest, model, refit) or smaller
+            self.begun_from.add((frozenset(rest), model))
         return smaller
 
     def _once(
