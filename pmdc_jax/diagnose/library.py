@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..effects import EFFECTS, AbstractEffect
-from ..identify.noise import is_coarse
+from ..identify.noise import is_coarse, quantum, resolution
 from ..motor import Motor
 from ..recording import Recording
 from ..simulate import Tape, free_run
@@ -32,6 +32,8 @@ BEHIND_GEAR = np.arange(0.02, 0.25, 0.006)
 KNOTS_IN_PERIOD = 25
 # A motor moves above this share of its speed, and is slow for this share of the time that it moves
 MOVING, SLOWEST = 0.02, 0.05
+# Of the largest voltage, what a converter of seven bits and more resolves
+OF_CONVERTER = 0.01
 # Columns that are simulated side by side: the more, the more memory they take
 TOGETHER = 32
 
@@ -88,6 +90,8 @@ class Library:
         self.coarse = any(is_coarse(speed) for speed in _counted(base.given.training))
         # ... and of noise that the motor did not feel something is left
         self.wavers = bool(base.given.unfelt)
+        # by unit: what may be but a trace of what a sensor does
+        self.traces = _traces(base)
         self._whole: dict[int, np.ndarray] = {}
         self._base = base
 
@@ -117,6 +121,23 @@ class Library:
             change = np.asarray(seen) - np.asarray(self._base.polished.evaluation.seen)
             self._whole[key] = change.transpose(2, 1, 0)
         return self._whole[key]
+
+
+def _traces(base: Model) -> dict[str, float]:
+    """What is left of noise that was taken out of the recorded voltage, or what that was rounded to; and half of what a
+    current moves by."""
+    training = base.given.training
+    currents = [run.current for run in training if run.current is not None]
+    rounded = max((quantum(np.diff(current)) / 2 for current in currents), default=0.0)
+    unfelt = max(base.given.unfelt.values(), default=0.0)
+    volts = [run.voltage for run in training if run.voltage is not None]
+    return {"V": max(unfelt, _rounded_to(np.concatenate(volts or [np.zeros(1)]))), "A": rounded}
+
+
+def _rounded_to(volts: np.ndarray) -> float:
+    """What a converter rounds to or cuts off; zero for round numbers of a programme, which are far larger."""
+    step = resolution(volts)
+    return step if step < OF_CONVERTER * np.max(np.abs(volts)) else 0.0
 
 
 def _counted(runs: Sequence[Recording]) -> list[np.ndarray]:

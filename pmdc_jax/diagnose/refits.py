@@ -76,29 +76,25 @@ class Refits:
                 return self._best_of(effects, [start, *others], found.white)
             return self._refitted(effects, start, current, signal, found.white)
 
-        model = self._once(effects, current, refit)
-        if not self._keeps(model, current, signal, found.white):
-            model = self._better_from(effects, current, refit)
-        return model
+        model, key = self._once(effects, current, refit), frozenset(effects)
+        begun_here = (key, current) in self.begun_from
+        if model is None or begun_here or self._keeps(model, current, signal, found.white):
+            return model
+        return self._better_from(key, current, refit)
 
-    def _keeps(self, model: Model | None, current: Model, signal: Signal, white: Whitener) -> bool:
+    def _keeps(self, model: Model, current: Model, signal: Signal, white: Whitener) -> bool:
         """Whether a refit keeps enough of what the evidence against the current model promised."""
-        if model is None:
-            return False
         before, after = (self.comparison.left(m, white).squares for m in (current, model))
         return bool(before - after > KEPT * signal.gain)
 
     def _better_from(
-        self, effects: Sequence[str], current: Model, refit: Callable[[], Model | None]
-    ) -> Model | None:
+        self, key: frozenset[str], current: Model, refit: Callable[[], Model | None]
+    ) -> Model:
         """The better one of a model as it was fitted from another one and as it is fitted from the current one."""
-        key = frozenset(effects)
-        before = self.models.get(key)
-        if (key, current) not in self.begun_from:
-            again = self._fitted(key, current, refit)
-            if again and (not before or _fitness(again) < (1 - BETTER) * _fitness(before)):
-                self.models[key] = again
-        return self.models.get(key)
+        again = self._fitted(key, current, refit)
+        if again and _fitness(again) < (1 - BETTER) * _fitness(self.models[key]):
+            self.models[key] = again
+        return self.models[key]
 
     def in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
         """The current model with an effect in place of another: a fuller form of it, or one that has starts of its own,
@@ -155,11 +151,12 @@ class Refits:
 
         smaller = self._once(rest, model, refit)
         assert smaller is not None
-        if (frozenset(rest), model) not in self.begun_from:
+        key = frozenset(rest)
+        if (key, model) not in self.begun_from:
+            self.begun_from.add((key, model))
             here = polish(given.problem, begun, steps=0).refined.fitness
             if here < (1 - BETTER) * _fitness(smaller):
-                smaller = self._better_from(rest, model, refit) or smaller
-            self.begun_from.add((frozenset(rest), model))
+                return self._better_from(key, model, refit)
         return smaller
 
     def _once(

@@ -11,7 +11,6 @@ from scipy import special, stats
 
 from ..effects import EFFECTS
 from ..identify.colour import Series, Whitener, plain, whitener
-from ..identify.noise import quantum, resolution
 from ..simulate import LOCAL
 from .candidates import Candidate
 from .evidence import Block, Evidence, blocks_of, products
@@ -26,8 +25,6 @@ SLOWEST_WAVES = 1.5
 SLOWER = 4.0
 # So many standard errors are clearly more than nothing
 CLEARLY = 3.0
-# Of the largest voltage, what a converter of seven bits and more resolves
-OF_CONVERTER = 0.01
 # What a torque that drifts gains in white noise, over its degrees of freedom, at most: of some forty
 BY_CHANCE = 1.25
 
@@ -85,27 +82,10 @@ def screen(model: Model, library: Library) -> Screen:
         curves=curves,
         of_curve=blocks[len(library.candidates) :],
         dry=model.dry,
-        traces=_traces(model),
+        traces=library.traces,
     )
     white = whitener(_without_clearest(found, rows))
     return found._replace(evidence=_evidence(rows, white), white=white)
-
-
-def _traces(model: Model) -> dict[str, float]:
-    """What is left of noise that was taken out of the recorded voltage, or what that was rounded to; and half of what a
-    current moves by."""
-    training = model.given.training
-    currents = [run.current for run in training if run.current is not None]
-    rounded = max((quantum(np.diff(current)) / 2 for current in currents), default=0.0)
-    unfelt = max(model.given.unfelt.values(), default=0.0)
-    volts = [run.voltage for run in training if run.voltage is not None]
-    return {"V": max(unfelt, _rounded_to(np.concatenate(volts or [np.zeros(1)]))), "A": rounded}
-
-
-def _rounded_to(volts: np.ndarray) -> float:
-    """What a converter rounds to or cuts off; zero for round numbers of a programme, which are far larger."""
-    step = resolution(volts)
-    return step if step < OF_CONVERTER * np.max(np.abs(volts)) else 0.0
 
 
 def beyond_curves(found: Screen) -> float:
