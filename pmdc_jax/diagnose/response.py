@@ -70,7 +70,8 @@ def sensed(motor: Motor, tape: Tape, path: Path) -> Outputs:
     before, after = _states(motor, tape, path), _one_sample(motor, tape, path)
     _, drive = _of_blocks(motor, tape)
     value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T
-    seen = outputs(motor, drive, before, after, value, load)
+    rise = None if tape.rise is None else jnp.asarray(tape.rise).T
+    seen = outputs(motor, drive, before, after, value, load, rise)
     late = reported(motor, tape, seen.transpose(2, 0, 1))
     return late.transpose(2, 1, 0) - jnp.stack([path.current, path.speed], 1)
 
@@ -138,8 +139,9 @@ def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Drive]:
 def _one_sample(motor: Motor, tape: Tape, path: Path) -> State:
     along, drive = _of_blocks(motor, tape)
     value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T
+    rise = None if tape.rise is None else jnp.asarray(tape.rise).T
     state = _states(motor, tape, path)
-    return held_step(motor, along, drive, state, value, load, steps_in_sample(motor, tape))
+    return held_step(motor, along, drive, state, value, load, steps_in_sample(motor, tape), rise)
 
 
 def _states(motor: Motor, tape: Tape, path: Path) -> State:

@@ -257,6 +257,10 @@ def _messages(given: Prepared, solved: Solved, best: Refined, tied: bool) -> tup
         for run in given.runs
         if run.name in given.unfelt
     ]
+    if given.problem.tape.rise is not None:
+        messages.append(
+            "what drives the motor goes straight from sample to sample instead of being held: it is taken for that"
+        )
     if given.averaged:
         messages.append(
             f"the speed is a mean over {given.averaged}, as differences of an angle are: it is taken for that"

@@ -71,14 +71,14 @@ def _motion(
 ) -> tuple[Float[np.ndarray, " samples"] | None, Float[np.ndarray, " samples"], float]:
     """Angle in rad and speed in rad/s of the fitted linear motor, and the sample time in s.
 
-    No angle where a current drives it: that flows on between samples, so that the motion does not bend.
+    No angle where what drives flows on between samples, as a current does, so that the motion does not bend.
     """
     tape, mine = problem.tape, np.asarray(problem.tape.run) == run
     current, speed = np.moveaxis(np.asarray(fit.evaluation.seen)[mine], 1, 0)
     grid = np.asarray(tape.grid)[mine][0]
     drive = jax.tree.map(lambda share: np.asarray(share)[grid], tape.drive)
     step = float(np.asarray(tape.sample_time)[grid])
-    if drive.current:
+    if drive.current or tape.rise is not None:
         return None, speed.ravel(), step
     motor = problem.parameters(fit.refined.unknowns.coordinates)
     rates = np.zeros((5, 5))  # of current, speed, inputs and angle

@@ -23,6 +23,7 @@ from .problem import Evaluation, Problem, Unknowns
 from .refine import Refined, refine
 from .search import Found
 from .search import search as global_search
+from .straight import drives_straight, with_straight_drive
 from .turning import turned
 from .unfelt import without_unfelt
 
@@ -57,7 +58,15 @@ def solve(
 
     **Returns**: the problem as `searched` leaves it, and then whatever takes out such a thing, and the fit.
     """
-    given, solved = searched(given, search, seed, progress)
+    recorded = given
+    given, solved = _mended(*searched(given, search, seed, progress))
+    if drives_straight(given, solved.polished):
+        given, solved = _mended(*searched(with_straight_drive(recorded), search, seed, progress))
+    return given, solved
+
+
+def _mended(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
+    """The runs less what their sensors put into them, and the fit to them."""
     given, polished = without_unfelt(given, with_own(given.problem, solved.polished))
     given, polished = without_averaging(given, polished)
     given, polished = without_kinks(given, polished)
@@ -77,7 +86,8 @@ def searched(
     """
     began = time.perf_counter()
     report = progress or (lambda *args, **kwargs: None)
-    problem, searching = given.problem, Tape.from_recordings(given.training)
+    problem = given.problem
+    searching = Tape.from_recordings(given.training, straight=problem.tape.rise is not None)
     noise, sought = np.asarray(problem.noise), _where_effects_show(given)
 
     def look(seed: int) -> Found:

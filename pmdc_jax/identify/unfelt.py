@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import attrs
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -64,8 +65,10 @@ def without_unfelt(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
 def _driven(given: Prepared, drives: list[np.ndarray]) -> Problem:
     """The problem with the runs driven so."""
     runs = [attrs.evolve(r, **{r.drive: d}) for r, d in zip(given.runs, drives, strict=True)]
-    value = jnp.asarray(Tape.from_recordings(runs).value)
-    return replace(given.problem, tape=replace(given.problem.tape, value=value))
+    tape = given.problem.tape
+    driven = Tape.from_recordings(runs, straight=tape.rise is not None)
+    value, rise = jax.tree.map(jnp.asarray, (driven.value, driven.rise))
+    return replace(given.problem, tape=replace(tape, value=value, rise=rise))
 
 
 def _felt(problem: Problem, rough: Polished, smooth: Polished) -> list[float]:

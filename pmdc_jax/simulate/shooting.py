@@ -245,16 +245,17 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
         d_load = d_load.at[-1 - states].set(1.0)
     d_load = jnp.broadcast_to(d_load[:, None], (columns, len(starts)))
     value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T + offset
-
     turn = jnp.asarray(tape.turn).T
+    rise = None if tape.rise is None else jnp.asarray(tape.rise).T
 
     def advance(carry, k):
         state, d_state = carry.state
+        rises = None if rise is None else rise[k]
 
         def look_and_step(motor, along, state, load):
-            after = held_step(motor, along, drive, state, value[k], load, steps)
+            after = held_step(motor, along, drive, state, value[k], load, steps, rises)
             after = _turned(state, after, turn[k])
-            return after, outputs(motor, drive, state, after, value[k], load)
+            return after, outputs(motor, drive, state, after, value[k], load, rises)
 
         (state, seen), (d_state, d_seen) = jax.vmap(
             lambda *tangents: jax.jvp(look_and_step, (motor, along, state, load[k]), tangents),
@@ -346,17 +347,19 @@ def _stitch_tangents(
     return jax.lax.scan(follow, nothing, blocks)[1]
 
 
-def outputs(motor: Motor, drive: Drive, before: State, after: State, value, load):
+def outputs(motor: Motor, drive: Drive, before: State, after: State, value, load, rise=None):
     """Reported current and speed, and for a delay the slope of the latter at both ends of the sample."""
     current, speed = motor.sensors(before)
     if motor.speed_delay() is None:
         return jnp.stack([current, speed])
 
-    def slope(state):
-        rate = motor.derivative(state, value, load, drive)
+    half = 0.0 if rise is None else rise / 2
+
+    def slope(state, driven):
+        rate = motor.derivative(state, driven, load, drive)
         return jax.jvp(lambda x: motor.sensors(x)[1], (state,), (rate,))[1]
 
-    return jnp.stack([current, speed, slope(before), slope(after)])
+    return jnp.stack([current, speed, slope(before, value - half), slope(after, value + half)])
 
 
 def reported(motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]):

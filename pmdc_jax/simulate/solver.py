@@ -63,20 +63,24 @@ class Propagator(NamedTuple):
     inputs: Float[Array, "n 2 *#batch"]  # h phi_1(A h) B
     weights: Weights | None = None
     apart: Propagator | None = None  # the same while teeth do not touch
+    # h (phi_2 - phi_1 / 2)(A h): by what a drive acts that rises within a step, beyond what its mean does
+    ramp: Matrix | None = None
 
 
-def propagator(motor: Motor, step: Float[Array, ""], drive: Drive) -> Propagator:
+def propagator(
+    motor: Motor, step: Float[Array, ""], drive: Drive, straight: bool = False
+) -> Propagator:
     """Exact step of the linear part over `step` seconds, and the weights for what the effects add; of teeth that touch,
-    and beside it of such that do not."""
+    and beside it of such that do not. `straight` asks for what a drive needs that is not held."""
     A, B = _linear_part(motor, drive)
-    along = _by_linear_part(motor, step, A, B)
+    along = _by_linear_part(motor, step, A, B, straight)
     teeth = motor.toothed
     if teeth is None:
         return along
     assert teeth.twists is not None
     loose = motor.with_effects(e.loose() for e in motor.effects)
     A_apart, _ = _linear_part(loose, drive)
-    apart = _by_linear_part(motor, step, A_apart, B)
+    apart = _by_linear_part(motor, step, A_apart, B, straight)
     push = (A - A_apart)[:, 2 + _linear_states(motor).index(teeth.twists)]
     apart = _with_knocks(apart, knocks_of(A, push, step))
     return _with_knocks(along, knocks_of(A_apart, push, step))._replace(apart=apart)
@@ -88,7 +92,11 @@ def _with_knocks(along: Propagator, knocks: Float[Array, "powers n *#batch"]) ->
 
 
 def _by_linear_part(
-    motor: Motor, step: Float[Array, ""], A: Matrix, B: Float[Array, "n 2 *#batch"]
+    motor: Motor,
+    step: Float[Array, ""],
+    A: Matrix,
+    B: Float[Array, "n 2 *#batch"],
+    straight: bool,
 ) -> Propagator:
     """The propagator of a motor whose linear part is A and B.
 
@@ -96,11 +104,13 @@ def _by_linear_part(
     doi:10.1006/jcph.2002.6995.
     """
     if motor.affine:
-        _, (phi0, phi1) = phi_functions(A * step, 1)
+        _, (phi0, phi1, *phi2) = phi_functions(A * step, 2 if straight else 1)
         inputs = step * product(phi1, B)
-        if not motor.effects:
-            return Propagator(phi0, inputs)
-        return Propagator(phi0, inputs, Weights(step * phi1, A, step * jnp.ones_like(motor.R)))
+        ramp = step * (phi2[0] - phi1 / 2) if straight else None
+        weights = None
+        if motor.effects:
+            weights = Weights(step * phi1, A, step * jnp.ones_like(motor.R))
+        return Propagator(phi0, inputs, weights, ramp=ramp)
     (half0, half1, *_), (phi0, phi1, phi2, phi3) = phi_functions(A * step, 3)
     push = step / 2 * half1
     stages = Stages(
@@ -161,24 +171,52 @@ def held_step(
     value: Scalars,
     load: Scalars,
     steps: int | Int[Array, ""] = 1,
+    rise: Scalars | None = None,
 ) -> State:
-    """The state one held sample later, in `steps` equal steps, for one of which `along` is made.
+    """The state one sample later, in `steps` equal steps, for one of which `along` is made.
+
+    What drives is held at `value`, or goes straight through it at the middle of the sample and rises by `rise` in all.
 
     Motors whose effects leave them linear: exact. Otherwise the linear part is exact and the rest goes by the
     four stages of ETDRK4, in which dry elements act in the direction the step began with, and teeth touch or not as
     they then did. A step in which a held state crosses zero, or teeth touch or part, is then mended (`switches`), so
     that friction sticks at exactly zero and a gear knocks without any smoothing.
     """
-    whole, inputs, weights, _ = along
-    if weights is None:
+    if along.weights is None:
         # the state last: two fused multiply-adds, where a sum of sums would take an addition more
-        current, speed = _times(whole, (state.current, state.speed), _times(inputs, (value, load)))
+        driven = _times(along.inputs, (value, load))
+        if rise is not None:
+            driven = _add(driven, _bend(motor, along, drive, state, value, load, rise))
+        current, speed = _times(along.whole, (state.current, state.speed), driven)
         return State(current, speed, state.extra)
     if isinstance(steps, int) and steps == 1:
-        return _step(motor, along, drive, state, value, load)
-    return jax.lax.fori_loop(
-        0, steps, lambda _, now: _step(motor, along, drive, now, value, load), state
+        return _step(motor, along, drive, state, value, load, rise)
+
+    def step(k, now: State) -> State:
+        if rise is None:
+            return _step(motor, along, drive, now, value, load)
+        middle = value + ((k + 0.5) / steps - 0.5) * rise
+        return _step(motor, along, drive, now, middle, load, rise / steps)
+
+    return jax.lax.fori_loop(0, steps, step, state)
+
+
+def _bend(
+    motor: Motor,
+    along: Propagator,
+    drive: Drive,
+    state: State,
+    value: Scalars,
+    load: Scalars,
+    rise: Scalars,
+) -> Vector:
+    """What a drive that rises on a straight line does in a step, beyond what its mean does."""
+    assert along.ramp is not None, "a propagator for held drives"
+    low, high = (
+        _vector(motor, motor.derivative(state, value + half, load, drive))
+        for half in (-rise / 2, rise / 2)
     )
+    return _times(along.ramp, tuple(b - a for a, b in zip(low, high, strict=True)))
 
 
 def _step(
@@ -188,6 +226,7 @@ def _step(
     state: State,
     value: Scalars,
     load: Scalars,
+    rise: Scalars | None = None,
 ) -> State:
     teeth = motor.toothed
     if teeth is not None:
@@ -198,7 +237,7 @@ def _step(
     weights = along.weights
     assert weights is not None
     motor = motor.with_effects(e.over_step(state, weights.step) for e in motor.effects)
-    rate, after = _unswitched(motor, along.whole, weights, drive, state, value, load)
+    rate, after = _unswitched(motor, along, weights, drive, state, value, load, rise)
     x, begun, moved = _vector(motor, state), _vector(motor, rate), _vector(motor, after)
     slow = _slow(motor, after)
     if teeth is not None and weights.knocks is not None:
@@ -223,39 +262,43 @@ def _step(
 
 def _unswitched(
     motor: Motor,
-    whole: Matrix,
+    along: Propagator,
     weights: Weights,
     drive: Drive,
     state: State,
     value: Scalars,
     load: Scalars,
+    rise: Scalars | None,
 ) -> tuple[State, State]:
     """The rate at which a step begins, and how it ends if dry elements and teeth go on as they began."""
     h, linear, always = weights.step, weights.linear, jnp.all(weights.step > 0)
     moving = (jnp.sign(state.current), jnp.sign(state.speed))
     x, slow = _vector(motor, state), _slow(motor, state)
 
-    def rates(x, slow):
-        rate = motor.derivative(_state(motor, x, slow), value, load, drive, moving)
+    def rates(x, slow, when):
+        driven = value if rise is None else value + (when - 0.5) * rise
+        rate = motor.derivative(_state(motor, x, slow), driven, load, drive, moving)
         return _vector(motor, rate), _slow(motor, rate)
 
     if weights.stages is None:
-        begun, s0 = once(rates(x, slow), always)
-        after = _state(motor, _add(x, _times(weights.push, begun)), _shifted(slow, h, s0))
-        return _state(motor, begun, s0), after
+        begun, s0 = once(rates(x, slow, 0.5), always)
+        moved = _add(x, _times(weights.push, begun))
+        if rise is not None:
+            moved = _add(moved, _bend(motor, along, drive, state, value, load, rise))
+        return _state(motor, begun, s0), _state(motor, moved, _shifted(slow, h, s0))
 
-    def rest(x, slow):
+    def rest(x, slow, when):
         """What the linear part leaves over, and the rates of the states that are not in it."""
-        rate, slow = rates(x, slow)
+        rate, slow = rates(x, slow, when)
         return once((_add(rate, _times(-linear, x)), slow), always)
 
     half, push, turn, first, middle, last = weights.stages
-    moved, halfway = _times(whole, x), _times(half, x)
-    n0, s0 = rest(x, slow)
-    n1, s1 = rest(_add(halfway, _times(push, n0)), _shifted(slow, h / 2, s0))
-    n2, s2 = rest(_add(halfway, _times(push, n1)), _shifted(slow, h / 2, s1))
+    moved, halfway = _times(along.whole, x), _times(half, x)
+    n0, s0 = rest(x, slow, 0.0)
+    n1, s1 = rest(_add(halfway, _times(push, n0)), _shifted(slow, h / 2, s0), 0.5)
+    n2, s2 = rest(_add(halfway, _times(push, n1)), _shifted(slow, h / 2, s1), 0.5)
     end = _add(moved, _times(2 * push, n2), _times(turn, n0))
-    n3, s3 = rest(end, _shifted(slow, h, s2))
+    n3, s3 = rest(end, _shifted(slow, h, s2), 1.0)
     moved = _add(moved, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
     slow = _shifted(slow, h / 6, {k: s0[k] + 2 * (s1[k] + s2[k]) + s3[k] for k in slow})
     return _state(motor, _add(n0, _times(linear, x)), s0), _state(motor, moved, slow)
@@ -320,6 +363,7 @@ def along_grids(motor: Motor, tape: Tape) -> Propagator:
             motor,
             tape.sample_time[g] / steps,
             Drive(*(jnp.asarray(share)[g] for share in tape.drive)),
+            tape.rise is not None,
         )
         for g in range(tape.sample_time.shape[0])
     ]

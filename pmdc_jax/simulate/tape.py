@@ -27,10 +27,11 @@ class Tape(eqx.Module):
     """Runs laid end to end; a run begins with a new block, and its last block is filled up with weight 0.
 
     A sample time, a drive (voltage, current or torque) and a rotor that is free or held make a *grid*; blocks of
-    one grid share the exact step. The drive and the load of sample k hold until sample k + 1.
+    one grid share the exact step. The drive and the load of sample k hold until sample k + 1; a drive with a `rise`
+    goes on straight until then.
     """
 
-    value: Float[Samples, "blocks samples"]  # what drives: V, A or N m
+    value: Float[Samples, "blocks samples"]  # mean over each sample of what drives: V, A or N m
     load: Float[Samples, "blocks samples"]  # N m, zero where unknown
     measured: Float[Samples, "blocks 2 samples"]  # current A, speed rad/s; zero where missing
     weight: Float[Samples, "blocks 2 samples"]  # 1 where measured, else 0
@@ -47,19 +48,26 @@ class Tape(eqx.Module):
     turn: Float[Samples, "blocks samples"]
     # longest sample time, rounded up to few values: it decides how a sample is divided
     longest: float = eqx.field(static=True)
+    # by how much what drives rises over each sample; None where all that drives is held
+    rise: Float[Samples, "blocks samples"] | None = None
 
     @classmethod
     def from_recordings(
-        cls, recordings: Sequence[Recording], unloaded: bool = False, follow: bool = False
+        cls,
+        recordings: Sequence[Recording],
+        unloaded: bool = False,
+        follow: bool = False,
+        straight: bool = False,
     ) -> Tape:
         """Lay recordings end to end.
 
         **Arguments**: `recordings`, each with a uniform sample time (see `pmdc_jax.simulate.uniform`);
         `unloaded` declares the load of runs without a load column to be zero instead of unknown; `follow` makes
         the rotor turn as measured where the speed was: torques that depend on its angle keep step with
-        the real ones, which a free run would lose after a few turns.
+        the real ones, which a free run would lose after a few turns; `straight`, whether voltages and torques go on
+        a straight line from sample to sample instead of being held.
         """
-        runs = [_Run(recording) for recording in recordings]
+        runs = [_Run(recording, straight) for recording in recordings]
         grids = list(dict.fromkeys(run.grid for run in runs))
         # few distinct lengths, so that few shapes are ever compiled
         blocks = _round_up(sum(run.blocks for run in runs))
@@ -69,6 +77,7 @@ class Tape(eqx.Module):
             "measured": np.zeros((blocks, 2, BLOCK)),
             "weight": np.zeros((blocks, 2, BLOCK)),
             "turn": np.full((blocks, BLOCK), np.nan),
+            "rise": np.zeros((blocks, BLOCK)) if straight else None,
             "run": np.full(blocks, len(runs) - 1),
             "begins": np.zeros(blocks, bool),
             "grid": np.full(blocks, grids.index(runs[-1].grid)),
@@ -82,6 +91,8 @@ class Tape(eqx.Module):
                 missing = np.isnan(samples)
                 tape["measured"][part, channel] = run.fill(np.where(missing, 0.0, samples))
                 tape["weight"][part, channel] = run.fill(np.where(missing, 0.0, 1.0))
+            if straight:
+                tape["rise"][part] = run.fill(run.rise)
             if follow:
                 tape["turn"][part] = run.fill(run.turn(), hold=True)
             tape["run"][part], tape["grid"][part] = index, grids.index(run.grid)
@@ -121,7 +132,7 @@ class Tape(eqx.Module):
 class _Run:
     """One recording as the tape needs it: what drives it, what was measured, how it starts."""
 
-    def __init__(self, recording: Recording):
+    def __init__(self, recording: Recording, straight: bool):
         self.length = len(recording.time)
         self.blocks = -(-self.length // BLOCK)
         missing = np.full(self.length, np.nan)
@@ -130,16 +141,18 @@ class _Run:
         if recording.speed is not None:
             self.speed = recording.speed
         if recording.torque is not None:
-            drive, self.value = "torque", recording.torque
+            drive, value = "torque", recording.torque
         elif recording.voltage is not None:
-            drive, self.value = "voltage", recording.voltage
+            drive, value = "voltage", recording.voltage
             if recording.current is not None:
                 self.current = recording.current
         else:
-            # the measured current flows on between its samples: its mean over each interval drives
-            drive, i = "current", recording.current
-            assert i is not None, "Recording guarantees something that drives"
-            self.value = np.append((i[:-1] + i[1:]) / 2, i[-1])
+            drive, value = "current", recording.current
+            assert value is not None, "Recording guarantees something that drives"
+        # a measured current flows on between its samples, whatever a voltage does
+        goes_on = straight or drive == "current"
+        self.rise = np.diff(value, append=value[-1]) if goes_on else np.zeros(self.length)
+        self.value = value + self.rise / 2
         # rounded: two runs of one clock must share a grid, whatever the last bits of their time stamps
         self.grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held)
         self.initial = (_first(self.current), _first(self.speed))
