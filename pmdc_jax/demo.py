@@ -40,14 +40,13 @@ def demo(
     from .control.tuning import tune
     from .diagnose import diagnose
     from .motor_file import load_motor, load_uncertainty, save_motor
-    from .recording import read_recording
     from .report.diagnosis import write_diagnosis
     from .report.json import diagnosis_json, write_json
     from .report.tuning import write_tuning_report
 
     report, found, motor, page, controller = (folder / name for name in WRITTEN)
     training, held_out = (
-        [read_recording(SAMPLE / f"{name}.csv") for name in names] for names in (TRAINING, HOLDOUT)
+        [SAMPLE / f"{name}.csv" for name in names] for names in (TRAINING, HOLDOUT)
     )
     diagnosis = diagnose(training, holdout=held_out, seed=seed, progress=progress)
     save_motor(motor, diagnosis.final.motor, diagnosis.final)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -155,6 +155,20 @@ def read_recording(
         ignored=tuple(header for header in table.headers if header and header not in used),
         notes=tuple(_notes(path.stem, table.headers, found, empty)),
     )
+
+
+# one run or several, each as it is or the file that holds it
+Run = Recording | str | os.PathLike[str]
+Runs = Run | Sequence[Run]
+
+
+def recordings_of(runs: Runs) -> list[Recording]:
+    """Runs as they are, and files read.
+
+    **Raises**: `InputError` where a file cannot be read.
+    """
+    several = [runs] if isinstance(runs, Recording | str | os.PathLike) else runs
+    return [run if isinstance(run, Recording) else read_recording(run) for run in several]
 
 
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:

@@ -161,3 +161,12 @@ def test_a_spline_is_mended_where_steps_bend_the_motion(known_by):
     assert found.fit["steps"].speed_rmse < 0.05
     for name in ("R", "L", "Kb", "J"):
         assert found.parameters[name].value == pytest.approx(plant[name], rel=2e-3)
+
+
+def test_counts_are_known_as_such_where_a_speed_leaps():
+    """From sample to sample by dozens of counts, hardly ever by one."""
+    rng = np.random.default_rng(8)
+    step = 2 * np.pi / 4096 / 0.03
+    speed = step * np.round(rng.uniform(-800, 800, 600) / step)
+    assert quantum(np.diff(np.unique(speed))) == pytest.approx(step, rel=1e-6)
+    assert quantum(np.diff(np.unique(speed + 0.3 * step * rng.standard_normal(600)))) == 0

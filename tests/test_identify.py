@@ -166,6 +166,22 @@ def test_hold_outs_do_not_touch_the_fit(runs):
 # -------------------------------------------------------------- what the recordings cannot tell
 
 
+def test_a_bound_along_an_unseen_direction_is_none(x64):
+    """A search ends anywhere along it, and so where Kt meets its bound: J and f are no surer for that."""
+    given, solved = solve(prepare(unloaded(5), [], unloaded=True), "cma_es", seed=0)
+    names, best = given.problem.parameters.names, solved.polished.refined
+    at = np.array(best.unknowns.coordinates)
+    down = given.problem.parameters.lower[names.index("Kt")] - at[names.index("Kt")]
+    at[[names.index(name) for name in ("Kt", "J", "f")]] += down
+    held = Refined(best.unknowns._replace(coordinates=jnp.asarray(at)), best.fitness, (3,), True)
+    assert names[3] == "Kt"
+    polished = polish(given.problem, held)
+    assert polished.refined.at_bound == (3,)
+    found = judge(given, solved._replace(polished=polished))
+    assert {found.parameters[n].status for n in ("Kt", "J", "f")} == {"not_identifiable"}
+    assert found.parameters["Kt"].value == pytest.approx(found.parameters["Kb"].value, rel=1e-6)
+
+
 @pytest.mark.parametrize("declared", [True, False], ids=["declared", "unknown constant load"])
 def test_without_a_known_load_only_ratios_are_claimed(declared):
     result = identify(unloaded(5), unloaded=declared)

@@ -18,7 +18,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
 from pmdc_jax.columns import understand
-from pmdc_jax.recording import Recording, read_recording, write_recording
+from pmdc_jax.recording import Recording, read_recording, recordings_of, write_recording
 
 T = np.arange(12) * 0.01
 NUMBER = {"allow_nan": False, "allow_infinity": False, "width": 64}
@@ -339,3 +339,13 @@ def test_importing_is_light():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+def test_a_path_stands_for_what_it_holds(tmp_path):
+    run = Recording("step", 0.01 * np.arange(20), np.ones(20), speed=np.arange(20.0))
+    path = tmp_path / "step.csv"
+    write_recording(run, path)
+    for kind in (run, path, str(path)):
+        for found in (*recordings_of(kind), *recordings_of([kind])):
+            assert found.name == "step"
+            np.testing.assert_array_equal(found.speed, run.speed)

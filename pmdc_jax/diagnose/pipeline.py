@@ -17,7 +17,7 @@ from ..identify.judge import judge
 from ..identify.prepare import prepare
 from ..identify.solve import Solved, solve
 from ..precision import double_precision
-from ..recording import Recording
+from ..recording import Runs
 from .diagnosis import (
     Detectable,
     Diagnosis,
@@ -49,8 +49,8 @@ NOTHING = 1e-2
 
 @double_precision
 def diagnose(
-    recordings: Sequence[Recording],
-    holdout: Sequence[Recording] = (),
+    recordings: Runs,
+    holdout: Runs = (),
     *,
     tie: Sequence[tuple[str, str]] = (),
     known: Mapping[str, float] | None = None,

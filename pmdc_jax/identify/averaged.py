@@ -75,6 +75,17 @@ LAST = Sensed("the last sample", _over_last, _last_undone)
 LATE = Sensed("", lambda x: np.append(x[:1], x[:-1]), lambda x: np.append(x[1:], x[-1:]))
 
 
+def of_averaged(given: Prepared) -> Callable[[Samples], Samples]:
+    """What the sensors of runs made of their speeds, as far as it was undone."""
+    return {TWO.over: TWO.of, LAST.over: LAST.of}.get(given.averaged, lambda speed: speed)
+
+
+def seems_averaged(given: Prepared) -> bool:
+    """Whether the speeds are counts of an encoder whose noise is that of means."""
+    counts = _in_counts(_speeds(given))
+    return bool(counts) and counted_over(counts)[0] is not None
+
+
 def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     """The runs with the speed itself where a mean was recorded, and the fit to them.
 
@@ -169,7 +180,8 @@ def _in_counts(speeds: Sequence[tuple[np.ndarray, float]]) -> list[np.ndarray]:
     """The speeds in counts a sample, of an encoder with as many lines; none, if they are no such counts."""
     counts = []
     for speed, sample_time in speeds:
-        step = quantum(np.diff(speed))
+        # from sample to sample a speed may leap by many counts, its values lie closer
+        step = quantum(np.diff(speed)) or quantum(np.diff(np.unique(speed)))
         lines = 2 * np.pi / step / sample_time if step else np.inf
         if lines > LINES or abs(lines - round(lines)) > WHOLE:
             return []

@@ -12,7 +12,7 @@ from ..motor import PARAMETERS, Motor
 from ..recording import Recording
 from ..simulate import Tape
 from ..threads import side_by_side
-from .identifiability import explain
+from .identifiability import SHARE, explain
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import white_noise
 from .parameters import Parameters, unit_of
@@ -35,8 +35,8 @@ TO_SHOW = 0.3
 
 def judge(given: Prepared, solved: Solved) -> Identification:
     """What a fit tells of every parameter and of every run."""
-    polished = solved.polished
     problem, training = given.problem, given.training
+    polished = _let_go(problem, solved.polished, len(training))
     parameters = problem.parameters
     info = _information(problem, polished, len(training))
     chosen = _tidy(problem, polished, info)
@@ -87,6 +87,18 @@ def _information(problem: Problem, polished: Polished, runs: int) -> Information
     evaluation, count = polished.evaluation, len(problem.parameters.names)
     free = np.array([k not in polished.refined.at_bound for k in range(count)])
     return information(evaluation.residuals, evaluation.jacobian, problem.tape.run, free, runs)
+
+
+def _let_go(problem: Problem, polished: Polished, runs: int) -> Polished:
+    """The fit with no coordinate held at its bound that lies there by chance, along an unseen direction of several."""
+
+    def released(held: Sequence[int]) -> Polished:
+        return polished._replace(refined=polished.refined._replace(at_bound=tuple(held)))
+
+    bound = polished.refined.at_bound
+    unseen = _information(problem, released(()), runs).unseen if bound else ()
+    several = [d for d in unseen if np.max(np.abs(d)) <= ALONE]
+    return released([k for k in bound if all(abs(d[k]) <= SHARE for d in several)])
 
 
 def _vanished(parameters: Parameters, info: Information) -> list[int]:
@@ -188,7 +200,7 @@ def _estimates(
 def _status(k: int, best: Refined, info: Information) -> Status:
     if k in best.at_bound:
         return "at_bound"
-    unseen = any(abs(direction[k]) > 0.05 for direction in info.unseen)
+    unseen = any(abs(direction[k]) > SHARE for direction in info.unseen)
     if unseen or np.sqrt(info.covariance[k, k]) > FLAT:
         return "not_identifiable"
     return "identified"
@@ -257,10 +269,8 @@ def _messages(given: Prepared, solved: Solved, best: Refined, tied: bool) -> tup
         for run in given.runs
         if run.name in given.unfelt
     ]
-    if given.problem.tape.rise is not None:
-        messages.append(
-            "what drives the motor goes straight from sample to sample instead of being held: it is taken for that"
-        )
+    if given.timing:
+        messages.append(f"the voltage {given.timing}: it is taken for that")
     if given.averaged:
         messages.append(
             f"the speed is a mean over {given.averaged}, as differences of an angle are: it is taken for that"

@@ -62,6 +62,9 @@ def quantum(steps: Float[np.ndarray, " steps"]) -> float:
     sizes = sizes[sizes > ROUNDING * np.max(sizes, initial=0.0)]
     if not len(sizes):
         return 0.0
-    smallest = float(np.quantile(sizes, 0.01))
-    off = np.abs(sizes / smallest - np.round(sizes / smallest))
-    return smallest if np.mean(off < 0.02) > 0.95 else 0.0
+    # the smallest one may be none, the next ones may be two or more
+    for smallest in (np.quantile(sizes, 0.01), np.min(sizes)):
+        off = np.abs(sizes / smallest - np.round(sizes / smallest))
+        if np.mean(off < 0.02) > 0.95:
+            return float(smallest)
+    return 0.0

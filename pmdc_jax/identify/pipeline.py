@@ -10,7 +10,7 @@ import attrs
 
 from ..compiled import make_room
 from ..precision import double_precision
-from ..recording import Recording
+from ..recording import Runs
 from .colour import whitener
 from .identification import Identification
 from .judge import judge
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 @double_precision
 def identify(
-    recordings: Sequence[Recording],
-    holdout: Sequence[Recording] = (),
+    recordings: Runs,
+    holdout: Runs = (),
     *,
     tie: Sequence[tuple[str, str]] = (),
     known: Mapping[str, float] | None = None,
@@ -38,8 +38,8 @@ def identify(
 ) -> Identification:
     """Identify a motor from recordings of it.
 
-    **Arguments**: `recordings` to fit, at least one; `holdout`, runs kept out of the fit; `tie`, pairs such as
-    ("Kt", "Kb") of parameters that are one; `known`, values in SI that are not sought; `unloaded` declares that
+    **Arguments**: `recordings` to fit, or their files, at least one; `holdout`, runs kept out of the fit; `tie`, pairs
+    such as ("Kt", "Kb") of parameters that are one; `known`, values in SI that are not sought; `unloaded` declares that
     runs without a load column have no load (otherwise a constant unknown one); `effects`, names of effects
     to identify too; `search`, a key of `pmdc_jax.identify.search.METHODS`; `seed` of the search; `progress`,
     called now and then with what is being done and how good the fit is.

@@ -14,7 +14,7 @@ from ..check import check
 from ..effects import AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS
-from ..recording import Finding, Recording
+from ..recording import Finding, Recording, Runs, recordings_of
 from ..simulate import Tape, uniform
 from .bounds import search_bounds
 from .identification import Role
@@ -39,6 +39,8 @@ class Prepared(NamedTuple):
     differentiated: tuple[bool, ...] = ()
     # over which samples the speeds were means, and are undone; empty, if they were none
     averaged: str = ""
+    # when the voltages act, if not from their sample to the next
+    timing: str = ""
 
     @property
     def training(self) -> list[Recording]:
@@ -68,8 +70,8 @@ class Prepared(NamedTuple):
 
 
 def prepare(
-    recordings: Sequence[Recording],
-    holdout: Sequence[Recording],
+    recordings: Runs,
+    holdout: Runs,
     *,
     tie: Sequence[tuple[str, str]] = (),
     known: Mapping[str, float] | None = None,
@@ -77,6 +79,7 @@ def prepare(
     effects: Sequence[type[AbstractEffect]] = (),
 ) -> Prepared:
     """Check the recordings and lay them out; raises `InputError` where they cannot give an answer."""
+    recordings, holdout = recordings_of(recordings), recordings_of(holdout)
     _refuse(recordings, holdout, tie, known)
     findings = check([*recordings, *holdout])
     _refuse_errors(findings)

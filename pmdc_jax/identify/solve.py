@@ -23,7 +23,7 @@ from .problem import Evaluation, Problem, Unknowns
 from .refine import Refined, refine
 from .search import Found
 from .search import search as global_search
-from .straight import drives_straight, with_straight_drive
+from .timing import timing_of, with_timing
 from .turning import turned
 from .unfelt import without_unfelt
 
@@ -60,8 +60,9 @@ def solve(
     """
     recorded = given
     given, solved = _mended(*searched(given, search, seed, progress))
-    if drives_straight(given, solved.polished):
-        given, solved = _mended(*searched(with_straight_drive(recorded), search, seed, progress))
+    if timing := timing_of(recorded, given, solved.polished):
+        recorded = with_timing(recorded, timing)
+        given, solved = _mended(*searched(recorded, search, seed, progress))
     return given, solved
 
 

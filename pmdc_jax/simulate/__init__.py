@@ -9,7 +9,7 @@ import numpy as np
 
 from ..motor import Motor
 from ..precision import double_precision
-from ..recording import Recording
+from ..recording import Recording, Run, recordings_of
 from .population import squared_errors
 from .reference import reference_solution
 from .shooting import LOCAL, free_run, sensitivities
@@ -29,10 +29,10 @@ __all__ = [
 
 
 @double_precision
-def simulate(motor: Motor, recording: Recording) -> Recording:
+def simulate(motor: Motor, recording: Run) -> Recording:
     """Simulate a motor on what drives a recording, from the recorded start.
 
-    **Arguments**: `motor`, of scalars; `recording`, whose voltage (or current, or torque), load and time
+    **Arguments**: `motor`, of scalars; `recording` or its file, whose voltage (or current, or torque), load and time
     stamps are used; its first current and speed, where recorded, are the initial state, otherwise the motor
     starts at rest. An unknown load is taken as zero, and a rotor that stood still throughout as held.
 
@@ -40,6 +40,7 @@ def simulate(motor: Motor, recording: Recording) -> Recording:
     is not driven by voltage has no simulated current.
     """
     motor = jax.tree.map(jnp.asarray, motor)
+    (recording,) = recordings_of(recording)
     even = uniform(recording)
     tape = Tape.from_recordings([even], unloaded=True)
     outputs = free_run(motor, tape, jnp.asarray(tape.initial), jnp.zeros(1))

@@ -1,7 +1,8 @@
-"""A drive that goes on straight between its samples: simulated as scipy does, and told from a held one."""
+"""Voltages that are not held from their samples on: simulated as scipy does, and told from those that are."""
 
 from __future__ import annotations
 
+import attrs
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from pmdc_jax.simulate import LOCAL, Tape, free_run, sensitivities
 # sampled more slowly than its current settles: 2 ms beside L / R of 1.25 ms
 SMALL = {"R": 0.8, "L": 1e-3, "Kb": 0.04, "Kt": 0.039, "J": 4e-5, "f": 3e-5}
 STEP = 2e-3
-STRAIGHT = "straight"
 
 
 def driven(seed: int, samples: int, load: float = 0.0) -> Recording:
@@ -46,11 +46,17 @@ def largest_error(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def by_scipy(run: Recording, straight: bool = True) -> np.ndarray:
-    """Current and speed of the linear motor: `lsim` goes straight between the samples, `dlsim` holds them."""
+    """Current, speed and angle of the linear motor: `lsim` goes straight between the samples, `dlsim` holds them."""
     m = SMALL
-    A = np.array([[-m["R"] / m["L"], -m["Kb"] / m["L"]], [m["Kt"] / m["J"], -m["f"] / m["J"]]])
-    B = np.diag([1 / m["L"], -1 / m["J"]])
-    system, inputs = (A, B, np.eye(2), np.zeros((2, 2))), np.stack([run.voltage, run.load], 1)
+    A = np.array(
+        [
+            [-m["R"] / m["L"], -m["Kb"] / m["L"], 0],
+            [m["Kt"] / m["J"], -m["f"] / m["J"], 0],
+            [0, 1, 0],
+        ]
+    )
+    B = np.array([[1 / m["L"], 0], [0, -1 / m["J"]], [0, 0]])
+    system, inputs = (A, B, np.eye(3), np.zeros((3, 2))), np.stack([run.voltage, run.load], 1)
     if straight:
         return signal.lsim(system, inputs, run.time)[1]
     return signal.dlsim(signal.cont2discrete(system, STEP), inputs)[1]
@@ -58,7 +64,7 @@ def by_scipy(run: Recording, straight: bool = True) -> np.ndarray:
 
 def test_the_linear_motor_is_exact(x64):
     run = driven(1, 500, load=0.02)
-    assert largest_error(seen(run, motor_with()), by_scipy(run)) < 1e-10
+    assert largest_error(seen(run, motor_with()), by_scipy(run)[:, :2]) < 1e-10
 
 
 def heated(i, w, v, rise):
@@ -124,23 +130,45 @@ def test_sensitivities_are_central_differences(x64, names):
         assert error < 1e-4, (parameters.names[column], error)
 
 
-def logged(straight: bool) -> list[Recording]:
-    """Three runs with noise, one of them loaded, of an amplifier that follows the voltage or holds it."""
+# how runs are driven and logged, and what is said of it
+LOGS = {
+    "held": None,
+    "straight": "straight",
+    "recorded late": "recorded a sample late",
+    "acts late": "acts a sample later",
+    "straight, counted": "straight",
+}
+LINES = 2048
+
+
+def logged(how: str) -> list[Recording]:
+    """Three runs with noise, one of them under a load that comes and goes."""
     rng, runs = np.random.default_rng(11), []
     for seed, load in ((21, 0.0), (22, 0.05), (23, 0.0)):
-        run = driven(seed, 2500, load)
-        current, speed = by_scipy(run, straight).T + np.array(
-            [[0.02], [0.2]]
-        ) * rng.standard_normal((2, len(run)))
-        runs.append(Recording(run.name, run.time, run.voltage, current, speed=speed, load=run.load))
+        run = driven(seed, 2501)
+        run = attrs.evolve(run, load=load * (np.sin(8 * run.time) > 0))
+        outputs = by_scipy(run, "straight" in how)[:, :2]
+        outputs += np.array([0.02, 0.2]) * rng.standard_normal(outputs.shape)
+        v, measured = run.voltage[:-1], outputs[:-1]
+        load = run.load[:-1]
+        if how == "recorded late":  # with what came of it, and so is the load
+            measured = outputs[1:]
+        if "counted" in how:  # of an encoder, over the last sample
+            angle = np.round(by_scipy(run)[:, 2] * LINES / (2 * np.pi)) * 2 * np.pi / LINES
+            measured[:, 1] = np.diff(angle, prepend=angle[0])[:-1] / STEP
+        if how == "acts late":
+            v, measured, load = run.voltage[1:], outputs[:-1], run.load[:-1]
+        runs.append(Recording(run.name, run.time[:-1], v, *measured.T, load=load))
     return runs
 
 
-@pytest.mark.parametrize("straight", [True, False])
-def test_a_drive_is_taken_for_what_it_was(straight):
-    """Held, the voltages of the first runs would make L 60 % too small and R 5 %."""
-    found = identify(logged(straight))
-    assert any(STRAIGHT in message for message in found.messages) == straight
+@pytest.mark.parametrize("how", LOGS)
+def test_a_voltage_acts_when_it_did(how):
+    """Held from their rows on, these voltages would make L wrong by up to 60 % and R by 5 %."""
+    found = identify(logged(how))
+    said = [message for message in found.messages if message.startswith("the voltage")]
+    assert len(said) == (LOGS[how] is not None)
+    assert all(LOGS[how] in message for message in said)
     for name in PARAMETERS:
         estimate = found.parameters[name]
         assert abs(estimate.value - SMALL[name]) < 3 * estimate.stderr, name

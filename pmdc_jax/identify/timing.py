@@ -1,0 +1,138 @@
+"""When what drives the motor acts: from its sample to the next, as recordings are taken, or otherwise.
+
+An amplifier that follows a signal, and most simulations that others make (`lsim`, interpolated tables), go through the
+recorded voltages on straight lines; a loop that applies a voltage, waits and then records everything writes it a
+sample late; a command that a controller computes often acts a sample after it was recorded. Taken for held at once,
+such a voltage is up to a sample late or early, for which the inductance makes up, and then the resistance and the
+friction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import attrs
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..recording import Recording, Samples
+from ..simulate import Tape
+from .averaged import of_averaged, seems_averaged, without_averaging
+from .likelihood import unlikely
+from .polish import Polished, polish
+from .prepare import Prepared
+from .problem import normal_matrix
+
+# Another timing must be so much likelier, by the logarithm
+LIKELIER = 30.0
+# ... and is not even asked where the misfit shows less than this share of half a sample
+SHOWS = 0.3
+
+
+class Timing(NamedTuple):
+    """When the voltages of a recording act, otherwise than held from their sample to the next."""
+
+    what: str
+    ahead: int  # by how many samples they were recorded late
+    straight: bool  # from sample to sample, instead of held
+    load: bool = False  # whether the recorded loads act likewise
+
+
+OTHERWISE = (
+    Timing("goes straight from sample to sample instead of being held", 0, True),
+    Timing("was recorded a sample late, when it had been held instead of before", 1, False),
+    Timing("acts a sample later than it was recorded", -1, False),
+)
+
+
+def timing_of(recorded: Prepared, given: Prepared, fit: Polished) -> Timing | None:
+    """How the voltages of the runs act, if that is clearly likelier otherwise than as they are taken.
+
+    **Arguments**: `recorded`, the runs as they are; `given`, less what their sensors put into them; `fit`, to these.
+    """
+    if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
+        return None  # without a current, or without a speed, only a delay would show
+    early = _early(given, fit)
+    # a speed that is a mean over the last sample comes half a sample late, too, and may hide it
+    hidden = not given.averaged and seems_averaged(given)
+    asked = [t for t in OTHERWISE if hidden or (t.ahead < 0) == (early < 0)]
+    if abs(early) < SHOWS and not hidden:
+        return None
+    measured = recorded.problem.tape.measured
+    compared = _without_first(recorded)  # which nobody can foretell where a voltage acts later
+    as_taken = unlikely(compared, fit, of_averaged(given))
+
+    def unlikely_with(timing: Timing) -> float:
+        other = with_timing(given, timing)._replace(averaged="")
+        tape = replace(other.problem.tape, measured=measured)
+        other = other._replace(problem=replace(other.problem, tape=tape))
+        nearer = polish(other.problem, fit.refined)
+        # what is a mean over the last sample, and what is late, only a fit in time can tell
+        other, nearer = without_averaging(other, nearer)
+        return unlikely(compared, nearer, of_averaged(other))
+
+    likely = {timing: unlikely_with(timing) for timing in asked}
+    likeliest = min(asked, key=lambda timing: likely[timing])
+    if not likely[likeliest] < as_taken - LIKELIER:
+        return None
+    with_load = likeliest._replace(load=True)
+    known = any(run.load is not None for run in given.training)
+    return with_load if known and unlikely_with(with_load) < likely[likeliest] else likeliest
+
+
+def _early(given: Prepared, fit: Polished) -> float:
+    """By how many halves of a sample the voltages seem to act before they are taken to: by regression of the misfit on
+    what half a sample does, less what the parameters could do of it.
+
+    Straight ones are held at their means for this, which needs no code but what is compiled.
+    """
+    means = with_timing(given, OTHERWISE[0]).problem
+    means = replace(means, tape=replace(means.tape, rise=None))
+    sooner, evaluation = polish(means, fit.refined, steps=0).evaluation.seen, fit.evaluation
+    scale = given.problem.tape.weight / fit.noise[:, None]
+    change = (sooner - evaluation.seen) * scale * given.problem.counted[:, None, None]
+    matrix = np.asarray(
+        normal_matrix(evaluation._replace(residuals=change), means.tape, means.counts)
+    )
+    hessian, slope = matrix[:-1, :-1], matrix[:-1, -1]
+    own = matrix[-1, -1] - slope @ np.linalg.pinv(hessian, hermitian=True) @ slope
+    shared = -float(jnp.sum(evaluation.residuals * change))
+    return shared / own if own > 0 else 0.0
+
+
+def with_timing(given: Prepared, timing: Timing) -> Prepared:
+    """The runs with voltages that act so."""
+    tape = given.problem.tape
+    taken = [tape.samples_of(k, tape.value, len(run)) for k, run in enumerate(given.runs)]
+    runs = [_acting(run, v, timing) for run, v in zip(given.runs, taken, strict=True)]
+    driven = Tape.from_recordings(runs, straight=timing.straight)
+    value, load, rise = jax.tree.map(jnp.asarray, (driven.value, driven.load, driven.rise))
+    tape = replace(tape, value=value, load=load, rise=rise)
+    problem = replace(given.problem, tape=tape)
+    acting = given._replace(runs=runs, problem=problem, timing=timing.what)
+    return _without_first(acting) if timing.ahead < 0 else acting
+
+
+def _without_first(given: Prepared) -> Prepared:
+    """The runs less what was measured at their first samples: how each is at its second one is then its own."""
+    tape = given.problem.tape
+    weight = np.array(tape.weight)
+    weight[np.asarray(tape.begins), :, 0] = 0.0
+    tape = replace(tape, weight=jnp.asarray(weight))
+    return given._replace(problem=replace(given.problem, tape=tape))
+
+
+def _acting(run: Recording, voltage: Samples, timing: Timing) -> Recording:
+    """A run with the voltages, and perhaps the loads, of those samples at which they act."""
+    if run.drive != "voltage":
+        return run
+    last = len(run) - 1
+    rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)
+    run = attrs.evolve(run, voltage=voltage[rows])
+    if not timing.load or run.load is None:
+        return run
+    # a straight load is held at its means: it is slow enough
+    ahead = np.minimum(rows + 1, last) if timing.straight else rows
+    return attrs.evolve(run, load=(run.load[rows] + run.load[ahead]) / 2)
