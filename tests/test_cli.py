@@ -312,8 +312,8 @@ def test_demo_writes_into_its_folder(faked, faked_tuning, capsys, tmp_path):
     motor, controller, options = faked_tuning.tune
     assert (motor, controller, options["uncertainty"]) == ("motor", "pid", "spread")
     recordings, options = faked.identify
-    assert recordings == ["staircase", "prbs", "triangle", "loaded"]
-    assert options["holdout"] == ["drive"]
+    assert [path.stem for path in recordings] == ["staircase", "prbs", "triangle", "loaded"]
+    assert [path.stem for path in options["holdout"]] == ["drive"]
     assert "report.html" in capsys.readouterr().out
 
 
