@@ -23,7 +23,7 @@ from .problem import Evaluation, Problem, Unknowns
 from .refine import Refined, refine
 from .search import Found
 from .search import search as global_search
-from .timing import timing_of, with_timing
+from .timing import how_unlikely, likelier_timings, with_timing
 from .turning import turned
 from .unfelt import without_unfelt
 
@@ -60,10 +60,13 @@ def solve(
     """
     recorded = given
     given, solved = _mended(*searched(given, search, seed, progress))
-    if timing := timing_of(recorded, given, solved.polished):
-        recorded = with_timing(recorded, timing)
-        given, solved = _mended(*searched(recorded, search, seed, progress))
-    return given, solved
+    otherwise = [
+        _mended(*searched(with_timing(recorded, timing), search, seed, progress))
+        for timing in likelier_timings(recorded, given, solved.polished)
+    ]
+    if not otherwise:
+        return given, solved
+    return min(otherwise, key=lambda found: how_unlikely(recorded, found[0], found[1].polished))
 
 
 def _mended(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:

@@ -10,6 +10,7 @@ friction.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import attrs
@@ -47,39 +48,41 @@ OTHERWISE = (
 )
 
 
-def timing_of(recorded: Prepared, given: Prepared, fit: Polished) -> Timing | None:
-    """How the voltages of the runs act, if that is clearly likelier otherwise than as they are taken.
+def likelier_timings(recorded: Prepared, given: Prepared, fit: Polished) -> list[Timing]:
+    """How the voltages of the runs may act: each way that is clearly likelier than the one that they are taken for.
 
     **Arguments**: `recorded`, the runs as they are; `given`, less what their sensors put into them; `fit`, to these.
     """
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
-        return None  # without a current, or without a speed, only a delay would show
+        return []  # without a current, or without a speed, only a delay would show
     early = _early(given, fit)
     # a speed that is a mean over the last sample comes half a sample late, too, and may hide it
     hidden = not given.averaged and seems_averaged(given)
-    asked = [t for t in OTHERWISE if hidden or (t.ahead < 0) == (early < 0)]
     if abs(early) < SHOWS and not hidden:
-        return None
-    measured = recorded.problem.tape.measured
-    compared = _without_first(recorded)  # which nobody can foretell where a voltage acts later
-    as_taken = unlikely(compared, fit, of_averaged(given))
+        return []
 
+    @cache
     def unlikely_with(timing: Timing) -> float:
+        measured = recorded.problem.tape.measured
         other = with_timing(given, timing)._replace(averaged="")
         tape = replace(other.problem.tape, measured=measured)
         other = other._replace(problem=replace(other.problem, tape=tape))
         nearer = polish(other.problem, fit.refined)
         # what is a mean over the last sample, and what is late, only a fit in time can tell
-        other, nearer = without_averaging(other, nearer)
-        return unlikely(compared, nearer, of_averaged(other))
+        return how_unlikely(recorded, *without_averaging(other, nearer))
 
-    likely = {timing: unlikely_with(timing) for timing in asked}
-    likeliest = min(asked, key=lambda timing: likely[timing])
-    if not likely[likeliest] < as_taken - LIKELIER:
-        return None
-    with_load = likeliest._replace(load=True)
-    known = any(run.load is not None for run in given.training)
-    return with_load if known and unlikely_with(with_load) < likely[likeliest] else likeliest
+    enough = how_unlikely(recorded, given, fit) - LIKELIER
+    asked = [t for t in OTHERWISE if hidden or (t.ahead < 0) == (early < 0)]
+    clearly = [timing for timing in asked if unlikely_with(timing) < enough]
+    if all(run.load is None for run in given.training):
+        return clearly
+    return [min(t, t._replace(load=True), key=unlikely_with) for t in clearly]
+
+
+def how_unlikely(recorded: Prepared, given: Prepared, fit: Polished) -> float:
+    """How unlikely a fit makes recorded runs, but for their first samples: nobody can foretell these where a voltage
+    acts later."""
+    return unlikely(_without_first(recorded), fit, of_averaged(given))
 
 
 def _early(given: Prepared, fit: Polished) -> float:

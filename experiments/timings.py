@@ -1,0 +1,153 @@
+"""Are motors found whose voltages are not held from their own samples on? Random motors, five kinds of log each.
+
+`python -m experiments.timings [--motors 10] [--first 2000]`
+
+Motors of 1 W to 20 kW, sampled 0.1 to 6 times in L / R, three runs of each, two of three under a load that comes and
+goes in one run. SciPy simulates the linear motor exactly (`expm`), with voltages that are held from their samples on;
+go straight from sample to sample; are recorded a sample late, with what came of them; act a sample late; or go
+straight while the speed is the difference of an encoder's counts. `identify` gets the recordings and nothing else.
+"""
+
+import argparse
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.linalg import expm
+
+from benchmarks.virtual_bench import SIX
+from pmdc_jax import Recording, identify
+
+WAYS = ("held", "straight", "recorded late", "acts late", "straight, counted")
+EXCITATIONS = ("steps", "prbs", "chirp", "sines", "one way")
+LINES = 2048
+
+
+class Drawn(NamedTuple):
+    """A motor, and what it is made for."""
+
+    parameters: dict[str, float]
+    volts: float
+    amperes: float
+    speed: float
+    settles: float  # mechanical time constant, s
+    sample_time: float
+
+
+def drawn(rng: np.random.Generator) -> Drawn:
+    """A motor of any size by rules of thumb: what it takes, how fast it turns, what it loses in its winding."""
+    watts = 10 ** rng.uniform(0, 4.3)
+    volts = np.clip(6 * watts**0.3, 3, 400) * rng.uniform(0.7, 1.4)
+    speed = np.clip(900 * watts**-0.15 * rng.uniform(0.6, 1.6), 60, 1500)
+    efficiency = np.clip(0.6 + 0.07 * np.log10(watts), 0.5, 0.92)
+    amperes = watts / volts / efficiency
+    R = volts / amperes * (1 - efficiency) * rng.uniform(0.4, 0.9)
+    Kb = (volts - R * amperes) / speed
+    Kt = Kb * rng.uniform(0.95, 1.03)
+    settles = 10 ** rng.uniform(-2.0, -0.3)
+    L = R * settles * 10 ** rng.uniform(-2, -0.7)
+    f = Kt * amperes * rng.uniform(0.02, 0.15) / speed
+    motor = dict(zip(SIX, (R, L, Kb, Kt, settles * Kb * Kt / R, f), strict=True))
+    sample_time = max(L / R / 10 ** rng.uniform(-0.7, 0.9), settles / 200)
+    return Drawn(motor, volts, amperes, speed, settles, float(f"{sample_time:.1g}"))
+
+
+def voltage(kind: str, motor: Drawn, time: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What the motor is driven with."""
+    volts, settles = motor.volts, motor.settles
+    if kind == "steps":
+        return volts * rng.uniform(-1, 1, 8)[np.minimum(8 * time / time[-1], 7).astype(int)]
+    if kind == "prbs":
+        hold = max(0.7 * settles, 3 * motor.sample_time)
+        return (
+            0.8
+            * volts
+            * (2 * rng.integers(0, 2, int(time[-1] / hold) + 2) - 1)[(time / hold).astype(int)]
+        )
+    if kind == "chirp":
+        return 0.7 * volts * np.sin((0.2 + 1.4 * time / time[-1]) * time / settles)
+    sines = np.sin(np.geomspace(0.05, 2.5, 6) * time[:, None] / settles + rng.uniform(0, 6, 6)).sum(
+        1
+    )
+    return volts * (0.25 * sines if kind == "sines" else 0.5 + 0.08 * sines)
+
+
+def motion(motor: Drawn, v: np.ndarray, load: np.ndarray, straight: bool) -> np.ndarray:
+    """Current, speed and angle from rest, (samples, 3)."""
+    R, L, Kb, Kt, J, f = (motor.parameters[name] for name in SIX)
+    rates = np.zeros(
+        (6, 6)
+    )  # of current, speed, angle, voltage, load and of how fast the voltage rises
+    rates[0, [0, 1, 3]] = -R / L, -Kb / L, 1 / L
+    rates[1, [0, 1, 4]] = Kt / J, -f / J, -1 / J
+    rates[2, 1] = rates[3, 5] = 1.0
+    after = expm(rates * motor.sample_time)[:3]
+    rise = np.diff(v, append=v[-1]) / motor.sample_time * straight
+    states = np.zeros((len(v), 3))
+    for k in range(len(v) - 1):
+        states[k + 1] = after @ np.concatenate([states[k], [v[k], load[k], rise[k]]])
+    return states
+
+
+def log(motor: Drawn, way: str, kind: str, loaded: bool, rng: np.random.Generator) -> Recording:
+    """One run, logged so."""
+    samples = int(np.clip(rng.uniform(20, 60) * motor.settles / motor.sample_time, 600, 8000))
+    time = motor.sample_time * np.arange(samples)
+    v = voltage(kind, motor, time, rng)
+    torque = motor.parameters["Kt"] * motor.amperes * rng.uniform(0.3, 0.7)
+    load = torque * loaded * (np.sin(19 * time / time[-1]) > 0)
+    seen = motion(motor, v, load, "straight" in way)
+    noise = np.array([motor.amperes, motor.speed]) * 10 ** rng.uniform([-3.3, -3.7], [-1.7, -2.0])
+    current, speed = (seen[:, :2] + noise * rng.standard_normal((samples, 2))).T
+    if "counted" in way:
+        count = 2 * np.pi / LINES
+        speed = np.diff(count * np.round(seen[:, 2] / count), prepend=0.0) / motor.sample_time
+    before, after = slice(None, -1), slice(1, None)
+    driven = after if way == "acts late" else before
+    measured = after if way == "recorded late" else before
+    return Recording(
+        kind, time[before], v[driven], current[measured], speed[measured], load[before]
+    )
+
+
+def errors(seed: int, way: str) -> tuple[float, float]:
+    """The largest error of any parameter that is claimed, in standard errors; and of any but f in per cent."""
+    rng = np.random.default_rng(seed)
+    motor = drawn(rng)
+    loaded = rng.random() < 2 / 3
+    kinds = rng.choice(EXCITATIONS, 3, replace=False)
+    runs = [log(motor, way, kind, loaded and kind == kinds[1], rng) for kind in kinds]
+    found = {n: e for n, e in identify(runs).parameters.items() if e.status == "identified"}
+    off = {name: e.value - motor.parameters[name] for name, e in found.items()}
+    return (
+        max(abs(off[name]) / e.stderr for name, e in found.items()),
+        max(100 * abs(off[name]) / motor.parameters[name] for name in found if name != "f"),
+    )
+
+
+def main() -> None:
+    """Run the study and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--motors", type=int, default=10)
+    parser.add_argument("--first", type=int, default=2000, help="seed of the first motor")
+    options = parser.parse_args()
+    seeds = range(options.first, options.first + options.motors)
+    progress = Console(stderr=True)
+    found = {
+        (seed, way): errors(seed, way)
+        for seed in track(seeds, console=progress, transient=True)
+        for way in WAYS
+    }
+    shown = Table("motor", *WAYS, title="Largest error in standard errors (and in %, but for f)")
+    for seed in seeds:
+        cells = (found[seed, way] for way in WAYS)
+        shown.add_row(str(seed), *(f"{sure:.1f} ({percent:.2f})" for sure, percent in cells))
+    medians = (np.median([found[seed, way] for seed in seeds], axis=0) for way in WAYS)
+    shown.add_row("median", *(f"{sure:.1f} ({percent:.2f})" for sure, percent in medians))
+    Console(width=120).print(shown)
+
+
+if __name__ == "__main__":
+    main()
