@@ -65,6 +65,7 @@ class Prepared(NamedTuple):
             self.problem.noise,
             free=jnp.ones(len(parameters.names), bool),
             counts=self.problem.counts,
+            unknown=self.problem.unknown,
         )
         return self._replace(problem=problem)
 

@@ -41,6 +41,8 @@ class Problem(eqx.Module):
     free: Bool[Array, " parameters"]
     counts: Bool[Array, " runs"]
     whitening: Whitening | None = None  # in place of the noise, where residuals are correlated
+    # what else may have moved the outputs of each run, A and rad/s: of it residuals tell nothing
+    unknown: Float[Array, "blocks 2 samples unknowns"] | None = None
 
     @property
     def outputs(self) -> int:
@@ -114,7 +116,8 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     # Levenberg-Marquardt traces under an empty mesh; under no mesh at all everything would be traced once more
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
         # whitened apart, for the simulation takes long to compile
-        return weighed(problem, _evaluate(replace(problem, whitening=None), unknowns))
+        simulated = _evaluate(replace(problem, whitening=None, unknown=None), unknowns)
+        return weighed(problem, _less_unknown(problem, simulated))
 
 
 def weighed(problem: Problem, plain: Evaluation) -> Evaluation:
@@ -129,6 +132,29 @@ def _evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     scale = tape.weight / problem.noise[:, None]
     jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]
     return Evaluation(seen, (seen - tape.measured) * scale, jacobian)
+
+
+def _less_unknown(problem: Problem, plain: Evaluation) -> Evaluation:
+    """A free run with residuals and derivatives that are orthogonal to what else may have moved its outputs."""
+    return plain if problem.unknown is None else _orthogonal(problem, plain)
+
+
+@eqx.filter_jit
+def _orthogonal(problem: Problem, plain: Evaluation) -> Evaluation:
+    tape = problem.tape
+    assert problem.unknown is not None
+    unknown = problem.unknown * (tape.weight / problem.noise[:, None])[..., None]
+    both = jnp.concatenate([unknown, plain.jacobian, plain.residuals[..., None]], -1)
+    products = jax.ops.segment_sum(jnp.einsum("bcsi,bcsj->bij", unknown, both), tape.run, tape.runs)
+    count = unknown.shape[-1]
+    gram, along = products[..., :count], products[..., count:]
+    # runs with fewer unknowns have columns of zeros
+    gram = (
+        gram + jnp.eye(count) * jnp.where(jnp.diagonal(gram, axis1=1, axis2=2) > 0, 0, 1)[:, None]
+    )
+    share = jnp.linalg.solve(gram, along)
+    left = both[..., count:] - jnp.einsum("bcsi,bij->bcsj", unknown, share[tape.run])
+    return Evaluation(plain.seen, left[..., -1], left[..., :-1])
 
 
 @eqx.filter_jit

@@ -23,6 +23,7 @@ from .problem import Evaluation, Problem, Unknowns
 from .refine import Refined, refine
 from .search import Found
 from .search import search as global_search
+from .steps import with_steps
 from .timing import how_unlikely, likelier_timings, with_timing
 from .turning import turned
 from .unfelt import without_unfelt
@@ -60,13 +61,17 @@ def solve(
     """
     recorded = given
     given, solved = _mended(*searched(given, search, seed, progress))
-    otherwise = [
-        _mended(*searched(with_timing(recorded, timing), search, seed, progress))
-        for timing in likelier_timings(recorded, given, solved.polished)
-    ]
-    if not otherwise:
-        return given, solved
-    return min(otherwise, key=lambda found: how_unlikely(recorded, found[0], found[1].polished))
+    timings = likelier_timings(recorded, given, solved.polished)
+    acting = [with_timing(recorded, timing) for timing in timings]
+    otherwise = [_mended(*searched(taken, search, seed, progress)) for taken in acting]
+    found = [_stepped(*taken) for taken in [(given, solved), *otherwise]]
+    return min(found, key=lambda ended: how_unlikely(recorded, ended[0], ended[1].polished))
+
+
+def _stepped(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
+    """The runs with steps of their voltages where they came, and the fit to them."""
+    given, polished = with_steps(given, solved.polished)
+    return given, solved._replace(polished=polished)
 
 
 def _mended(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
