@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import ParamSpec, TypeVar
@@ -32,6 +32,17 @@ def side_by_side_until(
         if enough(made):
             break
     return made
+
+
+def one_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
+    """What calls return, in their order, while the next one is made on another core already. Not to be nested."""
+    waiting: Future[T] | None = None
+    for call in calls:
+        before, waiting = waiting, beside(call)
+        if before is not None:
+            yield before.result()
+    if waiting is not None:
+        yield waiting.result()
 
 
 def beside(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+
+# Most of the tests' time is compilation, and this takes a quarter of it away; see pmdc_jax/compiled.py.
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
+
 # First, so that the change to jaxtyping below is seen by nobody but the package under test.
 import diffrax  # noqa: F401
 import equinox  # noqa: F401

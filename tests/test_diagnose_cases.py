@@ -83,6 +83,7 @@ def test_nothing_is_found_where_nothing_is_missing(noise):
     assert 0 < by_name["coulomb_friction"].amplitude < 0.05
 
 
+@pytest.mark.slow
 def test_a_voltage_recorded_by_ten_bits_hides_no_dead_zone():
     """Levels are off by half a bit each, which lasts as long as they do; the motor feels the real ones."""
     rng, bit, runs = np.random.default_rng(21), 48 / 1024, []
@@ -96,6 +97,7 @@ def test_a_voltage_recorded_by_ten_bits_hides_no_dead_zone():
     assert diagnose(runs).verdict == "none_detected"
 
 
+@pytest.mark.slow
 def test_a_constant_load_would_not_have_shown_beside_a_load_that_nobody_knows():
     """Nor Coulomb friction, of a motor that turns one way."""
     _, triangle, _ = recorded(vb.BenchMotor(**PAPER), 1, NOISE)
@@ -152,6 +154,7 @@ def test_where_a_peak_of_friction_would_not_show_it_is_not_ruled_out(peak):
     assert found.next_experiment is not None
 
 
+@pytest.mark.slow
 def test_a_faint_effect_beside_a_strong_one_is_named():
     """A dead zone explains hundreds of times as much, but leaves nothing in the mechanical equation."""
     dry = 0.008
@@ -165,6 +168,7 @@ def test_a_faint_effect_beside_a_strong_one_is_named():
     assert low < dry < high < 1.1 * low
 
 
+@pytest.mark.slow
 def test_drag_beside_dry_friction_is_no_stribeck_friction():
     """The slope of a Stribeck curve and more viscous friction bend together as drag does."""
     plant = Plant(**PAPER, friction_forward_Nm=0.12, friction_backward_Nm=0.12, drag=2.7e-6)
@@ -174,6 +178,7 @@ def test_drag_beside_dry_friction_is_no_stribeck_friction():
     assert {effect.name for effect in found.effects} == {"coulomb_friction", "quadratic_drag"}
 
 
+@pytest.mark.slow
 def test_what_is_one_volt_in_the_given_runs_is_not_told_apart():
     """A dead zone beside a delay, turning one way, without a current: dry friction and a load would do the same."""
     plant = Plant(**PAPER, dead_zone_V=1.0, delay_s=0.01)
@@ -192,6 +197,7 @@ def test_what_is_one_volt_in_the_given_runs_is_not_told_apart():
     assert found.closed_fraction > 0.99
 
 
+@pytest.mark.slow
 def test_a_rotor_that_sticks_for_long_is_found_by_searching_anew():
     """One short staircase under load: the best motor without friction is so far off that no response to first order
     shows what is missing."""
@@ -218,6 +224,7 @@ def test_a_rotor_that_sticks_for_long_is_found_by_searching_anew():
         assert effect.parameters[field].value == pytest.approx(truth, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_bearing_that_seizes_is_no_coulomb_friction():
     """Torque noise is slow too, but does not turn with the direction of motion."""
     plant = Plant(**PAPER, seizing_Nm=0.04, seizing_from_s=1.0)

@@ -529,6 +529,7 @@ def test_a_run_may_begin_twisted(x64, name):
             assert np.max(np.abs(found - right[channel])) < case.tolerance * np.max(right[channel])
 
 
+@pytest.mark.slow
 def test_teeth_in_many_short_blocks_are_joined(x64):
     """A slow small wave at 0.2 ms: some sixty blocks, each half as long as the motor remembers how it began."""
     time = 2e-4 * np.arange(8000)

@@ -6,17 +6,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..compiled import quickly_compiled
 from ..effects import EFFECTS, AbstractEffect
 from ..identify.noise import is_coarse, quantum, resolution
 from ..motor import Motor
 from ..recording import Recording
 from ..simulate import Tape, free_run
+from ..threads import one_ahead
 from .candidates import Candidate, Scales, candidates
 from .model import Model
 from .response import Path, kicks, pushes, sensed
@@ -92,35 +93,42 @@ class Library:
         self.wavers = bool(base.given.unfelt)
         # by unit: what may be but a trace of what a sensor does
         self.traces = _traces(base)
-        self._whole: dict[int, np.ndarray] = {}
+        self._simulated: dict[int, np.ndarray] = {}
         self._base = base
 
     def changes(self, tape: Tape, path: Path) -> Iterator[Change]:
         """What every candidate changes along a path, in their order, some of one effect at a time."""
+        return one_ahead(self._calls(tape, path))
+
+    def _calls(self, tape: Tape, path: Path) -> Iterator[Callable[[], Change]]:
         for name in EFFECTS:
             shapes = [c for c in self.candidates if c.effect == name]
             if shapes and shapes[0].whole:
-                seen = np.stack([self._response(c, tape) for c in shapes], -1)
-                yield Change(np.zeros_like(seen), seen)
+                yield partial(self._whole, shapes, tape)
             elif shapes:
                 settings = [values for c in shapes for values in c.columns]
                 units = np.array([unit for c in shapes for unit in c.units])
                 for part in np.array_split(np.arange(len(settings)), -(-len(settings) // TOGETHER)):
                     values = {f: np.array([settings[k][f] for k in part]) for f in settings[0]}
-                    small = _small(EFFECTS[name], values, self.bare, tape, path)
-                    yield Change(*(np.asarray(x) / units[part] for x in small))
+                    case = (EFFECTS[name], values, self.bare, tape, path)
+                    yield partial(_scaled_down, case, units[part])
+
+    def _whole(self, shapes: Sequence[Candidate], tape: Tape) -> Change:
+        """What whole settings of an effect change."""
+        seen = np.stack([self._response(c, tape) for c in shapes], -1)
+        return Change(np.zeros_like(seen), seen)
 
     def _response(self, candidate: Candidate, tape: Tape) -> np.ndarray:
         """The response to a whole setting, simulated once."""
         key = id(candidate)
-        if key not in self._whole:
+        if key not in self._simulated:
             values = {field: jnp.asarray(x) for field, x in candidate.columns[0].items()}
             local = self._base.polished.refined.unknowns.local
             motor = self.bare.with_effects([EFFECTS[candidate.effect](**values)])
             seen = free_run(motor, tape, local[:, :2], local[:, 2])
             change = np.asarray(seen) - np.asarray(self._base.polished.evaluation.seen)
-            self._whole[key] = change.transpose(2, 1, 0)
-        return self._whole[key]
+            self._simulated[key] = change.transpose(2, 1, 0)
+        return self._simulated[key]
 
 
 def _traces(base: Model) -> dict[str, float]:
@@ -146,7 +154,12 @@ def _counted(runs: Sequence[Recording]) -> list[np.ndarray]:
     return speeds + [np.gradient(run.angle) for run in runs if run.angle is not None]
 
 
-@eqx.filter_jit
+def _scaled_down(case: tuple, units: np.ndarray) -> Change:
+    """What small settings change, as many of each as of one unit of its amplitude."""
+    return Change(*(np.asarray(x) / units for x in _small(*case)))
+
+
+@quickly_compiled
 def _small(
     effect: type[AbstractEffect],
     settings: Mapping[str, Array | np.ndarray],

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping
+from functools import cache, partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..compiled import QUICKLY
 from ..errors import InputError
 from ..simulate import Tape, squared_errors
 from .parameters import Parameters
@@ -126,7 +127,7 @@ def search(
     return _collect(seen, low, high, interrupted)
 
 
-@functools.cache
+@cache
 def _programs(method: str, population: int, dimensions: int):
     """How a search begins and how it goes on, compiled as two programs: step by step evosax compiles dozens.
 
@@ -146,11 +147,11 @@ def _programs(method: str, population: int, dimensions: int):
         asked, state = algorithm.ask(keys(seed, generation)[0], state, settings())
         return jnp.clip(asked, 0.0, 1.0), jax.tree.map(_settled, state)
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=QUICKLY)
     def begin(seed, *start):
         return ask(seed, 1, algorithm.init(jax.random.key(seed), *start, settings()))
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=QUICKLY)
     def go_on(seed, generation, cube, fitness, state):
         state, _ = algorithm.tell(keys(seed, generation)[1], cube, fitness, state, settings())
         return ask(seed, generation + 1, state)

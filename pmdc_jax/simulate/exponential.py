@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ def product(
     return (a[:, :, None] * b[None]).sum(1)
 
 
+@partial(jax.jit, static_argnames="count")
 def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
     """phi_0 to phi_count of z / 2 and of z.
 

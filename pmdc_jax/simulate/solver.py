@@ -8,6 +8,7 @@ from operator import add
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,6 +68,7 @@ class Propagator(NamedTuple):
     ramp: Matrix | None = None
 
 
+@eqx.filter_jit
 def propagator(
     motor: Motor, step: Float[Array, ""], drive: Drive, straight: bool = False
 ) -> Propagator:
@@ -341,7 +343,7 @@ def walk(solver: HeldInput, start: Walk, steps: int, saveat: diffrax.SaveAt) -> 
     """Take `steps` steps through diffrax and return what `saveat` asks for."""
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: y),
-        solver,
+        HeldInput(jax.jit(solver.advance)),
         t0=0.0,
         t1=float(steps),
         dt0=1.0,
