@@ -135,6 +135,7 @@ def recorded_from(plant: Plant, seed: int, noise: vb.Noise) -> list[Recording]:
     return runs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("peak", [1.0, 3.0], ids=["coulomb", "stribeck"])
 def test_where_a_peak_of_friction_would_not_show_it_is_not_ruled_out(peak):
     """Friction so faint that it is hardly seen, with and without a peak of three times as much at rest."""

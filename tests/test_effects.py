@@ -467,7 +467,10 @@ def test_a_much_saturated_inductance_is_nearly_as_exact(x64):
     assert relative_errors(simulated(motor, runs), expected)[0] < 5e-3
 
 
-@pytest.mark.parametrize(("gap_rad", "drag"), [(1e-3, 0.0), (0.07, 0.0), (0.07, 6e-5)])
+@pytest.mark.parametrize(
+    ("gap_rad", "drag"),
+    [(1e-3, 0.0), (0.07, 0.0), pytest.param(0.07, 6e-5, marks=pytest.mark.slow)],
+)
 def test_hard_teeth_are_nearly_as_exact(x64, gap_rad, drag):
     """They ring at 840 Hz, hardly once in a sample, as those of a real gear do; beside drag, which is not linear."""
     hard = {"stiffness_Nm_rad": 2800.0, "damping_Nms_rad": 0.3, "load_share": 0.7}

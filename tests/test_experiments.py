@@ -52,6 +52,7 @@ def test_our_force_error_is_the_published_one(fit):
     assert force_errors(plain) == pytest.approx(FORCE_ERRORS[fit.name], abs=0.06)
 
 
+@pytest.mark.slow
 @needs_emps
 @free_run
 def test_linear_force_error_is_within_one_point_of_least_squares():

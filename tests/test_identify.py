@@ -578,6 +578,7 @@ def test_friction_that_had_all_but_vanished_is_found_again(x64, runs):
     assert again.fitness == pytest.approx(there.fitness, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_rotor_turns_by_its_own_speed_and_not_by_that_of_a_slow_sensor(x64):
     """The sensor's lag by scipy; the angle by Simpson's rule over the speed itself."""
     rng, lag = np.random.default_rng(4), 5e-3
@@ -892,7 +893,7 @@ def behind_a_gear(gap: float, load: float, twist: float = 0.0) -> tuple[Problem,
     return given.problem, Unknowns(jnp.asarray(coordinates), jnp.zeros((1, LOCAL)))
 
 
-@pytest.mark.parametrize("gap", [0.05, 0.3])
+@pytest.mark.parametrize("gap", [pytest.param(0.05, marks=pytest.mark.slow), 0.3])
 def test_what_belongs_to_a_run_is_never_fitted_for_the_worse(gap):
     """Nobody knows the load of a run behind a gear with play, where straight lines lead anywhere."""
     with jax.enable_x64(True):

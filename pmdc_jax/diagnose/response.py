@@ -136,7 +136,7 @@ def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Drive]:
     return jax.tree.map(spread, along), drive
 
 
-@eqx.filter_jit
+@eqx.filter_jit  # one trace of the bare motor serves all effects
 def _one_sample(motor: Motor, tape: Tape, path: Path) -> State:
     along, drive = _of_blocks(motor, tape)
     value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T

@@ -65,6 +65,8 @@ def solve(
     acting = [with_timing(recorded, timing) for timing in timings]
     otherwise = [_mended(*searched(taken, search, seed, progress)) for taken in acting]
     found = [_stepped(*taken) for taken in [(given, solved), *otherwise]]
+    if not otherwise:
+        return found[0]
     return min(found, key=lambda ended: how_unlikely(recorded, ended[0], ended[1].polished))
 
 

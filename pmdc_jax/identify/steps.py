@@ -27,14 +27,17 @@ from .problem import Problem
 
 # A step is so many times what the voltage does from sample to sample around it, and this share of its range
 STANDS_OUT, LARGE = 10.0, 0.05
-# Fewer steps tell nothing of whether all come alike; more a run than one in so many samples, or in all than so many
-# numbers can say what they do, are no switch's
-FEWEST, SAMPLES, NUMBERS = 4, 20, 2e7
+# Fewer steps tell nothing of whether all come alike; more a run than one in so many samples are no switch's
+FEWEST, SAMPLES = 4, 20
+# What steps do to the outputs takes at most so many numbers
+NUMBERS = 2e7
 # Steps without a clock come anywhere in a sample: their shares of it spread so much, and hardly leave it
 SPREAD, OUTSIDE = 0.15, 0.2
 # They must be so much likelier, by the logarithm, and by so much for each
 LIKELIER, EACH = 30.0, 5.0
 PASSES = 5
+# What is said of the voltage
+STEPPED = "steps between samples"
 # Squares by which a step shows, as a share of those of the one that shows most, below which it does not
 HARDLY = 1e-8
 
@@ -54,21 +57,22 @@ def with_steps(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     steps = [steps_of(run) for run in given.runs]
     if problem.tape.rise is not None:  # what goes straight rises in the middle
         steps = [s._replace(share=s.share + 0.5) for s in steps]
-    numbers = sum(2 * len(run) * len(s.at) for run, s in zip(given.runs, steps, strict=True))
-    count = sum(len(s.at) for s in steps)
-    if not all(problem.samples > 0) or count < FEWEST or numbers > NUMBERS:
+    count, most = sum(len(s.at) for s in steps), max(len(s.at) for s in steps)
+    too_many = 2 * problem.tape.value.size * most > NUMBERS
+    if not all(problem.samples > 0) or count < FEWEST or too_many:
         return given, fit
-    steps = _moved(problem, fit, steps)
-    if not _come_anywhere(steps):
+    enough = LIKELIER + EACH * count
+    steps, promised = _moved(problem, fit, steps)
+    if promised < enough or not _come_anywhere(steps):
         return given, fit
     placed, better = given, fit
     for _ in range(PASSES):
         placed = _placed(given, better, steps)
         better = polish(placed.problem, better.refined)
-        steps = _moved(placed.problem, better, steps)
+        steps, _ = _moved(placed.problem, better, steps)
     sensed = of_averaged(given)
     gained = unlikely(given, fit, sensed) - unlikely(given, better, sensed)
-    return (placed, better) if gained > LIKELIER + EACH * count else (given, fit)
+    return (placed, better) if gained > enough else (given, fit)
 
 
 def steps_of(run: Recording) -> Steps:
@@ -87,25 +91,28 @@ def steps_of(run: Recording) -> Steps:
 
 
 def _come_anywhere(steps: Sequence[Steps]) -> bool:
+    """Whether steps come at all times within a sample, and neither all alike nor before or after it."""
     share = np.concatenate([s.share for s in steps])
     inside = (share > -OUTSIDE) & (share < 1 + OUTSIDE)
     return bool(np.mean(inside) > 1 - OUTSIDE and np.std(np.clip(share, 0, 1)) > SPREAD)
 
 
-def _moved(problem: Problem, fit: Polished, steps: Sequence[Steps]) -> list[Steps]:
-    """The steps at the times that make the misfit of a fit least."""
+def _moved(problem: Problem, fit: Polished, steps: Sequence[Steps]) -> tuple[list[Steps], float]:
+    """The steps at the times that make the misfit of a fit least, and by how much that is likelier in white noise."""
     tape = problem.tape
     scale = np.asarray(tape.weight) / fit.noise[:, None]
     left = (np.asarray(tape.measured) - np.asarray(fit.evaluation.seen)) * scale
-    moved = []
+    moved, squares = [], 0.0
     for run, s in enumerate(steps):
         mine = np.asarray(tape.run) == run
         columns = _responses(problem, fit, run, s) * scale[mine][..., None]
         rows, rest = columns.reshape(left[mine].size, len(s.at)), left[mine].ravel()
+        along = rows.T @ rest
         # a step that is hardly felt stays where it is
-        by = np.linalg.pinv(rows.T @ rows, hermitian=True, rcond=HARDLY) @ (rows.T @ rest)
+        by = np.linalg.pinv(rows.T @ rows, hermitian=True, rcond=HARDLY) @ along
         moved.append(s._replace(share=s.share + by))
-    return moved
+        squares += float(along @ by)
+    return moved, squares / 2
 
 
 def _placed(given: Prepared, fit: Polished, steps: Sequence[Steps]) -> Prepared:
@@ -157,6 +164,3 @@ def _powers(A: Float[np.ndarray, "2 2"], count: int) -> Float[np.ndarray, "count
     while len(powers) < count:
         powers = np.concatenate([powers, powers @ np.linalg.matrix_power(A, len(powers))])
     return powers[:count]
-
-
-STEPPED = "steps between samples"

@@ -229,7 +229,7 @@ def _join(
     return joined, starts, run
 
 
-@eqx.filter_jit
+@eqx.filter_jit  # one trace serves `_join` and, of the same columns, whoever else asks
 def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_offset) -> Pass:
     """Run every block from its start, with tangents. The last columns are the starts themselves."""
     motor, grids = prepared

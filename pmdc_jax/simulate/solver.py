@@ -68,7 +68,7 @@ class Propagator(NamedTuple):
     ramp: Matrix | None = None
 
 
-@eqx.filter_jit
+@eqx.filter_jit  # one trace serves all grids
 def propagator(
     motor: Motor, step: Float[Array, ""], drive: Drive, straight: bool = False
 ) -> Propagator:
@@ -341,9 +341,11 @@ class HeldInput(diffrax.AbstractSolver):
 
 def walk(solver: HeldInput, start: Walk, steps: int, saveat: diffrax.SaveAt) -> Any:
     """Take `steps` steps through diffrax and return what `saveat` asks for."""
+    # diffrax traces its step twice, and that of a motor with effects takes half a second
+    traced_once = HeldInput(jax.jit(solver.advance))
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: y),
-        HeldInput(jax.jit(solver.advance)),
+        traced_once,
         t0=0.0,
         t1=float(steps),
         dt0=1.0,
