@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from .alignment import alignment, sampling
+from .clock import evenly_stamped, is_even
 from .plausibility import angle_against_speed, plain_units, signs, speed_of
 from .recording import Finding, Recording
 
@@ -47,7 +48,7 @@ def gaps(run: Recording) -> Iterator[Finding]:
             f"{_count(len(rows), 'gap')} in time, the longest {steps[longest]:.4g} s "
             f"where the step is {np.median(steps):.4g} s",
             place(run, int(longest)),
-            "Split the run at the gaps: the voltage in between is not known",
+            "The voltage is taken to have been held meanwhile. If it was not, split the run at its gaps",
         )
 
 
@@ -59,14 +60,16 @@ def jitter(run: Recording) -> Iterator[Finding]:
     scatter = steps / np.mean(steps) - 1
     deviation = float(np.sqrt(np.mean(scatter**2) / 2))
     if deviation > JITTER:
+        samples = "came evenly all the same, by how they go on: they are taken as even"
+        if not is_even(evenly_stamped(run).time):
+            samples = "are taken when they were stamped"
         yield Finding(
             run.name,
             "time",
-            "warning",
-            f"time stamps jitter by {deviation:.1%} of a step of {np.mean(steps):.4g} s",
+            "note",
+            f"time stamps jitter by {deviation:.1%} of a step of {np.mean(steps):.4g} s, and the samples {samples}",
             f"worst near {place(run, int(np.argmax(np.abs(np.diff(run.time) - np.mean(steps)))))}",
-            "Export more digits, or the time of the sampling clock instead of the logging computer; from a simulation "
-            "of variable steps, samples at fixed ones",
+            "If these are not the times of sampling, export those of the sampling clock",
         )
 
 
@@ -139,6 +142,19 @@ def constant_load(run: Recording) -> Iterator[Finding]:
         )
 
 
+def spare_torque(run: Recording) -> Iterator[Finding]:
+    """A torque beside a voltage: only one of them can drive."""
+    if run.torque is not None and run.drive == "voltage":
+        yield Finding(
+            run.name,
+            "torque",
+            "note",
+            "the voltage drives the motor, and this column is not used",
+            "whole run",
+            "Leave out the voltage for the torque to drive the mechanical half alone",
+        )
+
+
 def leaps(run: Recording) -> Iterator[Finding]:
     """A current that drives, and leaps from one sample to the next: half way between is but a guess."""
     if run.drive != "current" or run.current is None:
@@ -202,6 +218,7 @@ LOOKS = (
     wrapped_angle,
     constant_load,
     leaps,
+    spare_torque,
     signs,
     angle_against_speed,
     alignment,

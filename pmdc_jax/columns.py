@@ -206,6 +206,10 @@ def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column
     if spec not in headers:
         header, _, unit = (part.strip() for part in spec.rpartition(":"))
         header, unit = (header, unit) if header else (spec.strip(), None)
+    # a unit may stand in the line below the name
+    named = [h for h in headers if h.rpartition(" [")[0] == header]
+    if header not in headers and len(named) == 1:
+        (header,) = named
     if header not in headers:
         listed = ", ".join(headers[:20]) or "none"
         raise InputError(option, f"the file has no column '{header}'", f"Its columns are: {listed}")

@@ -60,7 +60,8 @@ class Recording:
     **Fields**: `name`, shown in results; `time`, s, (samples,), strictly increasing from any start;
     and, None where not recorded, of the same shape: `voltage` V, `current` A, `speed` rad/s, `load`
     N m, `angle` rad, `temperature` degrees C, `torque` N m. `held`, whether the rotor was locked;
-    `source`, the file; `ignored`, headers not used; `notes`, what was assumed while reading.
+    `source`, the file; `ignored`, headers not used; `notes`, what was assumed while reading; `uneven`, the record
+    that this one lays on an even clock, None where it is a record itself.
 
     **Raises**: `InputError` where nothing could be identified from it.
     """
@@ -78,9 +79,11 @@ class Recording:
     source: str | None = field(default=None, kw_only=True)
     ignored: tuple[str, ...] = field(default=(), kw_only=True)
     notes: tuple[Finding, ...] = field(default=(), kw_only=True)
+    uneven: Recording | None = field(default=None, kw_only=True)
 
     def __attrs_post_init__(self):
-        for fault in _faults(self.columns()):
+        # what was laid on an even clock was a sound record before
+        for fault in _faults(self.columns()) if self.uneven is None else ():
             sample = "" if fault.row is None else f"sample {fault.row + 1}"
             column = fault.quantity and f"column {fault.quantity}"
             where = ", ".join(filter(None, (self.source or self.name, sample, column)))
@@ -98,6 +101,11 @@ class Recording:
     def duration(self) -> float:
         """From the first to the last sample, s."""
         return float(self.time[-1] - self.time[0])
+
+    @property
+    def recorded(self) -> Recording:
+        """As it was recorded, on whatever clock."""
+        return self if self.uneven is None else self.uneven
 
     @property
     def drive(self) -> Literal["voltage", "current", "torque"]:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import polars as pl
 
 MISSING = ["NA", "N/A", "n/a", "null", "NULL", "None"]
+# Lines that an instrument may write before its header
+PREAMBLE = 200
 NUMBERS_ONLY = "Recordings hold plain numbers; leave a cell empty where a sample is missing"
 
 
@@ -42,7 +44,7 @@ def open_table(path: Path) -> Table:
 
     **Raises**: `InputError` if it cannot be read as such.
     """
-    kinds = {".csv": CsvTable, ".tsv": CsvTable, ".txt": CsvTable}
+    kinds = dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm"), CsvTable)
     kinds |= {".parquet": ParquetTable, ".pq": ParquetTable, ".mat": MatTable}
     if path.is_dir():
         raise InputError(str(path), "this is a folder", "Name the files in it, one run each")
@@ -69,15 +71,17 @@ def open_table(path: Path) -> Table:
 class CsvTable:
     """Text with a header line; separated by comma, semicolon or tab.
 
-    Lines that begin with # and empty lines are skipped. Numbers may have a decimal comma unless the
-    comma separates. A second line of units belongs to the header. Dates with times are read as seconds since the
-    first of them.
+    Lines that begin with # and empty lines are skipped, and what an instrument writes before the header. Numbers may
+    have a decimal comma unless the comma separates. A second line of units belongs to the header. Dates with times are
+    read as seconds since the first of them.
     """
 
     def __init__(self, path: Path):
         self._path = path
         self._raw = _text(path)
-        header, self._header_line, self._start = _find_header(self._raw, path)
+        header, self._header_line, self._start = _past_preamble(
+            self._raw, *_find_header(self._raw, path)
+        )
         self._separator = next((s for s in "\t;" if s in header), ",")
         names = [name.strip() for name in _fields(header, self._separator)]
         units, start = _find_units(self._raw, self._start, self._separator, len(names))
@@ -296,6 +300,25 @@ def _find_header(raw: bytes, path: Path) -> tuple[str, int, int]:
         comment = line.removeprefix("#")
         start, number = end + 1, number + 1
     raise InputError(str(path), "it holds no header and no rows", "Export the recording again")
+
+
+def _past_preamble(raw: bytes, line: str, number: int, start: int) -> tuple[str, int, int]:
+    """The header as `_find_header` gives it; where its fields are not as many as the numbers have that follow, the last
+    line before these that has as many, for an instrument wrote of itself before."""
+    header, texts = (line, number, start), []
+    while start < len(raw) and len(texts) < PREAMBLE:
+        end = raw.find(b"\n", start) + 1 or len(raw)
+        number, now = number + 1, raw[start:end].decode().strip("\r\n")
+        if _is_numbers(now) and now.strip():
+            separator = next((s for s in "\t;" if s in now), ",")
+            count = len(_fields(now, separator))
+            if count < 2 or len(_fields(line, separator)) == count:
+                break
+            alike = [text for text in texts if len(_fields(text[0], separator)) == count]
+            return alike[-1] if alike else header
+        texts.append((now, number, end))
+        start = end
+    return header
 
 
 def _find_units(raw: bytes, start: int, separator: str, count: int) -> tuple[list[str] | None, int]:

@@ -192,10 +192,17 @@ def wrapped(run):
     return evolve(run, speed=None, angle=np.mod(0.05 * np.arange(len(run)), 2 * np.pi))
 
 
+def test_stamps_that_jitter_are_noted_with_what_the_samples_are_taken_for():
+    for seed in (1, 7, 13):
+        (found,) = [f for f in check([with_jitter(good_run(seed, "prbs"))]) if f.column == "time"]
+        assert found.severity == "note"
+        assert "jitter by" in found.what
+        assert "came evenly all the same" in found.what
+
+
 RPM = 30 / np.pi
 FAULTS = [
     ("gap", with_gap, "time", "1 gap in time, the longest"),
-    ("jitter", with_jitter, "time", "jitter by"),
     ("holes", with_holes, "speed", "300 of 3000 values are missing"),
     ("clipped current", lambda run: clip(run, "current", 0.7), "current", "clipped at"),
     ("clipped speed", lambda run: clip(run, "speed", 0.7), "speed", "clipped at"),

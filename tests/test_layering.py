@@ -24,8 +24,10 @@ BELOW = {
     "recording": {"columns", "errors", "tables", "units"},
     "effects": set(),
     "motor": {"effects"},
-    "simulate": {"effects", "motor", "precision", "recording", "threads"},
-    "check": {"alignment", "plausibility", "recording"},
+    "simulate": {"clock", "effects", "errors", "motor", "precision", "recording", "threads"},
+    "clock": {"recording"},
+    "spikes": {"recording"},
+    "check": {"alignment", "clock", "plausibility", "recording"},
     "motor_file": {"effects", "errors", "motor", "report"},
     "control": {
         "compiled",
@@ -39,6 +41,7 @@ BELOW = {
     },
     "identify": {
         "check",
+        "clock",
         "compiled",
         "effects",
         "errors",
@@ -46,6 +49,7 @@ BELOW = {
         "precision",
         "recording",
         "simulate",
+        "spikes",
         "threads",
     },
 }

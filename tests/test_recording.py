@@ -18,6 +18,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
 from pmdc_jax.columns import understand
+from pmdc_jax.errors import InputError
 from pmdc_jax.recording import Recording, read_recording, recordings_of, write_recording
 
 T = np.arange(12) * 0.01
@@ -349,3 +350,40 @@ def test_a_path_stands_for_what_it_holds(tmp_path):
         for found in (*recordings_of(kind), *recordings_of([kind])):
             assert found.name == "step"
             np.testing.assert_array_equal(found.speed, run.speed)
+
+
+# --------------------------------------------------------------------------------- instruments
+
+
+ROWS = "".join(f"{0.001 * k:.3f},{12 + k % 3},{0.1 * k:.1f},{k}\n" for k in range(20))
+
+
+@pytest.mark.parametrize(
+    "preamble",
+    [
+        "Model,MSO46\nFirmware Version,1.30\n\nProbe Attenuation,10,1,1\nVertical Units,V,A,V\n\n",
+        "LabVIEW Measurement,\nSeparator,Comma\n***End_of_Header***,\n",
+        "Date 2026-11-24\nSample interval 0.001\n",
+    ],
+)
+def test_what_an_instrument_writes_before_its_header_is_skipped(tmp_path, preamble):
+    file = tmp_path / "scope.csv"
+    file.write_text(f"{preamble}time_s,voltage_V,current_A,speed_rad_s\n{ROWS}")
+    run = read_recording(file)
+    assert len(run) == 20
+    assert (run.voltage[1], run.current[1], run.speed[1]) == (13.0, 0.1, 1.0)
+
+
+def test_a_header_of_another_width_is_no_preamble(tmp_path):
+    file = tmp_path / "run.csv"
+    file.write_text(f"time_s,voltage_V,current_A\n{ROWS}")
+    with pytest.raises(InputError, match="it has 4 fields where the header"):
+        read_recording(file)
+
+
+def test_a_column_is_mapped_by_its_name_without_the_unit_below(tmp_path):
+    file = tmp_path / "scope.csv"
+    file.write_text(f"x-axis,1,2,3\nsecond,Volt,Ampere,Volt\n{ROWS}")
+    columns = {"time": "x-axis", "voltage": "1", "current": "2", "speed": "3:rad/s"}
+    run = read_recording(file, columns)
+    assert (run.time[1], run.voltage[1], run.speed[1]) == (0.001, 13.0, 1.0)

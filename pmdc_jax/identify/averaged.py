@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_banded
 
+from ..simulate import Tape
 from .likelihood import Samples, unlikely
 from .noise import quantum
 from .polish import Polished, polish
@@ -78,6 +79,13 @@ LATE = Sensed("", lambda x: np.append(x[:1], x[:-1]), lambda x: np.append(x[1:],
 def of_averaged(given: Prepared) -> Callable[[Samples], Samples]:
     """What the sensors of runs made of their speeds, as far as it was undone."""
     return {TWO.over: TWO.of, LAST.over: LAST.of}.get(given.averaged, lambda speed: speed)
+
+
+def as_recorded(given: Prepared) -> Prepared:
+    """The runs with their outputs as recorded, whatever was undone."""
+    measured = jnp.asarray(Tape.from_recordings(given.runs).measured)
+    problem = replace(given.problem, tape=replace(given.problem.tape, measured=measured))
+    return given._replace(problem=problem, averaged="")
 
 
 def seems_averaged(given: Prepared) -> bool:
@@ -155,7 +163,7 @@ def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, 
     tape = given.problem.tape
     measured = np.array(tape.measured)
     for run in range(tape.runs):
-        mine = np.asarray(tape.run) == run
+        mine = tape.blocks_of(run)
         known = np.asarray(tape.weight)[mine, 1].ravel() > 0
         if known.sum() > 2 and not given.differentiated[run]:
             speed = measured[mine, 1].ravel()

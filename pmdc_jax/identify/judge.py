@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,6 +25,8 @@ from .solve import SAME, Solved
 from .uncertainty import FLAT, Information, information
 
 TIDYINGS = 3
+# What a fit leaves is told of if it is so many times the white noise
+MISSED = 2.0
 # Of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
 # A parameter is alone in an unseen direction of unit length if it has so much of it
@@ -63,7 +65,7 @@ def judge(given: Prepared, solved: Solved) -> Identification:
         findings=given.findings,
         covariance=info.covariance,
         covariance_names=parameters.names,
-        messages=_messages(given, solved, best, chosen is not polished),
+        messages=_messages(given, solved, best, fit, chosen is not polished),
     )
 
 
@@ -250,19 +252,36 @@ def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | 
     return float(100 * (1 - error / spread)) if spread > 0 else None
 
 
-def _noise_of(fit: Mapping[str, RunFit]) -> dict[str, float | None]:
-    def errors(name: str) -> list[np.ndarray]:
-        runs = [f for f in fit.values() if f.role == "train"]
-        pairs = [(getattr(f, name), getattr(f, f"{name}_simulated")) for f in runs]
-        return [m - s for m, s in pairs if m is not None and s is not None]
+def _left(fit: Mapping[str, RunFit], name: str) -> list[np.ndarray]:
+    """What the fit leaves of an output in every run that has it."""
+    runs = [f for f in fit.values() if f.role == "train"]
+    pairs = [(getattr(f, name), getattr(f, f"{name}_simulated")) for f in runs]
+    return [m - s for m, s in pairs if m is not None and s is not None]
 
+
+def _noise_of(fit: Mapping[str, RunFit]) -> dict[str, float | None]:
     return {
-        "current_A": white_noise(errors("current")),
-        "speed_rad_s": white_noise(errors("speed")),
+        "current_A": white_noise(_left(fit, "current")),
+        "speed_rad_s": white_noise(_left(fit, "speed")),
     }
 
 
-def _messages(given: Prepared, solved: Solved, best: Refined, tied: bool) -> tuple[str, ...]:
+def _missed(fit: Mapping[str, RunFit]) -> Iterator[str]:
+    """What to say of outputs that are missed by far more than their noise."""
+    for name in ("current", "speed"):
+        left = _left(fit, name)
+        noise = white_noise(left)
+        size = np.sqrt(np.nanmean(np.square(np.concatenate(left)))) if left else 0.0
+        if noise and size > MISSED * noise:
+            yield (
+                f"what the fit leaves of the {name} is {size / noise:.2g} times its white noise: `pmdc diagnose` tells "
+                "whether the model lacks something, or a torque disturbs the motor"
+            )
+
+
+def _messages(
+    given: Prepared, solved: Solved, best: Refined, fit: Mapping[str, RunFit], tied: bool
+) -> tuple[str, ...]:
     messages = [
         f"{run.name}: the {run.drive} holds {given.unfelt[run.name]:.3g} {UNITS[run.drive]} of noise that the motor "
         "did not feel: it was taken out"
@@ -279,6 +298,7 @@ def _messages(given: Prepared, solved: Solved, best: Refined, tied: bool) -> tup
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
     if not best.converged:
         messages.append("the refinement did not converge: the gradient is not zero at its end")
+    messages += _missed(fit)
     if tied:
         messages.append("Kt was set equal to Kb, as they are in SI, and J and f go with it")
     return tuple(messages)

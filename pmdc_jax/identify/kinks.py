@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -44,7 +43,7 @@ def _mended(given: Prepared, splined: list[int], fit: Polished) -> Prepared:
     problem, tape = given.problem, given.problem.tape
     measured = np.array(tape.measured)
     for run in splined:
-        mine = np.asarray(tape.run) == run
+        mine = tape.blocks_of(run)
         error = _spline_error(problem, fit, run, given.differentiated[run], len(given.runs[run]))
         measured[mine, 1] -= error * (np.asarray(tape.weight)[mine, 1] > 0)
     problem = replace(problem, tape=replace(tape, measured=jnp.asarray(measured)))
@@ -73,11 +72,9 @@ def _motion(
 
     No angle where what drives flows on between samples, as a current does, so that the motion does not bend.
     """
-    tape, mine = problem.tape, np.asarray(problem.tape.run) == run
+    tape, mine = problem.tape, problem.tape.blocks_of(run)
     current, speed = np.moveaxis(np.asarray(fit.evaluation.seen)[mine], 1, 0)
-    grid = np.asarray(tape.grid)[mine][0]
-    drive = jax.tree.map(lambda share: np.asarray(share)[grid], tape.drive)
-    step = float(np.asarray(tape.sample_time)[grid])
+    drive, step = tape.drive_of(run), tape.sample_time_of(run)
     if drive.current or tape.rise is not None:
         return None, speed.ravel(), step
     motor = problem.parameters(fit.refined.unknowns.coordinates)

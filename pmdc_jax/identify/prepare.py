@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..check import check
+from ..clock import evenly_stamped
 from ..effects import AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS
 from ..recording import Finding, Recording, Runs, recordings_of
 from ..simulate import Tape, uniform
+from ..spikes import without_spikes
 from .bounds import search_bounds
 from .identification import Role
 from .noise import white_noise
@@ -41,6 +43,8 @@ class Prepared(NamedTuple):
     averaged: str = ""
     # when the voltages act, if not from their sample to the next
     timing: str = ""
+    # whether they go straight from sample to sample
+    straight: bool = False
 
     @property
     def training(self) -> list[Recording]:
@@ -80,11 +84,13 @@ def prepare(
     effects: Sequence[type[AbstractEffect]] = (),
 ) -> Prepared:
     """Check the recordings and lay them out; raises `InputError` where they cannot give an answer."""
-    recordings, holdout = recordings_of(recordings), recordings_of(holdout)
+    recordings, holdout = (
+        [without_spikes(run) for run in recordings_of(runs)] for runs in (recordings, holdout)
+    )
     _refuse(recordings, holdout, tie, known)
     findings = check([*recordings, *holdout])
     _refuse_errors(findings)
-    runs = [uniform(r) for r in (*recordings, *holdout)]
+    runs = [uniform(evenly_stamped(r)) for r in (*recordings, *holdout)]
     training = runs[: len(recordings)]
     noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in ("current", "speed")])
     untouched = _untouched(training, tie)

@@ -89,17 +89,16 @@ def residuals_of(given: Prepared, fit: Polished) -> list[Series]:
 
 def series_of(tape: Tape, run: int, signal: np.ndarray) -> Series:
     """A signal (blocks, 2, samples, ...) of one run in the order of time, of the outputs that it has."""
-    mine = np.asarray(tape.run) == run
+    mine = tape.blocks_of(run)
     part = np.moveaxis(signal[mine], 1, 2)
     values = part.reshape(-1, *part.shape[2:])
     weight = np.moveaxis(np.asarray(tape.weight)[mine], 1, 2).reshape(-1, 2) > 0
     outputs = tuple(int(c) for c in _outputs(tape, run))
-    first = np.flatnonzero(mine)[0]
-    kind = (float(np.asarray(tape.sample_time)[np.asarray(tape.grid)[first]]), outputs)
+    kind = (tape.sample_time_of(run), outputs)
     return Series(values[:, list(outputs)], np.asarray(weight[:, list(outputs)].all(1)), kind)
 
 
 def _outputs(tape: Tape, run: int) -> np.ndarray:
     """The outputs that a run has."""
-    weight = np.asarray(tape.weight)[np.asarray(tape.run) == run]
+    weight = np.asarray(tape.weight)[tape.blocks_of(run)]
     return np.flatnonzero(weight.any((0, 2)))

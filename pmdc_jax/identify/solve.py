@@ -14,6 +14,7 @@ from ..simulate import Tape
 from ..threads import beside, side_by_side_until
 from .averaged import without_averaging
 from .bounds import effect_bounds
+from .clock import on_clock
 from .identification import Search
 from .kinks import without_kinks
 from .parameters import Parameters
@@ -61,13 +62,13 @@ def solve(
     """
     recorded = given
     given, solved = _mended(*searched(given, search, seed, progress))
-    timings = likelier_timings(recorded, given, solved.polished)
+    timings = likelier_timings(given, solved.polished)
     acting = [with_timing(recorded, timing) for timing in timings]
     otherwise = [_mended(*searched(taken, search, seed, progress)) for taken in acting]
     found = [_stepped(*taken) for taken in [(given, solved), *otherwise]]
     if not otherwise:
         return found[0]
-    return min(found, key=lambda ended: how_unlikely(recorded, ended[0], ended[1].polished))
+    return min(found, key=lambda ended: how_unlikely(ended[0], ended[1].polished))
 
 
 def _stepped(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
@@ -78,7 +79,8 @@ def _stepped(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
 
 def _mended(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
     """The runs less what their sensors put into them, and the fit to them."""
-    given, polished = without_unfelt(given, with_own(given.problem, solved.polished))
+    given, polished = on_clock(given, with_own(given.problem, solved.polished))
+    given, polished = without_unfelt(given, polished)
     given, polished = without_averaging(given, polished)
     given, polished = without_kinks(given, polished)
     return given, solved._replace(polished=polished)
@@ -98,7 +100,7 @@ def searched(
     began = time.perf_counter()
     report = progress or (lambda *args, **kwargs: None)
     problem = given.problem
-    searching = Tape.from_recordings(given.training, straight=problem.tape.rise is not None)
+    searching = Tape.from_recordings(given.training, straight=given.straight)
     noise, sought = np.asarray(problem.noise), _where_effects_show(given)
 
     def look(seed: int) -> Found:

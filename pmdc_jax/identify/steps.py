@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -55,7 +54,7 @@ def with_steps(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     these steps come with the samples, or all as late."""
     problem = given.problem
     steps = [steps_of(run) for run in given.runs]
-    if problem.tape.rise is not None:  # what goes straight rises in the middle
+    if given.straight:  # what goes straight rises in the middle
         steps = [s._replace(share=s.share + 0.5) for s in steps]
     count, most = sum(len(s.at) for s in steps), max(len(s.at) for s in steps)
     too_many = 2 * problem.tape.value.size * most > NUMBERS
@@ -104,7 +103,7 @@ def _moved(problem: Problem, fit: Polished, steps: Sequence[Steps]) -> tuple[lis
     left = (np.asarray(tape.measured) - np.asarray(fit.evaluation.seen)) * scale
     moved, squares = [], 0.0
     for run, s in enumerate(steps):
-        mine = np.asarray(tape.run) == run
+        mine = tape.blocks_of(run)
         columns = _responses(problem, fit, run, s) * scale[mine][..., None]
         rows, rest = columns.reshape(left[mine].size, len(s.at)), left[mine].ravel()
         along = rows.T @ rest
@@ -123,7 +122,7 @@ def _placed(given: Prepared, fit: Polished, steps: Sequence[Steps]) -> Prepared:
     most = max(len(s.at) for s in steps)
     unknown = np.zeros((*np.shape(tape.measured), most))
     for run, s in enumerate(steps):
-        mine = np.flatnonzero(np.asarray(tape.run) == run)
+        mine = np.flatnonzero(tape.blocks_of(run))
         unknown[mine, ..., : len(s.at)] = _responses(problem, fit, run, s)
         share = np.clip(s.share, 0.0, 1.0)
         block, sample = np.divmod(s.at - 1, BLOCK)
@@ -143,13 +142,10 @@ def _responses(
 ) -> Float[np.ndarray, "blocks 2 samples steps"]:
     """What the outputs of a run gain, in A and rad/s, as each of its steps comes a sample earlier: as fast as at the
     time where it is."""
-    tape, mine = problem.tape, np.asarray(problem.tape.run) == run
-    grid = np.asarray(tape.grid)[mine][0]
-    drive = jax.tree.map(lambda share: np.asarray(share)[grid], tape.drive)
-    step = float(np.asarray(tape.sample_time)[grid])
+    tape, step = problem.tape, problem.tape.sample_time_of(run)
     motor = problem.parameters(fit.refined.unknowns.coordinates)
-    A, B = map(np.asarray, motor.state_space(drive))
-    length = int(mine.sum()) * BLOCK
+    A, B = map(np.asarray, motor.state_space(tape.drive_of(run)))
+    length = int(tape.blocks_of(run).sum()) * BLOCK
     after = _powers(expm(A * step), length)
     responses = np.zeros((length, 2, len(steps.at)))
     for k, (at, height, share) in enumerate(zip(*steps, strict=True)):

@@ -18,9 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..recording import Recording, Samples
-from ..simulate import Tape
-from .averaged import of_averaged, seems_averaged, without_averaging
+from ..recording import Recording
+from ..simulate import Tape, uniform
+from .averaged import as_recorded, of_averaged, seems_averaged, without_averaging
+from .clock import on_clock
 from .likelihood import unlikely
 from .polish import Polished, polish
 from .prepare import Prepared
@@ -48,10 +49,10 @@ OTHERWISE = (
 )
 
 
-def likelier_timings(recorded: Prepared, given: Prepared, fit: Polished) -> list[Timing]:
+def likelier_timings(given: Prepared, fit: Polished) -> list[Timing]:
     """How the voltages of the runs may act: each way that is clearly likelier than the one that they are taken for.
 
-    **Arguments**: `recorded`, the runs as they are; `given`, less what their sensors put into them; `fit`, to these.
+    **Arguments**: `given`, the runs less what their sensors put into them; `fit`, to these.
     """
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
         return []  # without a current, or without a speed, only a delay would show
@@ -63,15 +64,12 @@ def likelier_timings(recorded: Prepared, given: Prepared, fit: Polished) -> list
 
     @cache
     def unlikely_with(timing: Timing) -> float:
-        measured = recorded.problem.tape.measured
-        other = with_timing(given, timing)._replace(averaged="")
-        tape = replace(other.problem.tape, measured=measured)
-        other = other._replace(problem=replace(other.problem, tape=tape))
+        other = as_recorded(with_timing(given, timing))
         nearer = polish(other.problem, fit.refined)
         # what is a mean over the last sample, and what is late, only a fit in time can tell
-        return how_unlikely(recorded, *without_averaging(other, nearer))
+        return how_unlikely(*without_averaging(*on_clock(other, nearer)))
 
-    enough = how_unlikely(recorded, given, fit) - LIKELIER
+    enough = how_unlikely(given, fit) - LIKELIER
     asked = [t for t in OTHERWISE if hidden or (t.ahead < 0) == (early < 0)]
     clearly = [timing for timing in asked if unlikely_with(timing) < enough]
     if all(run.load is None for run in given.training):
@@ -79,10 +77,10 @@ def likelier_timings(recorded: Prepared, given: Prepared, fit: Polished) -> list
     return [min(t, t._replace(load=True), key=unlikely_with) for t in clearly]
 
 
-def how_unlikely(recorded: Prepared, given: Prepared, fit: Polished) -> float:
-    """How unlikely a fit makes recorded runs, but for their first samples: nobody can foretell these where a voltage
-    acts later."""
-    return unlikely(_without_first(recorded), fit, of_averaged(given))
+def how_unlikely(given: Prepared, fit: Polished) -> float:
+    """How unlikely a fit makes the runs as recorded, but for their first samples: nobody can foretell these where a
+    voltage acts later."""
+    return unlikely(_without_first(as_recorded(given)), fit, of_averaged(given))
 
 
 def _early(given: Prepared, fit: Polished) -> float:
@@ -108,13 +106,14 @@ def _early(given: Prepared, fit: Polished) -> float:
 def with_timing(given: Prepared, timing: Timing) -> Prepared:
     """The runs with voltages that act so."""
     tape = given.problem.tape
-    taken = [tape.samples_of(k, tape.value, len(run)) for k, run in enumerate(given.runs)]
-    runs = [_acting(run, v, timing) for run, v in zip(given.runs, taken, strict=True)]
+    runs = [uniform(_acting(run, k, tape, timing)) for k, run in enumerate(given.runs)]
     driven = Tape.from_recordings(runs, straight=timing.straight)
     value, load, rise = jax.tree.map(jnp.asarray, (driven.value, driven.load, driven.rise))
     tape = replace(tape, value=value, load=load, rise=rise)
     problem = replace(given.problem, tape=tape)
-    acting = given._replace(runs=runs, problem=problem, timing=timing.what)
+    acting = given._replace(
+        runs=runs, problem=problem, timing=timing.what, straight=timing.straight
+    )
     return _without_first(acting) if timing.ahead < 0 else acting
 
 
@@ -127,13 +126,18 @@ def _without_first(given: Prepared) -> Prepared:
     return given._replace(problem=replace(given.problem, tape=tape))
 
 
-def _acting(run: Recording, voltage: Samples, timing: Timing) -> Recording:
-    """A run with the voltages, and perhaps the loads, of those samples at which they act."""
+def _acting(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
+    """The record of a run with the voltages, and perhaps the loads, of those samples at which they act.
+
+    Those of an even clock as the tape has them, for noise may have been taken out there.
+    """
     if run.drive != "voltage":
-        return run
-    last = len(run) - 1
+        return run.recorded
+    even = run.uneven is None
+    voltage = tape.samples_of(k, tape.value, len(run)) if even else run.recorded.voltage
+    run, last = run.recorded, len(run.recorded) - 1
     rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)
-    run = attrs.evolve(run, voltage=voltage[rows])
+    run = attrs.evolve(run, voltage=np.asarray(voltage)[rows])
     if not timing.load or run.load is None:
         return run
     # a straight load is held at its means: it is slow enough

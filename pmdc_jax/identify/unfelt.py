@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..simulate import Tape
+from ..simulate import Tape, uniform
 from .colour import whitener
 from .likelihood import unlikely
 from .polish import Polished, polish
@@ -43,7 +43,7 @@ def without_unfelt(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if nothing was found, or makes
     the runs less likely: where most of a misfit is another one's, its regression on a rough part may mislead.
     """
-    drives = [np.asarray(getattr(run, run.drive)) for run in given.runs]
+    drives = [np.asarray(getattr(run.recorded, run.drive)) for run in given.runs]
     rough = [drive - smoothed(drive) for drive in drives]
     if not any(map(np.any, rough)):
         return given, fit
@@ -64,9 +64,12 @@ def without_unfelt(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
 
 def _driven(given: Prepared, drives: list[np.ndarray]) -> Problem:
     """The problem with the runs driven so."""
-    runs = [attrs.evolve(r, **{r.drive: d}) for r, d in zip(given.runs, drives, strict=True)]
+    runs = [
+        uniform(attrs.evolve(run.recorded, **{run.drive: drive}))
+        for run, drive in zip(given.runs, drives, strict=True)
+    ]
     tape = given.problem.tape
-    driven = Tape.from_recordings(runs, straight=tape.rise is not None)
+    driven = Tape.from_recordings(runs, straight=given.straight)
     value, rise = jax.tree.map(jnp.asarray, (driven.value, driven.rise))
     return replace(given.problem, tape=replace(tape, value=value, rise=rise))
 

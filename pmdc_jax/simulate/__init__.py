@@ -14,6 +14,7 @@ from .population import squared_errors
 from .reference import reference_solution
 from .shooting import LOCAL, free_run, sensitivities
 from .tape import Tape
+from .uneven import seen_at_record
 from .uniform import uniform
 
 __all__ = [
@@ -44,11 +45,8 @@ def simulate(motor: Motor, recording: Run) -> Recording:
     even = uniform(recording)
     tape = Tape.from_recordings([even], unloaded=True)
     outputs = free_run(motor, tape, jnp.asarray(tape.initial), jnp.zeros(1))
-    current, speed = (
-        np.interp(recording.time, even.time, tape.samples_of(0, outputs[:, c], len(even.time)))
-        for c in range(2)
-    )
-    driven = recording.voltage is not None and recording.torque is None
-    return attrs.evolve(
-        recording, current=current if driven else recording.current, speed=speed, angle=None
-    )
+    seen = np.stack([tape.samples_of(0, outputs[:, c], len(even)) for c in range(2)], 1)
+    if even.uneven is not None:
+        seen = seen_at_record(motor, tape.drive_of(0), even, seen)
+    current = seen[:, 0] if recording.drive == "voltage" else recording.current
+    return attrs.evolve(recording, current=current, speed=seen[:, 1], angle=None)

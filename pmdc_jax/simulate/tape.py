@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..motor import Drive
+from .uneven import flows_on, mean_and_rise
 
 if TYPE_CHECKING:
     from ..recording import Recording
@@ -68,6 +69,7 @@ class Tape(eqx.Module):
         a straight line from sample to sample instead of being held.
         """
         runs = [_Run(recording, straight) for recording in recordings]
+        rises = straight or any(recording.uneven is not None for recording in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
         # few distinct lengths, so that few shapes are ever compiled
         blocks = _round_up(sum(run.blocks for run in runs))
@@ -77,7 +79,7 @@ class Tape(eqx.Module):
             "measured": np.zeros((blocks, 2, BLOCK)),
             "weight": np.zeros((blocks, 2, BLOCK)),
             "turn": np.full((blocks, BLOCK), np.nan),
-            "rise": np.zeros((blocks, BLOCK)) if straight else None,
+            "rise": np.zeros((blocks, BLOCK)) if rises else None,
             "run": np.full(blocks, len(runs) - 1),
             "begins": np.zeros(blocks, bool),
             "grid": np.full(blocks, grids.index(runs[-1].grid)),
@@ -91,7 +93,7 @@ class Tape(eqx.Module):
                 missing = np.isnan(samples)
                 tape["measured"][part, channel] = run.fill(np.where(missing, 0.0, samples))
                 tape["weight"][part, channel] = run.fill(np.where(missing, 0.0, 1.0))
-            if straight:
+            if rises:
                 tape["rise"][part] = run.fill(run.rise)
             if follow:
                 tape["turn"][part] = run.fill(run.turn(), hold=True)
@@ -122,11 +124,27 @@ class Tape(eqx.Module):
         """Number of runs."""
         return self.initial.shape[0]
 
+    def blocks_of(self, run: int) -> Bool[np.ndarray, " blocks"]:
+        """Which blocks are of one run."""
+        return np.asarray(self.run) == run
+
     def samples_of(
         self, run: int, signal: Float[Samples, "blocks samples"], length: int
     ) -> np.ndarray:
         """The `length` samples of one run, cut out of a signal laid out like the tape."""
-        return np.asarray(signal)[np.asarray(self.run) == run].reshape(-1)[:length]
+        return np.asarray(signal)[self.blocks_of(run)].reshape(-1)[:length]
+
+    def grid_of(self, run: int) -> int:
+        """The grid of one run."""
+        return int(np.asarray(self.grid)[self.blocks_of(run)][0])
+
+    def drive_of(self, run: int) -> Drive:
+        """What drives one run."""
+        return Drive(*(float(np.asarray(share)[self.grid_of(run)]) for share in self.drive))
+
+    def sample_time_of(self, run: int) -> float:
+        """Sample time of one run, s."""
+        return float(self.sample_time[self.grid_of(run)])
 
 
 class _Run:
@@ -140,19 +158,16 @@ class _Run:
         self.current, self.speed = missing, missing
         if recording.speed is not None:
             self.speed = recording.speed
-        if recording.torque is not None:
-            drive, value = "torque", recording.torque
-        elif recording.voltage is not None:
-            drive, value = "voltage", recording.voltage
-            if recording.current is not None:
-                self.current = recording.current
+        drive = recording.drive
+        if drive == "voltage" and recording.current is not None:
+            self.current = recording.current
+        value = getattr(recording, drive)
+        goes_on = straight or flows_on(recording)
+        if recording.uneven is not None:
+            self.value, self.rise = mean_and_rise(recording, straight)
         else:
-            drive, value = "current", recording.current
-            assert value is not None, "Recording guarantees something that drives"
-        # a measured current flows on between its samples, whatever a voltage does
-        goes_on = straight or drive == "current"
-        self.rise = np.diff(value, append=value[-1]) if goes_on else np.zeros(self.length)
-        self.value = value + self.rise / 2
+            self.rise = np.diff(value, append=value[-1]) if goes_on else np.zeros(self.length)
+            self.value = value + self.rise / 2
         # rounded: two runs of one clock must share a grid, whatever the last bits of their time stamps
         self.grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held)
         self.initial = (_first(self.current), _first(self.speed))

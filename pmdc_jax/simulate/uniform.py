@@ -5,12 +5,16 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
+from ..clock import is_even
+from ..errors import InputError
 from ..recording import Recording
 
-# Largest distance of a time stamp from a uniform grid, in steps, that is taken for rounding of the stamps.
-ROUNDING = 0.02
 # An interval longer than this many steps is a gap: outputs inside it count as missing.
 GAP = 3.0 * (1 + 1e-9)  # exactly three, but for rounding, are none
+# An even clock ticks no more often than so many times for every sample
+MOST = 20
+# ... and any that leaves this share of the most samples a tick of their own is as good
+ALIKE = 0.98
 
 
 def uniform(recording: Recording) -> Recording:
@@ -18,31 +22,51 @@ def uniform(recording: Recording) -> Recording:
 
     Evenly sampled recordings keep their samples. Otherwise whatever drives and the load, which hold between
     samples, are averaged over each interval of the grid, so that no volt-second is lost, and the outputs are
-    interpolated linearly; inside gaps, and past the end, they are missing (NaN). A rotor that stands still
-    throughout is held: there is nothing to learn from its speed.
+    interpolated linearly; inside gaps, and past the end, they are missing (NaN). The record goes along as `uneven`.
+    A rotor that stands still throughout is held: there is nothing to learn from its speed.
+
+    **Raises**: `InputError` where a gap is so long that next to nothing was recorded.
     """
     if recording.stands_still:
         recording = attrs.evolve(recording, speed=None, angle=None, held=True)
     if recording.speed is None and recording.angle is not None:
         recording = attrs.evolve(recording, speed=speed_by_spline(recording.angle, recording.time))
     time = recording.time
-    steps = np.arange(len(time))
-    step = (time[-1] - time[0]) / (len(time) - 1)
-    if np.max(np.abs(time - (time[0] + steps * step))) <= ROUNDING * step:
-        return attrs.evolve(recording, time=time[0] + steps * step)
-    # rounded, so that runs of one clock share a grid
-    step = float(f"{np.median(np.diff(time)):.3g}")
-    grid = time[0] + step * np.arange(np.ceil((time[-1] - time[0]) / step - 1e-9) + 1)
+    if is_even(time):
+        return attrs.evolve(recording, time=np.linspace(time[0], time[-1], len(time)))
+    grid = _even_clock(time)
     held = {"voltage": recording.voltage, "load": recording.load, "torque": recording.torque}
     seen = {"current": recording.current, "speed": recording.speed}
+    if len(grid) > MOST * len(time):
+        steps = np.diff(time)
+        longest = int(np.argmax(steps))
+        raise InputError(
+            f"{recording.source or recording.name}, sample {longest + 1}",
+            f"a gap of {steps[longest]:.4g} s in time, where most steps are {np.median(steps):.4g} s",
+            "Split the run at its gaps",
+        )
     return attrs.evolve(
         recording,
         time=grid,
         angle=None,
         temperature=None,
+        uneven=recording,
         **{k: _average(time, x, grid) for k, x in held.items() if x is not None},
         **{k: _interpolate(time, x, grid) for k, x in seen.items() if x is not None},
     )
+
+
+def _even_clock(time: np.ndarray) -> np.ndarray:
+    """An even clock begun with the first sample: that of the mean step of time, but for gaps, or of the median,
+    whichever leaves more samples a tick of their own; rounded if that hardly matters, so that runs of one clock share
+    a grid."""
+    steps, passed = np.diff(time), time - time[0]
+    typical = np.median(steps)
+    mean = np.mean(steps[steps <= GAP * typical])
+    likely = [float(x) for x in (f"{mean:.2g}", f"{mean:.3g}", f"{typical:.3g}")]
+    own = [len(np.unique(np.rint(passed / step))) for step in likely]
+    step = next(x for x, ticks in zip(likely, own, strict=True) if ticks >= ALIKE * max(own))
+    return time[0] + step * np.arange(np.ceil(passed[-1] / step - 1e-9) + 1)
 
 
 def _average(time: np.ndarray, held: np.ndarray, grid: np.ndarray) -> np.ndarray:

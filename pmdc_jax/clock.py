@@ -1,0 +1,68 @@
+"""Whether samples came when their time stamps say, or evenly, and only the stamps are uneven.
+
+A computer that stamps what a sampling clock sends it does so early and late. Samples that truly came late show it: a
+speed that rises has risen further by then.
+"""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+from jaxtyping import Float
+
+from .recording import Recording
+
+Samples = Float[np.ndarray, " samples"]
+
+# Largest distance of a time stamp from an even clock, in steps, that is taken for rounding of the stamps
+ROUNDING = 0.02
+# ... and beyond which it is none that a sampling clock gave
+BEYOND = 3.0
+# Samples on either side over which a slope is taken
+AROUND = 5
+# Samples follow their stamps by less than this share, so many standard errors below it, if they came evenly
+HALF, CLEAR = 0.5, 4.0
+# Squares of what is but rounding, as a share of all
+ROUNDED = 1e-18
+
+
+def is_even(time: Samples) -> bool:
+    """Whether time stamps are even but for rounding."""
+    evenly = np.linspace(time[0], time[-1], len(time))
+    return bool(np.max(np.abs(time - evenly)) <= ROUNDING * (evenly[1] - evenly[0]))
+
+
+def evenly_stamped(recording: Recording) -> Recording:
+    """A record with even time stamps where its own are not, but its samples came evenly; as it is otherwise."""
+    time, ticks = recording.time, np.arange(len(recording))
+    step, begin = np.polyfit(ticks, time, 1)
+    late = time - (begin + ticks * step)
+    motion = recording.angle if recording.speed is None else recording.speed
+    if motion is None or is_even(time) or np.max(np.abs(late)) > BEYOND * step:
+        return recording
+    share, error = _following(motion, late, step)
+    came_evenly = share + CLEAR * error < HALF
+    return attrs.evolve(recording, time=begin + ticks * step) if came_evenly else recording
+
+
+def _following(signal: Samples, late: Samples, step: float) -> tuple[float, float]:
+    """By what share of how late its stamps are a signal is further on, and the standard error of that.
+
+    By regression of what straight lines from neighbour to neighbour miss of the signal on what its slope makes of the
+    stamps; infinitely uncertain where nothing moves.
+    """
+    lags = np.arange(-AROUND, AROUND + 1)
+    slope = np.correlate(signal, lags / (lags @ lags) / step, "same")
+    missed, expected = _bend(signal), slope[1:-1] * _bend(late)
+    known = np.isfinite(missed) & np.isfinite(expected)
+    known[:AROUND] = known[-AROUND:] = False
+    missed, expected = missed[known], expected[known]
+    power = expected @ expected
+    if not power > ROUNDED * np.nansum(signal**2):
+        return 1.0, np.inf
+    share = float(missed @ expected / power)
+    return share, float(np.sqrt(np.sum((expected * (missed - share * expected)) ** 2)) / power)
+
+
+def _bend(signal: Samples) -> Float[np.ndarray, " inner"]:
+    return signal[1:-1] - (signal[:-2] + signal[2:]) / 2

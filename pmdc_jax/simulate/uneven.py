@@ -1,0 +1,158 @@
+"""A record of an uneven clock beside the even one that it is laid on: what drives between, and how the motor moves.
+
+The solver steps along the even clock. What drives an even sample is then a straight line with the mean and the first
+moment of what was recorded, and a recorded sample is compared with the motion within the even sample where it lies.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..motor import Drive, Motor
+
+if TYPE_CHECKING:
+    from ..recording import Recording
+
+# Eigenvalues are taken apart to this share, at which a difference quotient has as many digits right
+NEAR = 1e-7
+# Series are better than quotients below
+SMALL = 3e-3
+
+
+class Pieces(NamedTuple):
+    """Stretches of time in which no sample begins, neither of the record nor of the even clock."""
+
+    time: Float[np.ndarray, " pieces"]  # s, when it begins
+    begins: Float[np.ndarray, " pieces"]  # s after its even sample
+    length: Float[np.ndarray, " pieces"]  # s
+    even: Int[np.ndarray, " pieces"]  # the even sample that it is a part of
+    value: Float[np.ndarray, " pieces"]  # of what drives, as it begins
+    slope: Float[np.ndarray, " pieces"]  # 1/s
+    load: Float[np.ndarray, " pieces"]  # N m, zero where unknown
+
+
+def flows_on(run: Recording) -> bool:
+    """Whether what drives goes straight from sample to sample: a measured current does, whatever a voltage may do."""
+    return run.drive == "current"
+
+
+def pieces_of(run: Recording, straight: bool) -> Pieces:
+    """The pieces of a run on an even clock, driven as recorded: held, or `straight` from sample to sample."""
+    record, step = run.recorded, run.sample_time
+    drive = np.asarray(getattr(record, record.drive))
+    edges = np.union1d(np.append(run.time, run.time[-1] + step), record.time)
+    begins, length = edges[:-1], np.diff(edges)
+    even = np.searchsorted(run.time, begins, "right") - 1
+    recorded = np.searchsorted(record.time, begins, "right") - 1
+    goes_on = straight or flows_on(run)
+    slopes = np.append(np.diff(drive) / np.diff(record.time), 0.0) * goes_on
+    slope = slopes[recorded]
+    value = drive[recorded] + slope * (begins - record.time[recorded])
+    load = np.zeros(len(record)) if record.load is None else record.load
+    return Pieces(begins, begins - run.time[even], length, even, value, slope, load[recorded])
+
+
+def mean_and_rise(run: Recording, straight: bool) -> tuple[np.ndarray, np.ndarray]:
+    """What drives each even sample: its mean, and the rise of the straight line that has its first moment too."""
+    _, begins, length, even, value, slope, _ = pieces_of(run, straight)
+    step, rise = run.sample_time, slope * length
+    middle = begins + length / 2 - step / 2
+    whole = length * (value + rise / 2)
+    moment = whole * middle + length**2 * rise / 12
+    mean, first = (np.bincount(even, x, len(run)) / step for x in (whole, moment))
+    return mean, 12 * first / step
+
+
+def seen_at_record(
+    motor: Motor,
+    drive: Drive,
+    even: Recording,
+    seen: Float[np.ndarray, "samples 2"],
+    straight: bool = False,
+) -> Float[np.ndarray, "recorded 2"]:
+    """Current A and speed rad/s at the time stamps of a record, from those `seen` at the samples of its `even` clock.
+
+    Exact for the linear motor, and for what the true drive does otherwise than the straight line that has its mean
+    and its first moment. What effects do besides within an even sample grows in proportion to time.
+    """
+    time, begins, length, at, value, slope, loads = pieces_of(even, straight)
+    mean, rise = mean_and_rise(even, straight)
+    step, line = even.sample_time, mean - rise / 2
+    A, B = map(np.asarray, motor.state_space(drive))
+    load = np.zeros(len(even)) if even.load is None else even.load
+    after, held, rising = _advances(A, np.concatenate([[step], begins, length]))
+
+    def moved(by: slice, of: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+        """From those even samples on, along the straight line."""
+        rate = seen[of] @ A.T + np.outer(line[of], B[:, 0]) + np.outer(load[of], B[:, 1])
+        bend = np.outer(rise[of] / step, B[:, 0])
+        return seen[of] + _times(held[by], rate) + _times(rising[by], bend)
+
+    whole, beginning, along = slice(0, 1), slice(1, len(at) + 1), slice(len(at) + 1, None)
+    missed = seen[1:] - moved(whole, np.arange(len(seen) - 1))
+    missed = np.append(missed, np.zeros((1, 2)), 0)[at] * (begins / step)[:, None]
+    # what the true drive does otherwise: by the pieces of an even sample, and then from sample to sample
+    apart = value - line[at] - rise[at] * begins / step
+    pushed = np.outer(apart, B[:, 0]) + np.outer(loads - load[at], B[:, 1])
+    pushed = _times(held[along], pushed)
+    pushed += _times(rising[along], np.outer(slope - rise[at] / step, B[:, 0]))
+    within, before = np.zeros((len(even), 2)), np.empty((len(at), 2))
+    nth = np.arange(len(at)) - np.searchsorted(at, at)
+    for n in range(nth.max() + 1):
+        (here,) = np.nonzero(nth == n)
+        before[here] = within[at[here]]
+        within[at[here]] = _times(after[along][here], before[here]) + pushed[here]
+    otherwise = np.append(np.zeros((1, 2)), _accumulated(after[0], within)[:-1], 0)
+    reached = moved(beginning, at) + missed + before + _times(after[beginning], otherwise[at])
+    return reached[np.searchsorted(time, even.recorded.time)]
+
+
+def _accumulated(
+    after: Float[np.ndarray, "2 2"], pushed: Float[np.ndarray, "samples 2"]
+) -> Float[np.ndarray, "samples 2"]:
+    """x(k) = `after` x(k - 1) + `pushed`(k) from rest, by sums over twice as many samples each time."""
+    total, count = pushed.copy(), 1
+    while count < len(total):
+        total[count:] += total[:-count] @ after.T
+        after, count = after @ after, 2 * count
+    return total
+
+
+def _times(matrices: Float[np.ndarray, "#n 2 2"], x: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    return np.einsum("nij,nj->ni", np.broadcast_to(matrices, (len(x), 2, 2)), x)
+
+
+def _advances(A: Float[np.ndarray, "2 2"], length: np.ndarray) -> list[np.ndarray]:
+    """Over each length of time, what becomes of a state, of a rate that is held, and of one that grows from nothing
+    by 1/s: phi_0, h phi_1 and h^2 phi_2 of A h, each (lengths, 2, 2).
+
+    By Newton's interpolation on the eigenvalues, for there are many lengths and one matrix.
+
+    **Source**: Higham, "Functions of Matrices" (2008), definition 1.4.
+    """
+    one, other = np.linalg.eigvals(A).astype(complex)
+    if abs(one - other) < NEAR * abs(one + other):  # critically damped
+        other = one * (1 + NEAR)
+    apart = (one - other) or 1.0
+    advances = []
+    for k in range(3):
+        at_one, at_other = _phi(one * length, k), _phi(other * length, k)
+        slope = (at_one - at_other) / apart
+        whole = at_one[:, None, None] * np.eye(2) + slope[:, None, None] * (A - one * np.eye(2))
+        advances.append(whole.real * length[:, None, None] ** k)
+    return advances
+
+
+def _phi(z: np.ndarray, k: int) -> np.ndarray:
+    """sum_j z^j / (j + k)!, k up to 2."""
+    if k == 0:
+        return np.exp(z)
+    small = np.abs(z) < SMALL
+    safe = np.where(small, 1.0, z)
+    first = np.where(small, 1 + z / 2 + z**2 / 6 + z**3 / 24 + z**4 / 120, np.expm1(safe) / safe)
+    if k == 1:
+        return first
+    return np.where(small, 1 / 2 + z / 6 + z**2 / 24 + z**3 / 120, (first - 1) / safe)

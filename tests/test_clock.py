@@ -1,0 +1,140 @@
+"""Records of uneven clocks: motors stepped exactly from stamp to stamp, and who is to be believed."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import pmdc_jax
+from pmdc_jax.clock import evenly_stamped, is_even
+from pmdc_jax.errors import InputError
+from pmdc_jax.motor import Drive, Motor
+from pmdc_jax.recording import Recording
+from pmdc_jax.simulate import uniform
+from pmdc_jax.simulate.uneven import mean_and_rise, pieces_of, seen_at_record
+
+# its current settles within a sample: L shows in when samples came
+MOTOR = {"R": 1.0, "L": 3.4e-4, "Kb": 0.07, "Kt": 0.07, "J": 1.16e-4, "f": 1.1e-4}
+NOISE = np.array([0.05, 0.3])
+STEP = 1e-3
+
+
+def stamps(kind: str, count: int, rng: np.random.Generator) -> np.ndarray:
+    """When samples are taken, s: about an even clock, with steps of any length, or at two rates."""
+    if kind == "jitter":
+        return STEP * (np.arange(count) + rng.uniform(-0.4, 0.4, count))
+    steps = {
+        "even": np.ones(count),
+        "walk": rng.uniform(0.3, 1.7, count),
+        "two rates": np.where(np.arange(count) < count // 2, 1.0, 5.0),
+    }[kind]
+    return STEP * np.append(0.0, np.cumsum(steps[1:]))
+
+
+def rates() -> np.ndarray:
+    """Of current, speed, voltage and load, 1/s; the latter two are held."""
+    m = MOTOR
+    A = np.zeros((4, 4))
+    A[0, :3] = -m["R"] / m["L"], -m["Kb"] / m["L"], 1 / m["L"]
+    A[1, :2], A[1, 3] = (m["Kt"] / m["J"], -m["f"] / m["J"]), -1 / m["J"]
+    return A
+
+
+def record(time: np.ndarray, rng: np.random.Generator, noise: np.ndarray = NOISE) -> Recording:
+    """A run with steps of voltage and load, held from stamp to stamp."""
+    voltage = np.repeat(rng.uniform(-15, 15, len(time)), rng.integers(8, 40, len(time)))[
+        : len(time)
+    ]
+    load = np.repeat(rng.uniform(-0.1, 0.1, len(time)), 150)[: len(time)]
+    values, vectors = np.linalg.eig(rates())
+    back, states = np.linalg.inv(vectors), np.zeros((len(time), 2))
+    for k, step in enumerate(np.diff(time)):
+        whole = back @ np.r_[states[k], voltage[k], load[k]]
+        states[k + 1] = (vectors @ (np.exp(values * step) * whole)).real[:2]
+    current, speed = (states + noise * rng.normal(size=states.shape)).T
+    return Recording("r", time, voltage, current, speed, load)
+
+
+@pytest.mark.parametrize("kind", ["jitter", "walk", "two rates"])
+def test_motors_are_found_in_records_of_uneven_clocks(kind):
+    rng = np.random.default_rng(21)
+    run = record(stamps(kind, 2400, rng), rng)
+    result = pmdc_jax.identify([run])
+    for name, true in MOTOR.items():
+        estimate = result.parameters[name]
+        # of friction so short a run tells a per cent at best
+        assert abs(estimate.value / true - 1) < (0.05 if name == "f" else 0.01), name
+        assert abs(estimate.value - true) < 3 * estimate.stderr, name
+    fit = result.fit["r"]
+    assert fit.speed_rmse == pytest.approx(NOISE[1], rel=0.1)
+    assert fit.current_rmse == pytest.approx(NOISE[0], rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["jitter", "walk", "two rates"])
+def test_a_linear_motor_is_simulated_exactly_at_uneven_stamps(kind):
+    rng = np.random.default_rng(22)
+    run = record(stamps(kind, 300, rng), rng, 0 * NOISE)
+    found = pmdc_jax.simulate(Motor(**MOTOR), run)
+    np.testing.assert_allclose(found.speed, run.speed, atol=1e-9 * np.ptp(run.speed))
+    np.testing.assert_allclose(found.current, run.current, atol=1e-9 * np.ptp(run.current))
+
+
+def test_what_goes_straight_between_uneven_stamps_has_its_mean_and_first_moment():
+    """By quadrature over each even sample; at the stamps, the motor against many short held steps."""
+    rng = np.random.default_rng(23)
+    run = record(stamps("walk", 60, rng), rng, 0 * NOISE)
+    even = uniform(run)
+    mean, rise = mean_and_rise(even, straight=True)
+    share = (np.arange(2000) + 0.5) / 2000
+    for k, begin in enumerate(even.time):
+        drive = np.interp(begin + even.sample_time * share, run.time, run.voltage)
+        assert mean[k] == pytest.approx(drive.mean(), abs=1e-4)
+        assert rise[k] == pytest.approx(12 * np.mean((share - 0.5) * drive), abs=1e-3)
+    fine, unloaded = 400, attrs.evolve(even, load=None, uneven=attrs.evolve(run, load=None))
+    line = expm(rates() * even.sample_time / fine)
+    straight, true = np.zeros((2, len(even) * fine + 1, 4))
+    middles = (np.arange(fine) + 0.5) / fine
+    for k in range(len(even) * fine):
+        at, part = divmod(k, fine)
+        now = even.time[at] + even.sample_time * middles[part]
+        straight[k, 2] = mean[at] + rise[at] * (middles[part] - 0.5)
+        true[k, 2] = np.interp(now, run.time, run.voltage)
+        straight[k + 1, :2], true[k + 1, :2] = (line @ straight[k])[:2], (line @ true[k])[:2]
+    seen = straight[:-1:fine, :2]
+    then = seen_at_record(Motor(**MOTOR), Drive(), unloaded, seen, straight=True)
+    times = even.time[0] + even.sample_time / fine * np.arange(len(true))
+    for c in range(2):
+        want = np.interp(run.time, times, true[:, c])
+        # by steps short beside any motion
+        np.testing.assert_allclose(then[:, c], want, atol=1e-4 * np.ptp(want))
+
+
+def test_pieces_cover_every_even_sample_once():
+    rng = np.random.default_rng(24)
+    even = uniform(record(stamps("walk", 200, rng), rng))
+    pieces = pieces_of(even, straight=False)
+    of_sample = np.bincount(pieces.even, pieces.length)
+    np.testing.assert_allclose(of_sample, even.sample_time, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_stamps_of_a_computer_beside_an_even_clock_are_not_believed(seed):
+    """Those of samples that were late themselves are: by what their speed says of it."""
+    rng = np.random.default_rng(30 + seed)
+    late = stamps("jitter", 2000, rng)
+    true = record(late, rng)
+    assert not is_even(evenly_stamped(true).time)
+    stamped = attrs.evolve(record(stamps("even", 2000, rng), rng), time=late)
+    believed = evenly_stamped(stamped)
+    assert is_even(believed.time)
+    assert believed.time[-1] == pytest.approx(STEP * 1999, abs=STEP / 10)
+
+
+def test_a_long_gap_is_refused():
+    rng = np.random.default_rng(40)
+    run = record(stamps("even", 100, rng), rng)
+    time = run.time + 60.0 * (np.arange(100) >= 50)
+    with pytest.raises(InputError, match=r"sample 50.*a gap of 60 s.*Split the run"):
+        uniform(attrs.evolve(run, time=time))

@@ -1,0 +1,54 @@
+"""Spikes in records of the virtual bench, and what only looks like one."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+import pytest
+from test_check import EXCITATIONS, good_run
+
+from pmdc_jax.identify.prepare import prepare
+from pmdc_jax.recording import Recording
+from pmdc_jax.spikes import without_spikes
+
+ROWS = np.array([200, 777, 1500, 2100])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_nothing_is_taken_from_a_sound_record(seed):
+    for name in EXCITATIONS:
+        run = good_run(seed, name)
+        assert without_spikes(run) is run
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("speed", 0.0), ("speed", 65535.0), ("current", 400.0)]
+)
+def test_spikes_are_missing_and_told_of(column, value):
+    run = good_run(3, "staircase")
+    signal = getattr(run, column).copy()
+    rows = ROWS[np.abs(signal[ROWS] - value) > 0.5 * np.ptp(signal)]
+    assert len(rows)
+    signal[rows] = value
+    mended = without_spikes(attrs.evolve(run, **{column: signal}))
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(getattr(mended, column))), rows)
+    (note,) = mended.notes
+    assert note.column == column
+    assert "straight back: taken as missing" in note.what
+
+
+def test_a_pulse_of_the_voltage_makes_no_spike():
+    time = 1e-3 * np.arange(1000)
+    voltage = np.where(np.arange(1000) % 97 == 50, 24.0, 2.0)
+    current = np.roll(voltage, 1) * 3.0
+    run = Recording("pulses", time, voltage, current, speed=time)
+    assert without_spikes(run) is run
+
+
+def test_a_fit_does_not_see_spikes_and_its_findings_tell_of_them():
+    run = good_run(3, "staircase")
+    speed = run.speed.copy()
+    speed[ROWS] = 3000.0
+    given = prepare([attrs.evolve(run, speed=speed)], ())
+    assert np.isnan(given.runs[0].speed[ROWS]).all()
+    assert any("straight back" in finding.what for finding in given.findings)
