@@ -10,11 +10,11 @@ from .alignment import alignment, sampling
 from .clock import evenly_stamped, is_even
 from .plausibility import angle_against_speed, plain_units, signs, speed_of
 from .recording import Finding, Recording
+from .unmeasured import flat_tops, noise_of
 
 GAP = 3.0  # median steps
 JITTER = 0.02  # of a step, root mean square
 LEAP = 0.2  # of the range
-FLAT_TOP = 1e-9  # probability that a run of equal extreme values is chance
 
 
 def check(recordings: Sequence[Recording]) -> tuple[Finding, ...]:
@@ -95,19 +95,15 @@ def clipped(run: Recording) -> Iterator[Finding]:
     """
     for quantity in ("current", "speed"):
         values = getattr(run, quantity)
-        if values is None or not _is_noisy(values):
-            continue
-        for extreme in (np.nanmax(values), np.nanmin(values)):
-            start, length, expected = _flat_top(values, extreme)
-            if length > expected:
-                yield Finding(
-                    run.name,
-                    quantity,
-                    "warning",
-                    f"it looks clipped at {extreme:.6g}: {length} equal values in a row",
-                    f"from {place(run, start)}",
-                    "Record with a larger range, or cut these samples out (leave the cells empty)",
-                )
+        for extreme, start, length in [] if values is None else flat_tops(values):
+            yield Finding(
+                run.name,
+                quantity,
+                "warning",
+                f"it looks clipped at {extreme:.6g}: {length} equal values in a row",
+                f"from {place(run, start)}",
+                "Record with a larger range, or cut these samples out (leave the cells empty)",
+            )
 
 
 def wrapped_angle(run: Recording) -> Iterator[Finding]:
@@ -161,7 +157,7 @@ def leaps(run: Recording) -> Iterator[Finding]:
         return
     steps = np.abs(np.diff(run.current))
     row = int(np.argmax(steps))
-    if steps[row] > LEAP * np.ptp(run.current) and steps[row] > 10 * _noise(run.current):
+    if steps[row] > LEAP * np.ptp(run.current) and steps[row] > 10 * noise_of(run.current):
         yield Finding(
             run.name,
             "current",
@@ -197,8 +193,8 @@ def excitation(runs: Sequence[Recording]) -> Iterator[Finding]:
                 "whole run",
                 "Record the motor as it turns as well. If only friction held it, leave out the run",
             )
-        elif speed is not None and np.nanstd(speed) <= np.sqrt(2) * _noise(speed):
-            noise = _noise(speed)
+        elif speed is not None and np.nanstd(speed) <= np.sqrt(2) * noise_of(speed):
+            noise = noise_of(speed)
             what = f"it swings less than its noise of {noise:.3g}" if noise else "it never changes"
             yield Finding(
                 run.name,
@@ -241,13 +237,6 @@ def _outputs(run: Recording) -> dict[str, np.ndarray]:
     return {quantity: values for quantity, values in found.items() if values is not None}
 
 
-def _noise(values: np.ndarray) -> float:
-    """Standard deviation of white noise, from third differences, which motion hardly reaches."""
-    third = np.diff(values, 3)
-    third = third[np.isfinite(third)]
-    return float(np.median(np.abs(third)) / (0.6745 * np.sqrt(20))) if len(third) else 0.0
-
-
 def _moves(values: np.ndarray | None) -> bool:
     """Whether means over parts of the run differ by more than noise makes them."""
     if values is None:
@@ -256,31 +245,4 @@ def _moves(values: np.ndarray | None) -> bool:
     size = max(len(values) // 50, 1)
     means = values[: len(values) // size * size].reshape(-1, size).mean(1)
     rounding = 1e-9 * float(np.max(np.abs(values), initial=0.0))
-    return bool(np.std(means) > 2 * _noise(values) / np.sqrt(size) + rounding)
-
-
-def _is_noisy(values: np.ndarray) -> bool:
-    """Whether the channel scatters: neither a clean simulation nor one rounded to a few digits."""
-    values = values[np.isfinite(values)]
-    inner = values[(values > values.min()) & (values < values.max())]
-    if len(inner) < 100 or _noise(inner) < 1e-5 * np.ptp(values):
-        return False
-    third = np.diff(inner, 3)
-    return bool(np.mean(third[1:] * third[:-1] < 0) > 0.5)  # 0.77 for white noise, 0 for motion
-
-
-def _flat_top(values: np.ndarray, extreme: float) -> tuple[int, int, float]:
-    """Start and length of the longest run of the extreme value, and the length chance may make."""
-    if extreme == 0:  # a motor at rest, or a sensor that knows one direction
-        return 0, 0, np.inf
-    padded = np.concatenate(([False], values == extreme, [False])).astype(np.int8)
-    starts, ends = (np.flatnonzero(np.diff(padded) == sign) for sign in (1, -1))
-    later = starts > 0  # a filter or a delay may hold the first value
-    if not later.any():
-        return 0, 0, np.inf
-    starts, ends = starts[later], ends[later]
-    longest = int(np.argmax(ends - starts))
-    inner = values[(values != extreme) & np.isfinite(values)]
-    repeats = (np.count_nonzero(np.diff(inner) == 0) + 1) / len(inner)
-    expected = 1 + np.log(FLAT_TOP / len(values)) / np.log(min(repeats, 0.999))
-    return int(starts[longest]), int(ends[longest] - starts[longest]), max(float(expected), 5.0)
+    return bool(np.std(means) > 2 * noise_of(values) / np.sqrt(size) + rounding)

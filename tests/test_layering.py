@@ -26,8 +26,8 @@ BELOW = {
     "motor": {"effects"},
     "simulate": {"clock", "effects", "errors", "motor", "precision", "recording", "threads"},
     "clock": {"recording"},
-    "spikes": {"recording"},
-    "check": {"alignment", "clock", "plausibility", "recording"},
+    "unmeasured": {"recording"},
+    "check": {"alignment", "clock", "plausibility", "recording", "unmeasured"},
     "motor_file": {"effects", "errors", "motor", "report"},
     "control": {
         "compiled",
@@ -49,7 +49,7 @@ BELOW = {
         "precision",
         "recording",
         "simulate",
-        "spikes",
+        "unmeasured",
         "threads",
     },
 }

@@ -275,7 +275,7 @@ def _missed(fit: Mapping[str, RunFit]) -> Iterator[str]:
         if noise and size > MISSED * noise:
             yield (
                 f"what the fit leaves of the {name} is {size / noise:.2g} times its white noise: `pmdc diagnose` tells "
-                "whether the model lacks something, or a torque disturbs the motor"
+                "whether the model lacks something, or the motor or a sensor was disturbed"
             )
 
 

@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..motor import PARAMETERS
 from ..recording import Finding, Recording, Runs, recordings_of
 from ..simulate import Tape, uniform
-from ..spikes import without_spikes
+from ..unmeasured import without_unmeasured
 from .bounds import search_bounds
 from .identification import Role
 from .noise import white_noise
@@ -85,7 +85,7 @@ def prepare(
 ) -> Prepared:
     """Check the recordings and lay them out; raises `InputError` where they cannot give an answer."""
     recordings, holdout = (
-        [without_spikes(run) for run in recordings_of(runs)] for runs in (recordings, holdout)
+        [without_unmeasured(run) for run in recordings_of(runs)] for runs in (recordings, holdout)
     )
     _refuse(recordings, holdout, tie, known)
     findings = check([*recordings, *holdout])

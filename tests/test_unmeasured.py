@@ -1,4 +1,4 @@
-"""Spikes in records of the virtual bench, and what only looks like one."""
+"""Samples that are no measurements, and what only looks like some."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from test_check import EXCITATIONS, good_run
 
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.recording import Recording
-from pmdc_jax.spikes import without_spikes
+from pmdc_jax.unmeasured import without_unmeasured
 
 ROWS = np.array([200, 777, 1500, 2100])
 
@@ -18,7 +18,7 @@ ROWS = np.array([200, 777, 1500, 2100])
 def test_nothing_is_taken_from_a_sound_record(seed):
     for name in EXCITATIONS:
         run = good_run(seed, name)
-        assert without_spikes(run) is run
+        assert without_unmeasured(run) is run
 
 
 @pytest.mark.parametrize(
@@ -30,11 +30,11 @@ def test_spikes_are_missing_and_told_of(column, value):
     rows = ROWS[np.abs(signal[ROWS] - value) > 0.5 * np.ptp(signal)]
     assert len(rows)
     signal[rows] = value
-    mended = without_spikes(attrs.evolve(run, **{column: signal}))
+    mended = without_unmeasured(attrs.evolve(run, **{column: signal}))
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(getattr(mended, column))), rows)
     (note,) = mended.notes
     assert note.column == column
-    assert "straight back: taken as missing" in note.what
+    assert "straight back" in note.what
 
 
 def test_a_pulse_of_the_voltage_makes_no_spike():
@@ -42,7 +42,7 @@ def test_a_pulse_of_the_voltage_makes_no_spike():
     voltage = np.where(np.arange(1000) % 97 == 50, 24.0, 2.0)
     current = np.roll(voltage, 1) * 3.0
     run = Recording("pulses", time, voltage, current, speed=time)
-    assert without_spikes(run) is run
+    assert without_unmeasured(run) is run
 
 
 def test_a_fit_does_not_see_spikes_and_its_findings_tell_of_them():
@@ -52,3 +52,12 @@ def test_a_fit_does_not_see_spikes_and_its_findings_tell_of_them():
     given = prepare([attrs.evolve(run, speed=speed)], ())
     assert np.isnan(given.runs[0].speed[ROWS]).all()
     assert any("straight back" in finding.what for finding in given.findings)
+
+
+def test_what_is_clipped_is_missing():
+    run = good_run(7, "prbs", noise=1e-3)
+    limit = np.quantile(run.current, 0.9)
+    mended = without_unmeasured(attrs.evolve(run, current=np.minimum(run.current, limit)))
+    np.testing.assert_array_equal(np.isnan(mended.current), run.current >= limit)
+    (note,) = mended.notes
+    assert "looks clipped" in note.what

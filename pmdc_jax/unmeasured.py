@@ -1,0 +1,115 @@
+"""Samples that are no measurements: they leap out and straight back, as where a telegram was lost, or the channel could
+not show more than the end of its range."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import attrs
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .recording import MAX_MISSING, Finding, Recording
+
+# A spike is so many times what a signal usually bends from sample to sample, and this share of its range at least
+STANDS_OUT, LARGE = 50.0, 0.2
+# Its neighbours differ by no more than this share of it; a voltage is steady if it moves by no more of its range
+ALIKE = 0.2
+# More than this share of all samples are no spikes
+RARE = 0.01
+FLAT_TOP = 1e-9  # probability that a run of equal extreme values is chance
+
+
+def without_unmeasured(run: Recording) -> Recording:
+    """A run in which the outputs' spikes, and what was clipped of them, is missing, with a note on either."""
+    outputs = ("speed", "current") if run.drive == "voltage" else ("speed",)
+    for name in outputs:
+        signal = getattr(run, name)
+        if signal is None:
+            continue
+        spikes = _spikes(signal) & _steady(run)
+        if 0 < spikes.sum() <= RARE * len(run):
+            run = _without(run, name, spikes, "leaps out and straight back")
+        signal = getattr(run, name)
+        ends = [extreme for extreme, *_ in flat_tops(signal)]
+        clipped = np.isin(signal, ends)
+        missing = np.mean(clipped | np.isnan(signal))
+        if ends and missing <= MAX_MISSING:
+            run = _without(run, name, clipped, "looks clipped")
+    return run
+
+
+def _without(run: Recording, name: str, lost: Bool[np.ndarray, " samples"], how: str) -> Recording:
+    """A run less some samples of an output."""
+    signal, rows = getattr(run, name), np.flatnonzero(lost)
+    others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+    note = Finding(
+        run.name,
+        name,
+        "note",
+        f"it {how}, at {signal[rows[0]]:.6g}: taken as missing",
+        f"sample {rows[0] + 1} ({run.time[rows[0]]:.6g} s){others}",
+        "If the motor did so, sample faster, and with a larger range",
+    )
+    missing = np.where(lost, np.nan, signal)
+    return attrs.evolve(run, notes=(*run.notes, note), **{name: missing})
+
+
+def _spikes(signal: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
+    before, after = np.diff(signal)[:-1], -np.diff(signal)[1:]
+    size = np.where(before * after > 0, np.minimum(np.abs(before), np.abs(after)), 0.0)
+    apart = np.abs(signal[2:] - signal[:-2])
+    low, high = np.nanquantile(signal, [0.02, 0.98])
+    least = max(STANDS_OUT * np.nanmedian(np.abs(np.diff(signal, 2))), LARGE * (high - low))
+    return np.pad((size > least) & (apart < ALIKE * size), 1)
+
+
+def _steady(run: Recording) -> Bool[np.ndarray, " samples"]:
+    """Where what drives cannot have made a spike, for it is as it was."""
+    drive = np.asarray(getattr(run, run.drive))
+    leaps = np.abs(np.diff(drive, prepend=drive[0])) > ALIKE * np.ptp(drive)
+    return ~(leaps | np.roll(leaps, 1) | np.roll(leaps, -1))
+
+
+def flat_tops(
+    values: Float[np.ndarray, " samples"],
+) -> Iterator[tuple[float, int, int]]:
+    """Extremes at which a noisy signal stays as no chance makes it, and start and length of the longest stay there."""
+    for extreme in (np.nanmax(values), np.nanmin(values)) if _is_noisy(values) else ():
+        start, length, expected = _flat_top(values, extreme)
+        if length > expected:
+            yield float(extreme), start, length
+
+
+def noise_of(values: np.ndarray) -> float:
+    """Standard deviation of white noise, from third differences, which motion hardly reaches."""
+    third = np.diff(values, 3)
+    third = third[np.isfinite(third)]
+    return float(np.median(np.abs(third)) / (0.6745 * np.sqrt(20))) if len(third) else 0.0
+
+
+def _is_noisy(values: np.ndarray) -> bool:
+    """Whether the channel scatters: neither a clean simulation nor one rounded to a few digits."""
+    values = values[np.isfinite(values)]
+    inner = values[(values > values.min()) & (values < values.max())]
+    if len(inner) < 100 or noise_of(inner) < 1e-5 * np.ptp(values):
+        return False
+    third = np.diff(inner, 3)
+    return bool(np.mean(third[1:] * third[:-1] < 0) > 0.5)  # 0.77 for white noise, 0 for motion
+
+
+def _flat_top(values: np.ndarray, extreme: float) -> tuple[int, int, float]:
+    """Start and length of the longest run of the extreme value, and the length chance may make."""
+    if extreme == 0:  # a motor at rest, or a sensor that knows one direction
+        return 0, 0, np.inf
+    padded = np.concatenate(([False], values == extreme, [False])).astype(np.int8)
+    starts, ends = (np.flatnonzero(np.diff(padded) == sign) for sign in (1, -1))
+    later = starts > 0  # a filter or a delay may hold the first value
+    if not later.any():
+        return 0, 0, np.inf
+    starts, ends = starts[later], ends[later]
+    longest = int(np.argmax(ends - starts))
+    inner = values[(values != extreme) & np.isfinite(values)]
+    repeats = (np.count_nonzero(np.diff(inner) == 0) + 1) / len(inner)
+    expected = 1 + np.log(FLAT_TOP / len(values)) / np.log(min(repeats, 0.999))
+    return int(starts[longest]), int(ends[longest] - starts[longest]), max(float(expected), 5.0)
