@@ -162,6 +162,13 @@ def test_what_is_not_in_the_library_in_words():
     assert "Held-out runs are missed by 3.00 times what the fitted ones are" in held_out
 
 
+def test_an_effect_that_makes_hold_outs_worse_is_said_to():
+    gap = {"train": Gap(1.2, 1.0, 1.0), "holdout": Gap(1.3, 1.6, 1.0)}
+    told = words(evolve(not_in_library(), effects=named().effects, gap=gap))
+    assert "With it held-out runs are missed by more than without" in told
+    assert "what is left is no effect" not in told
+
+
 @pytest.mark.parametrize(("after", "beyond"), [(2.4, None), (2.6, 2.6)])
 def test_hold_outs_tell_what_fitted_runs_do_not(after, beyond):
     gap = {"train": Gap(4.0, 1.0, 1.0), "holdout": Gap(5.0, after, 1.0)}

@@ -15,6 +15,8 @@ Verdict = Literal["none_detected", "named", "ambiguous", "not_in_library"]
 
 # Hold-outs that are missed by so many times what the fitted runs are show what those do not
 BEYOND = 2.5
+# ... or the effects that were added make them worse by this factor
+WORSE = 1.1
 
 
 @frozen
@@ -111,3 +113,9 @@ def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:
     """See `Diagnosis.beyond_fitted`."""
     ratio = gap["holdout"].after / gap["train"].after if "holdout" in gap else 1.0
     return ratio if ratio > BEYOND else None
+
+
+def worse_held_out(gap: Mapping[Role, Gap]) -> bool:
+    """Whether the effects that were added make hold-outs worse: then others are missing that look alike in the fitted
+    runs."""
+    return "holdout" in gap and gap["holdout"].after > WORSE * gap["holdout"].before

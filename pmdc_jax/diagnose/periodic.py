@@ -23,10 +23,11 @@ SLOWEST, NEAR, FAR = 12, 3, 6
 # runs with quantised speed up to 180, but at one frequency of three runs no more than 7 in any noise; a periodic
 # torque 200 and more in every run.
 STANDS_OUT = 50.0
-# ... and so many times as far if fewer than three runs could have it
+# ... and so many times as far, on the geometric mean, if fewer than three runs could have it
 ALONE = 10.0
-# A line that what drives has as well is no line of its own
-DRIVEN = 10.0
+# A line that what drives has as well is no line of its own, unless it stands out so many times as far: a controller
+# answers to a torque from outside
+DRIVEN, ANSWERED = 10.0, 10.0
 # ... and a drive that repeats itself this well has harmonics, at which any misfit has lines
 REPEATED = 0.95
 PEAKS = 5
@@ -81,20 +82,26 @@ def common_line(spectra: Sequence[Spectrum]) -> Line | None:
     for one in spectra:
         for peak in np.argsort(one.residual)[-PEAKS:]:
             frequency = peak / one.duration
-            mine = [
-                float(s.residual[_near(frequency, s)].max(initial=0.0))
-                for s in spectra
-                if s.driving[_near(frequency, s)].max(initial=0.0) < DRIVEN
-            ]
-            if 2 * sum(height > enough for height in mine) <= len(spectra):
+            mine = [height for s in spectra if (height := _own_height(frequency, s)) > 0]
+            if 2 * sum(height > STANDS_OUT for height in mine) <= len(spectra):
                 continue
-            height = float(np.median(mine))
+            few = len(spectra) < 3
+            height = float(np.exp(np.mean(np.log(mine))) if few else np.median(mine))
+            if height < enough:
+                continue
             if best is None or height > best.height:
                 near = _near(frequency, longest, 1 / one.duration)
                 sharp = near.start + int(np.argmax(longest.residual[near]))
                 low, high = (sharp - 1) / longest.duration, (sharp + 1) / longest.duration
                 best = Line(low, high, height)
     return best
+
+
+def _own_height(frequency: float, one: Spectrum) -> float:
+    """How far a line stands out in a run, zero if it is one of what drives."""
+    near = _near(frequency, one)
+    height, driving = (float(x[near].max(initial=0.0)) for x in (one.residual, one.driving))
+    return height if driving < max(DRIVEN, height / ANSWERED) else 0.0
 
 
 def _near(frequency: float, one: Spectrum, width: float = 0.0) -> slice:

@@ -27,6 +27,7 @@ from .diagnosis import (
     Region,
     Verdict,
     beyond_fitted,
+    worse_held_out,
 )
 from .evidence import Block
 from .experiment import next_experiment
@@ -88,7 +89,7 @@ def diagnose(
     verdict = _verdict(naming)
     gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
     total = _total(gaps, base)
-    if beyond_fitted(total):
+    if beyond_fitted(total) or worse_held_out(total):
         verdict = "not_in_library"
     seconds = {
         "identify": identified - began,

@@ -11,13 +11,14 @@ from jaxtyping import Float
 
 from ..effects import EFFECTS
 from ..identify.colour import Whitener, whitener
+from ..identify.identifiability import SHARE
 from ..identify.polish import polish, stood
 from ..identify.prepare import Prepared
 from ..identify.problem import Unknowns
 from ..identify.refine import Refined
 from ..identify.sharpen import residuals_of, whitened
 from ..identify.solve import POOR, Solved, searched
-from ..identify.uncertainty import FLAT
+from ..identify.uncertainty import FLAT, information
 from ..threads import side_by_side, side_by_side_until
 from .candidates import AROUND, FULLER, STARTS, Values
 from .compare import Comparison
@@ -128,8 +129,11 @@ class Refits:
         fuller = FULLER[effect]
         effects = (*(e for e in current.effects if e != effect), fuller.effect)
         given, begun = self._in_full(current, effect, effects)
-        extra = {f"{fuller.effect}.{field}" for field in fuller.extra}
-        free = jnp.asarray([name not in extra for name in given.problem.parameters.names])
+        held = {f"{fuller.effect}.{field}" for field in fuller.extra}
+        if "Kt" in _unseen(current):
+            # all torques would grow together, until what is held is nothing beside them
+            held.add("Kt")
+        free = jnp.asarray([name not in held for name in given.problem.parameters.names])
         given = given._replace(problem=replace(given.problem, free=free))
         return settled(effects, given, begun, white)
 
@@ -346,3 +350,23 @@ def common_phase(
         fits[run] = np.take_along_axis(together, best, 0)[0]
     chosen = int(np.argmax(sizes**2 @ fits))
     return float(common[chosen]), angles[:, chosen]
+
+
+def _unseen(model: Model) -> set[str]:
+    """The parameters that have a part in what the runs do not determine."""
+    problem, polished = model.given.problem, model.polished
+    names = problem.parameters.names
+    free = np.array([k not in polished.refined.at_bound for k in range(len(names))])
+    found = information(
+        polished.evaluation.residuals,
+        polished.evaluation.jacobian,
+        problem.tape.run,
+        free,
+        len(model.given.training),
+    )
+    return {
+        name
+        for d in found.unseen
+        for name, share in zip(names, d, strict=True)
+        if abs(share) > SHARE
+    }

@@ -77,7 +77,7 @@ def with_steps(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
 def steps_of(run: Recording) -> Steps:
     """The steps of the voltage of a run that stand out, as if they came with the samples."""
     at, height = np.zeros(0, int), np.zeros(0)
-    if run.drive == "voltage" and run.voltage is not None and len(run) > 3:
+    if run.drive == "voltage" and run.voltage is not None and run.uneven is None and len(run) > 3:
         rise = np.diff(run.voltage)
         size = np.abs(rise)
         around = np.pad(size, 1)

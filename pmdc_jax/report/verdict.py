@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..diagnose.diagnosis import Detectable, Diagnosis, EffectFound, Region
+from ..diagnose.diagnosis import Detectable, Diagnosis, EffectFound, Region, worse_held_out
 from ..identify.identification import Estimate, Role, RunFit
 from .notation import (
     amount,
@@ -87,7 +87,8 @@ def _ambiguous(diagnosis: Diagnosis) -> list[str]:
 def _not_in_library(diagnosis: Diagnosis) -> list[str]:
     sentences = [_disagreement(diagnosis)]
     if diagnosis.effects:
-        rest = "" if diagnosis.beyond_fitted else "; what is left is no effect of the library"
+        elsewhere = diagnosis.beyond_fitted or worse_held_out(diagnosis.gap)
+        rest = "" if elsewhere else "; what is left is no effect of the library"
         sentences.append(f"{_capital(_found(diagnosis))} explains part of it and was added{rest}.")
     else:
         sentences.append("Something is missing that no effect of the library explains.")
@@ -106,6 +107,11 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
         sentences.append(
             f"Held-out runs are missed by {significant(beyond)} times what the fitted ones are: something shows there"
             " that the fitted ones do not tell of. Fit one of them, too."
+        )
+    if worse_held_out(diagnosis.gap):
+        sentences.append(
+            "With it held-out runs are missed by more than without: something else is missing that looks alike in the"
+            " fitted ones. Fit one of the held-out runs, too."
         )
     return sentences
 
