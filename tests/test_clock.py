@@ -57,7 +57,12 @@ def record(time: np.ndarray, rng: np.random.Generator, noise: np.ndarray = NOISE
     return Recording("r", time, voltage, current, speed, load)
 
 
-@pytest.mark.parametrize("kind", ["jitter", "walk", "two rates"])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "kind", ["walk", pytest.param("jitter", marks=SLOW), pytest.param("two rates", marks=SLOW)]
+)
 def test_motors_are_found_in_records_of_uneven_clocks(kind):
     rng = np.random.default_rng(21)
     run = record(stamps(kind, 2400, rng), rng)
