@@ -305,6 +305,16 @@ def test_a_line_that_drives_is_none():
     assert common_line(shaken([7.3] * 4, driven=7.3)) is None
 
 
+def test_a_line_that_a_controller_answers_to_is_one():
+    """It stands out of the voltage, too, but far less. Two runs are enough if one of them shows it far more clearly."""
+    free, answered = shaken([7.3] * 2, size=6.0)
+    answered = answered._replace(driving=np.maximum(answered.driving, answered.residual / 20))
+    line = common_line([free, answered])
+    assert line.low < 7.3 < line.high
+    driven = answered._replace(driving=answered.residual)
+    assert common_line([free, driven]) is None
+
+
 def test_harmonics_of_a_drive_that_repeats_itself_are_none():
     """A wrong friction has lines at harmonics that the drive itself may lack."""
     rng, time = np.random.default_rng(0), np.arange(8000) * 1e-3

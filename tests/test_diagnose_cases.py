@@ -71,6 +71,16 @@ def test_hidden_friction_is_named_and_closes_the_gap(noise):
     assert found.base.parameters["f"].value > found.final.parameters["f"].value
 
 
+@pytest.mark.slow
+def test_friction_is_named_where_no_run_has_a_load():
+    """A peak of friction is ruled out there, too, although the scale of all torques is not seen."""
+    runs = recorded(vb.BenchMotor(**PAPER, coulomb_Nm=0.08), 4, NOISE)
+    found = diagnose([run for run in runs if run.name != "loaded"], unloaded=True)
+    assert found.verdict == "named"
+    assert [effect.name for effect in found.effects] == ["coulomb_friction"]
+    assert found.final.parameters["Kt"].status == "not_identifiable"
+
+
 @pytest.mark.parametrize("noise", [NOISE, SHAKEN], ids=["white", "coloured"])
 def test_nothing_is_found_where_nothing_is_missing(noise):
     found = diagnose(recorded(vb.BenchMotor(**PAPER), 5, noise))
