@@ -17,14 +17,11 @@ from jaxtyping import Float
 from scipy.linalg import solve_banded
 
 from ..simulate import Tape
-from .likelihood import Samples, unlikely
+from .likelihood import LIKELIER, Samples, unlikely
 from .noise import quantum
 from .polish import Polished, polish
 from .prepare import Prepared
 
-# A mean must be this much likelier than the speed itself, by the logarithm; or be no less likely by more, where the
-# speed is counted like one but other noise would show alike
-LIKELIER = 30.0
 # An encoder has fewer lines, and a whole number of them
 LINES, WHOLE = 2e4, 0.02
 # Power in counts squared, between that of a speed that was rounded to counts, 1/12, and that of such a mean, 1/3
@@ -121,7 +118,7 @@ def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polishe
 
 def counted_over(counts: Sequence[np.ndarray]) -> tuple[Sensed | None, float]:
     """Of what speeds are the mean that are multiples of a count a sample, if of anything; and how much likelier that
-    must make them, by the logarithm.
+    must make them, by the logarithm; if less than nothing, no less likely by more.
 
     Angles that are rounded to counts have a white noise of 1/12 count squared. Of differences over one sample it is
     four times as strong at the highest frequency, and twice at half of that; of differences over two samples, counted

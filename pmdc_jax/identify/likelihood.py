@@ -14,6 +14,9 @@ from .sharpen import series_of, training_runs
 
 Samples = Float[np.ndarray, " samples"]
 
+# Records are taken otherwise than they came if that is so much likelier, by the logarithm
+LIKELIER = 30.0
+
 
 def unlikely(
     given: Prepared, fit: Polished, sensed: Callable[[Samples], Samples] = lambda speed: speed

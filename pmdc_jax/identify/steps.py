@@ -19,7 +19,7 @@ from scipy.linalg import expm
 from ..recording import Recording
 from ..simulate.tape import BLOCK
 from .averaged import of_averaged
-from .likelihood import unlikely
+from .likelihood import LIKELIER, unlikely
 from .polish import Polished, polish
 from .prepare import Prepared
 from .problem import Problem
@@ -32,8 +32,8 @@ FEWEST, SAMPLES = 4, 20
 NUMBERS = 2e7
 # Steps without a clock come anywhere in a sample: their shares of it spread so much, and hardly leave it
 SPREAD, OUTSIDE = 0.15, 0.2
-# They must be so much likelier, by the logarithm, and by so much for each
-LIKELIER, EACH = 30.0, 5.0
+# Each of them must make the runs so much likelier
+EACH = 5.0
 PASSES = 5
 # What is said of the voltage
 STEPPED = "steps between samples"
@@ -65,10 +65,11 @@ def with_steps(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     if promised < enough or not _come_anywhere(steps):
         return given, fit
     placed, better = given, fit
-    for _ in range(PASSES):
+    for again in range(PASSES):
+        if again:
+            steps, _ = _moved(placed.problem, better, steps)
         placed = _placed(given, better, steps)
         better = polish(placed.problem, better.refined)
-        steps, _ = _moved(placed.problem, better, steps)
     sensed = of_averaged(given)
     gained = unlikely(given, fit, sensed) - unlikely(given, better, sensed)
     return (placed, better) if gained > enough else (given, fit)

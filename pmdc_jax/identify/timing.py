@@ -22,14 +22,12 @@ from ..recording import Recording
 from ..simulate import Tape, uniform
 from .averaged import as_recorded, of_averaged, seems_averaged, without_averaging
 from .clock import on_clock
-from .likelihood import unlikely
+from .likelihood import LIKELIER, unlikely
 from .polish import Polished, polish
 from .prepare import Prepared
 from .problem import normal_matrix
 
-# Another timing must be so much likelier, by the logarithm
-LIKELIER = 30.0
-# ... and is not even asked where the misfit shows less than this share of half a sample
+# Another timing is not even asked where the misfit shows less than this share of half a sample
 SHOWS = 0.3
 
 
