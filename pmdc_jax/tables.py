@@ -82,7 +82,7 @@ class CsvTable:
         header, self._header_line, self._start = _past_preamble(
             self._raw, *_find_header(self._raw, path)
         )
-        self._separator = next((s for s in "\t;" if s in header), ",")
+        self._separator = _separator(header)
         names = [name.strip() for name in _fields(header, self._separator)]
         units, start = _find_units(self._raw, self._start, self._separator, len(names))
         self._start = _past_empty_lines(self._raw, start)
@@ -310,7 +310,7 @@ def _past_preamble(raw: bytes, line: str, number: int, start: int) -> tuple[str,
         end = raw.find(b"\n", start) + 1 or len(raw)
         number, now = number + 1, raw[start:end].decode().strip("\r\n")
         if _is_numbers(now) and now.strip():
-            separator = next((s for s in "\t;" if s in now), ",")
+            separator = _separator(now)
             count = len(_fields(now, separator))
             if count < 2 or len(_fields(line, separator)) == count:
                 break
@@ -368,6 +368,11 @@ def _is_numbers(line: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _separator(line: str) -> str:
+    """What separates the fields of a line: a tab, else a semicolon, else a comma."""
+    return next((s for s in "\t;" if s in line), ",")
 
 
 def _fields(line: str, separator: str) -> list[str]:

@@ -91,7 +91,7 @@ def test_what_goes_straight_between_uneven_stamps_has_its_mean_and_first_moment(
     rng = np.random.default_rng(23)
     run = record(stamps("walk", 60, rng), rng, 0 * NOISE)
     even = uniform(run)
-    mean, rise = mean_and_rise(even, straight=True)
+    mean, rise = mean_and_rise(even, pieces_of(even, straight=True))
     share = (np.arange(2000) + 0.5) / 2000
     for k, begin in enumerate(even.time):
         drive = np.interp(begin + even.sample_time * share, run.time, run.voltage)

@@ -454,10 +454,7 @@ def test_missing_angles_are_missing_speeds():
 
 
 def test_simulate_keeps_the_time_stamps_and_starts_where_the_recording_does():
-    """At uneven stamps too, and whatever the caller's precision is.
-
-    Between even samples the speed is interpolated: off by at most h^2 / 8 times its curvature.
-    """
+    """At uneven stamps too, and whatever the caller's precision is."""
     rng, heavy = np.random.default_rng(7), PAPER | {"J": 0.01}
     time = 2.0 + 1e-3 * np.cumsum(rng.uniform(0.9, 1.1, 300))
     run = Recording(

@@ -11,14 +11,14 @@ from jaxtyping import Float
 
 from ..effects import EFFECTS
 from ..identify.colour import Whitener, whitener
-from ..identify.identifiability import SHARE
+from ..identify.identifiability import moved_by
 from ..identify.polish import polish, stood
 from ..identify.prepare import Prepared
 from ..identify.problem import Unknowns
 from ..identify.refine import Refined
 from ..identify.sharpen import residuals_of, whitened
 from ..identify.solve import POOR, Solved, searched
-from ..identify.uncertainty import FLAT, information
+from ..identify.uncertainty import FLAT, information_of
 from ..threads import side_by_side, side_by_side_until
 from .candidates import AROUND, FULLER, STARTS, Values
 from .compare import Comparison
@@ -354,19 +354,6 @@ def common_phase(
 
 def _unseen(model: Model) -> set[str]:
     """The parameters that have a part in what the runs do not determine."""
-    problem, polished = model.given.problem, model.polished
-    names = problem.parameters.names
-    free = np.array([k not in polished.refined.at_bound for k in range(len(names))])
-    found = information(
-        polished.evaluation.residuals,
-        polished.evaluation.jacobian,
-        problem.tape.run,
-        free,
-        len(model.given.training),
-    )
-    return {
-        name
-        for d in found.unseen
-        for name, share in zip(names, d, strict=True)
-        if abs(share) > SHARE
-    }
+    problem = model.given.problem
+    unseen = information_of(problem, model.polished).unseen
+    return {name for d in unseen for name in moved_by(d, problem.parameters)}

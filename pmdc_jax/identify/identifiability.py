@@ -14,15 +14,18 @@ from .parameters import Parameters
 SHARE = 0.05
 
 
+def moved_by(direction: np.ndarray, parameters: Parameters) -> tuple[str, ...]:
+    """The parameters that belong to a direction."""
+    return tuple(n for n, x in zip(parameters.names, direction, strict=True) if abs(x) > SHARE)
+
+
 def explain(
     unseen: Sequence[np.ndarray], parameters: Parameters, recordings: Sequence[Recording]
 ) -> tuple[Direction, ...]:
     """Say of each unseen direction which parameters it moves together, why it is unseen, and how to mend it."""
     directions = []
     for vector in unseen:
-        names = tuple(
-            name for name, share in zip(parameters.names, vector, strict=True) if abs(share) > SHARE
-        )
+        names = moved_by(vector, parameters)
         directions.append(Direction(names, *_reason(set(names), recordings)))
     # two directions that move the same parameters are one thing to say
     return tuple(dict.fromkeys(directions))
@@ -32,7 +35,7 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
     loads = [r.load for r in recordings if r.load is not None]
     loaded = any(np.ptp(load) > 0 or np.any(load != 0) for load in loads)
     electrical = any(r.voltage is not None for r in recordings)
-    driven = any(r.torque is not None for r in recordings)
+    driven = any(r.drive == "torque" for r in recordings)
     measured = any(r.voltage is not None and r.current is not None for r in recordings)
     turning = any(r.speed is not None or r.angle is not None for r in recordings if not r.held)
     listed = _listed(sorted(names))

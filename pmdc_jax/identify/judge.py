@@ -22,7 +22,7 @@ from .problem import Problem
 from .profile import QUADRATIC, profile_interval
 from .refine import Refined
 from .solve import SAME, Solved
-from .uncertainty import FLAT, Information, information
+from .uncertainty import FLAT, Information, information_of
 
 TIDYINGS = 3
 # What a fit leaves is told of if it is so many times the white noise
@@ -38,13 +38,13 @@ TO_SHOW = 0.3
 def judge(given: Prepared, solved: Solved) -> Identification:
     """What a fit tells of every parameter and of every run."""
     problem, training = given.problem, given.training
-    polished = _let_go(problem, solved.polished, len(training))
+    polished = _let_go(problem, solved.polished)
     parameters = problem.parameters
-    info = _information(problem, polished, len(training))
+    info = information_of(problem, polished)
     chosen = _tidy(problem, polished, info)
     for k in _vanished(parameters, info):
         if (lifted := _lifted(problem, chosen, k)) is not None:
-            info = _information(problem, lifted, len(training))
+            info = information_of(problem, lifted)
     best = chosen.refined
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
@@ -52,12 +52,14 @@ def judge(given: Prepared, solved: Solved) -> Identification:
     fit = _fits(
         given.runs, given.roles, problem.tape, np.asarray(ended.seen), np.asarray(unknowns.local)
     )
+    left = {name: _left(fit, name) for name in ("current", "speed")}
+    noise = {name: white_noise(errors) for name, errors in left.items()}
     return Identification(
         motor=_plain(parameters(best.unknowns.coordinates)),
         parameters=_estimates(parameters, best, info, given, _intervals(problem, best, info)),
         unidentified_directions=explain(info.unseen, parameters, training),
         fit=fit,
-        noise=_noise_of(fit),
+        noise={"current_A": noise["current"], "speed_rad_s": noise["speed"]},
         converged=best.converged,
         seed=solved.seed,
         seconds=solved.seconds,
@@ -65,7 +67,7 @@ def judge(given: Prepared, solved: Solved) -> Identification:
         findings=given.findings,
         covariance=info.covariance,
         covariance_names=parameters.names,
-        messages=_messages(given, solved, best, fit, chosen is not polished),
+        messages=_messages(given, solved, best, _missed(left, noise), chosen is not polished),
     )
 
 
@@ -85,20 +87,14 @@ def _intervals(
     return dict(zip(identified, side_by_side(interval, identified), strict=True))
 
 
-def _information(problem: Problem, polished: Polished, runs: int) -> Information:
-    evaluation, count = polished.evaluation, len(problem.parameters.names)
-    free = np.array([k not in polished.refined.at_bound for k in range(count)])
-    return information(evaluation.residuals, evaluation.jacobian, problem.tape.run, free, runs)
-
-
-def _let_go(problem: Problem, polished: Polished, runs: int) -> Polished:
+def _let_go(problem: Problem, polished: Polished) -> Polished:
     """The fit with no coordinate held at its bound that lies there by chance, along an unseen direction of several."""
 
     def released(held: Sequence[int]) -> Polished:
         return polished._replace(refined=polished.refined._replace(at_bound=tuple(held)))
 
     bound = polished.refined.at_bound
-    unseen = _information(problem, released(()), runs).unseen if bound else ()
+    unseen = information_of(problem, released(())).unseen if bound else ()
     several = [d for d in unseen if np.max(np.abs(d)) <= ALONE]
     return released([k for k in bound if all(abs(d[k]) <= SHARE for d in several)])
 
@@ -259,28 +255,22 @@ def _left(fit: Mapping[str, RunFit], name: str) -> list[np.ndarray]:
     return [m - s for m, s in pairs if m is not None and s is not None]
 
 
-def _noise_of(fit: Mapping[str, RunFit]) -> dict[str, float | None]:
-    return {
-        "current_A": white_noise(_left(fit, "current")),
-        "speed_rad_s": white_noise(_left(fit, "speed")),
-    }
-
-
-def _missed(fit: Mapping[str, RunFit]) -> Iterator[str]:
-    """What to say of outputs that are missed by far more than their noise."""
-    for name in ("current", "speed"):
-        left = _left(fit, name)
-        noise = white_noise(left)
-        size = np.sqrt(np.nanmean(np.square(np.concatenate(left)))) if left else 0.0
-        if noise and size > MISSED * noise:
+def _missed(
+    left: Mapping[str, list[np.ndarray]], noise: Mapping[str, float | None]
+) -> Iterator[str]:
+    """What to say of outputs of which far more is left than their noise."""
+    for name, errors in left.items():
+        size = np.sqrt(np.nanmean(np.square(np.concatenate(errors)))) if errors else 0.0
+        white = noise[name]
+        if white and size > MISSED * white:
             yield (
-                f"what the fit leaves of the {name} is {size / noise:.2g} times its white noise: `pmdc diagnose` tells "
+                f"what the fit leaves of the {name} is {size / white:.2g} times its white noise: `pmdc diagnose` tells "
                 "whether the model lacks something, or the motor or a sensor was disturbed"
             )
 
 
 def _messages(
-    given: Prepared, solved: Solved, best: Refined, fit: Mapping[str, RunFit], tied: bool
+    given: Prepared, solved: Solved, best: Refined, missed: Iterator[str], tied: bool
 ) -> tuple[str, ...]:
     messages = [
         f"{run.name}: the {run.drive} holds {given.unfelt[run.name]:.3g} {UNITS[run.drive]} of noise that the motor "
@@ -298,7 +288,7 @@ def _messages(
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
     if not best.converged:
         messages.append("the refinement did not converge: the gradient is not zero at its end")
-    messages += _missed(fit)
+    messages += missed
     if tied:
         messages.append("Kt was set equal to Kb, as they are in SI, and J and f go with it")
     return tuple(messages)

@@ -11,6 +11,8 @@ from jaxtyping import Float
 from scipy.special import chdtri, stdtrit
 
 from ..simulate import LOCAL
+from .polish import Polished
+from .problem import Problem
 
 REACH = NormalDist().inv_cdf(0.975)  # of a 95 % interval, in standard errors
 # A direction known no better than this, as standard error of a logarithm, counts as unseen.
@@ -42,6 +44,14 @@ class Part(NamedTuple):
 
     hessian: Float[np.ndarray, "parameters parameters"]
     score: Float[np.ndarray, " parameters"]
+
+
+def information_of(problem: Problem, polished: Polished) -> Information:
+    """What the runs that count tell about the coordinates that a fit left free; see `information`."""
+    found, held = polished.evaluation, polished.refined.at_bound
+    free = np.array([k not in held for k in range(len(problem.parameters.names))])
+    runs = int(np.sum(problem.counts))
+    return information(found.residuals, found.jacobian, problem.tape.run, free, runs)
 
 
 def information(residuals, jacobian, run, free: np.ndarray, runs: int) -> Information:

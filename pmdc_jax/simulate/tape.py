@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..motor import Drive
-from .uneven import flows_on, mean_and_rise
+from .uneven import flows_on, mean_and_rise, pieces_of
 
 if TYPE_CHECKING:
     from ..recording import Recording
@@ -164,7 +164,7 @@ class _Run:
         value = getattr(recording, drive)
         goes_on = straight or flows_on(recording)
         if recording.uneven is not None:
-            self.value, self.rise = mean_and_rise(recording, straight)
+            self.value, self.rise = mean_and_rise(recording, pieces_of(recording, straight))
         else:
             self.rise = np.diff(value, append=value[-1]) if goes_on else np.zeros(self.length)
             self.value = value + self.rise / 2

@@ -55,9 +55,10 @@ def pieces_of(run: Recording, straight: bool) -> Pieces:
     return Pieces(begins, begins - run.time[even], length, even, value, slope, load[recorded])
 
 
-def mean_and_rise(run: Recording, straight: bool) -> tuple[np.ndarray, np.ndarray]:
-    """What drives each even sample: its mean, and the rise of the straight line that has its first moment too."""
-    _, begins, length, even, value, slope, _ = pieces_of(run, straight)
+def mean_and_rise(run: Recording, pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
+    """What drives each even sample of a run: its mean, and the rise of the straight line that has its first moment
+    too."""
+    _, begins, length, even, value, slope, _ = pieces
     step, rise = run.sample_time, slope * length
     middle = begins + length / 2 - step / 2
     whole = length * (value + rise / 2)
@@ -78,8 +79,9 @@ def seen_at_record(
     Exact for the linear motor, and for what the true drive does otherwise than the straight line that has its mean
     and its first moment. What effects do besides within an even sample grows in proportion to time.
     """
-    time, begins, length, at, value, slope, loads = pieces_of(even, straight)
-    mean, rise = mean_and_rise(even, straight)
+    pieces = pieces_of(even, straight)
+    time, begins, length, at, value, slope, loads = pieces
+    mean, rise = mean_and_rise(even, pieces)
     step, line = even.sample_time, mean - rise / 2
     A, B = map(np.asarray, motor.state_space(drive))
     load = np.zeros(len(even)) if even.load is None else even.load
@@ -99,15 +101,26 @@ def seen_at_record(
     pushed = np.outer(apart, B[:, 0]) + np.outer(loads - load[at], B[:, 1])
     pushed = _times(held[along], pushed)
     pushed += _times(rising[along], np.outer(slope - rise[at] / step, B[:, 0]))
-    within, before = np.zeros((len(even), 2)), np.empty((len(at), 2))
-    nth = np.arange(len(at)) - np.searchsorted(at, at)
-    for n in range(nth.max() + 1):
-        (here,) = np.nonzero(nth == n)
-        before[here] = within[at[here]]
-        within[at[here]] = _times(after[along][here], before[here]) + pushed[here]
+    before, within = _through_pieces(at, after[along], pushed, len(even))
     otherwise = np.append(np.zeros((1, 2)), _accumulated(after[0], within)[:-1], 0)
     reached = moved(beginning, at) + missed + before + _times(after[beginning], otherwise[at])
     return reached[np.searchsorted(time, even.recorded.time)]
+
+
+def _through_pieces(
+    at: Int[np.ndarray, " pieces"],
+    after: Float[np.ndarray, "pieces 2 2"],
+    pushed: Float[np.ndarray, "pieces 2"],
+    samples: int,
+) -> tuple[Float[np.ndarray, "pieces 2"], Float[np.ndarray, "samples 2"]]:
+    """From rest as each even sample begins: the state before each of its pieces, and at its end."""
+    state, before = np.zeros((samples, 2)), np.empty((len(at), 2))
+    nth = np.arange(len(at)) - np.searchsorted(at, at)
+    for n in range(nth.max() + 1):
+        (here,) = np.nonzero(nth == n)
+        before[here] = state[at[here]]
+        state[at[here]] = _times(after[here], before[here]) + pushed[here]
+    return before, state
 
 
 def _accumulated(
