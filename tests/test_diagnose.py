@@ -19,12 +19,13 @@ from pmdc_jax.diagnose.evidence import Block, products
 from pmdc_jax.diagnose.experiment import difference_between
 from pmdc_jax.diagnose.kinship import are_rivals, is_within
 from pmdc_jax.diagnose.library import Library
-from pmdc_jax.diagnose.model import Model, model_of
+from pmdc_jax.diagnose.model import Fit, Model, model_of
 from pmdc_jax.diagnose.naming import Namer, Naming
 from pmdc_jax.diagnose.periodic import common_line, spectrum
 from pmdc_jax.diagnose.pipeline import may_be_none
 from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
+from pmdc_jax.diagnose.rounding import READINGS, gained_by_rounding, readings
 from pmdc_jax.diagnose.screen import common_to_waves, log_chance
 from pmdc_jax.diagnose.seen import Seen
 from pmdc_jax.effects import EFFECTS
@@ -224,6 +225,45 @@ def test_what_waves_of_any_period_gain_is_evidence_for_none():
     slow = 40.0 + by_chance
     slow[3] = 500.0  # one that is there raises the median by nothing
     assert common(slow) == {"cogging_torque": pytest.approx(40.0, abs=2.0)}
+
+
+def test_what_a_coarse_reading_leaves_is_evidence_for_nothing():
+    """Speeds that stand still twenty times, read in whole rad/s: what bends with the speed explains the errors."""
+    alarms = {"as if white": 0, "by rounding": 0}
+    for seed in range(50):
+        speed = np.random.default_rng(seed).uniform(-6, 6, 20).repeat(100)[:, None]
+        kind, known = (1e-3, (1,)), np.ones(len(speed), bool)
+        shared, own, residual, simulated = (
+            Series(x, known, kind)
+            for x in (speed[..., None], np.ones((len(speed), 1, 1)), np.round(speed) - speed, speed)
+        )
+        errors = readings(Fit(shared, own, residual, simulated), seed)
+        parts = (
+            shared.values,
+            (speed * np.abs(speed))[..., None],
+            errors,
+            residual.values[..., None],
+        )
+        rows = np.concatenate([*parts, own.values], -1)[:, 0] * np.sqrt(12)
+        evidence, drag = products([[rows]], 1, 1), Block((1,))
+        gain = evidence.regress().squares - evidence.regress([drag]).squares
+        noise = gained_by_rounding(evidence.of_readings(READINGS), drag)
+        alarms["as if white"] += stats.chi2.sf(gain, 1) < 0.01
+        alarms["by rounding"] += stats.chi2.sf(gain / noise, 1) < 0.01
+    assert alarms["as if white"] > 25
+    assert alarms["by rounding"] <= 3
+
+
+@pytest.mark.parametrize(("noise", "coarse"), [(0.0, True), (0.1, True), (1.0, False)])
+def test_only_steps_that_nothing_blurs_are_coarse(noise, coarse):
+    rng = np.random.default_rng(0)
+    exact, known = np.linspace(0, 20, 2000)[:, None], np.ones(2000, bool)
+    measured = 0.5 * np.round((exact + noise * rng.normal(size=exact.shape)) / 0.5)
+    left, simulated = (Series(x, known, (1e-3, (0,))) for x in (measured - exact, exact))
+    errors = readings(Fit(simulated, simulated, left, simulated), 0)
+    assert bool(errors.any()) is coarse
+    assert np.abs(errors).max() <= 0.25 + 1e-12
+    assert np.array_equal(errors, readings(Fit(simulated, simulated, left, simulated), 0))
 
 
 # ---------------------------------------------------------------------------------- the noise

@@ -445,9 +445,9 @@ def test_a_held_rotor_stays_where_it_is(x64, name):
         np.testing.assert_allclose(one[:, 0], other[:, 0], rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["resistance_heating", "stribeck_friction"])
+@pytest.mark.parametrize("name", ["resistance_heating", "stribeck_friction", "speed_sensor_delay"])
 def test_slow_sampling_is_as_exact(x64, name):
-    """At 10 ms, in equal steps of a millisecond or less."""
+    """At 10 ms, five times L / R, in equal steps of a millisecond or less; a delay is a part of a sample."""
     runs = [
         Recording(r.name, *(c[:64] for c in (r.time, r.voltage, r.current, r.speed, r.load)))
         for r in recordings(1e-2)

@@ -43,7 +43,8 @@ class Regression(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """Inner products of the white rows of every run: motor parameters first, then columns, residual last.
+    """Inner products of the white rows of every run: motor parameters first, then columns, what rounding may leave, and
+    the residual last.
 
     What belongs to a run alone (its initial state, its load) is projected out, with what can hardly be told from it.
     """
@@ -51,6 +52,15 @@ class Evidence(NamedTuple):
     products: Float[np.ndarray, "runs columns columns"]
     parameters: int  # how many columns are the motor's
     rows: int
+
+    def of_readings(self, count: int) -> list[Evidence]:
+        """The evidence if the residual were what rounding leaves of the `count` readings, where it matters at all."""
+        found = []
+        for reading in range(-1 - count, -1):
+            order = [*range(self.products.shape[1] - 1), reading]
+            if np.any(self.products[:, reading, reading]):
+                found.append(self._replace(products=self.products[:, order][:, :, order]))
+        return found
 
     def regress(self, blocks: Sequence[Block] = (), visible: float = VISIBLE) -> Regression:
         """Least squares of the residual on the motor's parameters and some blocks.
@@ -112,8 +122,8 @@ def products(
 ) -> Evidence:
     """Gather the evidence from white rows, of every run some at a time.
 
-    **Arguments**: the rows, whose first columns are those of the motor's `parameters`, then what may be missing, the
-    residual, and last the run's `own`.
+    **Arguments**: the rows, whose first columns are those of the motor's `parameters`, then what may be missing, what
+    rounding may leave, the residual, and last the run's `own`.
     """
     gathered, rows = [], 0
     for pieces in runs:

@@ -111,12 +111,13 @@ def ended(model: Model, white: Whitener) -> tuple[Prepared, Polished]:
 
 
 class Fit(NamedTuple):
-    """Of one training run, in A and rad/s: what is measured less what is simulated, and the derivatives of the
-    latter by the motor's parameters and by what belongs to the run alone."""
+    """Of one training run, in A and rad/s: what is simulated, what is measured less that, and the derivatives of the
+    former by the motor's parameters and by what belongs to the run alone."""
 
     shared: Series
     own: Series
     residual: Series
+    simulated: Series
 
 
 def rows_of(model: Model) -> list[Fit]:
@@ -126,6 +127,11 @@ def rows_of(model: Model) -> list[Fit]:
     count = model.given.problem.free.shape[0]
     residuals = residuals_of(model.given, model.polished)
     return [
-        Fit(series_of(tape, run, J[..., :count]), series_of(tape, run, J[..., count:]), residual)
+        Fit(
+            series_of(tape, run, J[..., :count]),
+            series_of(tape, run, J[..., count:]),
+            residual,
+            series_of(tape, run, np.asarray(evaluation.seen)),
+        )
         for run, residual in zip(model.training, residuals, strict=True)
     ]

@@ -67,11 +67,11 @@ def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
 @eqx.filter_jit
 def sensed(motor: Motor, tape: Tape, path: Path) -> Outputs:
     """By how much the sensors of `motor` report something else than the path."""
-    before, after = _states(motor, tape, path), _one_sample(motor, tape, path)
-    _, drive = _of_blocks(motor, tape)
+    along, drive = _of_blocks(motor, tape)
     value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T
     rise = None if tape.rise is None else jnp.asarray(tape.rise).T
-    seen = outputs(motor, drive, before, after, value, load, rise)
+    state, steps = _states(motor, tape, path), steps_in_sample(motor, tape)
+    seen = outputs(motor, along, drive, state, value, load, steps, rise)
     late = reported(motor, tape, seen.transpose(2, 0, 1))
     return late.transpose(2, 1, 0) - jnp.stack([path.current, path.speed], 1)
 

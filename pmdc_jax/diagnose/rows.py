@@ -21,26 +21,30 @@ from ..simulate import Tape
 from .library import TOGETHER, Change
 from .model import Fit, Model, rows_of
 from .response import Path, respond
+from .rounding import readings
 
 # Samples that are made white at once
 STRETCH = 2048
 
 
 class Rows(NamedTuple):
-    """Of one training run its fit, and what every candidate and curve changes in A and rad/s."""
+    """Of one training run its fit, what every candidate and curve changes, and what rounding may leave; A and rad/s."""
 
     fit: Fit
     columns: Float[np.ndarray, "samples outputs columns"]
+    rounding: Float[np.ndarray, "samples outputs readings"]
 
     def white(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
-        """Rows made white, some at a time: of the motor's parameters, the columns, the residual, and the run's own."""
-        shared, own, residual = self.fit
+        """Rows made white, some at a time: of the motor's parameters, the columns, what rounding may leave,
+        the residual, and the run's own."""
+        shared, own, residual, _ = self.fit
         back = len(whiten.filters[run])
         for first in range(back, len(residual.values), STRETCH):
             part = slice(first - back, first + STRETCH)
             everything = (
                 shared.values[part],
                 self.columns[part],
+                self.rounding[part],
                 residual.values[part, :, None],
                 own.values[part],
             )
@@ -53,7 +57,10 @@ def gathered(
 ) -> list[Rows]:
     """The rows of every training run, of `count` columns; `bare`, the motor without effects, carries changes on."""
     tape, fits = model.given.problem.tape, rows_of(model)
-    rows = [Rows(f, np.empty((*f.residual.values.shape, count), np.float32)) for f in fits]
+    rows = [
+        Rows(f, np.empty((*f.residual.values.shape, count), np.float32), readings(f, k))
+        for k, f in enumerate(fits)
+    ]
     first = 0
     for change, width in _side_by_side(changes):
         response = np.asarray(_response(bare, tape, path, change))[..., :width]

@@ -16,6 +16,7 @@ from .candidates import Candidate
 from .evidence import Block, Evidence, blocks_of, products
 from .library import Curve, Library, curves_over
 from .model import Model
+from .rounding import READINGS, gained_by_rounding
 from .rows import Rows, gathered
 
 # How much stronger slow noise may be at the slowest waves than at most of them
@@ -35,6 +36,7 @@ class Screen(NamedTuple):
     evidence: Evidence  # white
     white: Whitener
     unfiltered: Evidence  # the same without a filter of the noise
+    readings: list[Evidence]  # white, of what coarse converters may leave
     candidates: list[Candidate]
     of_candidate: list[Block]
     curves: list[Curve]
@@ -77,6 +79,7 @@ def screen(model: Model, library: Library) -> Screen:
         evidence=unfiltered,
         white=as_they_are,
         unfiltered=unfiltered,
+        readings=[],
         candidates=library.candidates,
         of_candidate=blocks[: len(library.candidates)],
         curves=curves,
@@ -85,7 +88,8 @@ def screen(model: Model, library: Library) -> Screen:
         traces=library.traces,
     )
     white = whitener(_without_clearest(found, rows))
-    return found._replace(evidence=_evidence(rows, white), white=white)
+    evidence = _evidence(rows, white)
+    return found._replace(evidence=evidence, white=white, readings=evidence.of_readings(READINGS))
 
 
 def beyond_curves(found: Screen) -> float:
@@ -116,11 +120,11 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     drift, waver = (_drift(found), _waver(found)) if white else (None, None)
 
     def signal(of: Candidate | Curve, block: Block, gain: float, common: float = 0.0) -> Signal:
-        noise = 1.0
+        noise = gained_by_rounding(found.readings, block)
         if drift is not None and _is_slow_torque(of):
-            noise = _beside(found, block, drift)
+            noise = max(noise, _beside(found, block, drift))
         if waver is not None and _is_voltage(of):
-            noise = _beside(found, block, waver)
+            noise = max(noise, _beside(found, block, waver))
         chance = log_chance(max(gain - common, 0.0) / noise, found.evidence.freedom(block))
         return Signal(gain, chance, of, block)
 
@@ -249,7 +253,7 @@ def _without_clearest(found: Screen, rows: Sequence[Rows]) -> list[Series]:
     best = found.evidence.regress([clearest])
     columns = np.array(clearest.columns) - found.evidence.parameters
     left = []
-    for k, (fit, X) in enumerate(rows):
+    for k, (fit, X, _) in enumerate(rows):
         coefficients = best.coefficients[0][k] if clearest.own else best.coefficients[0]
         known = fit.residual.known
         rest = fit.residual.values - fit.shared.values @ best.moved

@@ -256,7 +256,7 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
         def look_and_step(motor, along, state, load):
             after = held_step(motor, along, drive, state, value[k], load, steps, rises)
             after = _turned(state, after, turn[k])
-            return after, outputs(motor, drive, state, after, value[k], load, rises)
+            return after, outputs(motor, along, drive, state, value[k], load, steps, rises)
 
         (state, seen), (d_state, d_seen) = jax.vmap(
             lambda *tangents: jax.jvp(look_and_step, (motor, along, state, load[k]), tangents),
@@ -271,7 +271,7 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
         .set(jnp.eye(states)[:, :, None])
     )
     d_state = jax.vmap(lambda column: _unpack(motor, column))(identity)
-    reports = 2 if motor.speed_delay() is None else 4
+    reports = 2 if along.look is None else 3
     seen = (jnp.zeros((reports, len(starts))), jnp.zeros((columns, reports, len(starts))))
     saveat = diffrax.SaveAt(
         subs=[
@@ -348,43 +348,30 @@ def _stitch_tangents(
     return jax.lax.scan(follow, nothing, blocks)[1]
 
 
-def outputs(motor: Motor, drive: Drive, before: State, after: State, value, load, rise=None):
-    """Reported current and speed, and for a delay the slope of the latter at both ends of the sample."""
-    current, speed = motor.sensors(before)
-    if motor.speed_delay() is None:
+def outputs(
+    motor: Motor, along: Propagator, drive: Drive, state: State, value, load, steps, rise=None
+):
+    """Reported current and speed, and for a late sensor the speed where it looks within the sample that follows."""
+    current, speed = motor.sensors(state)
+    if along.look is None:
         return jnp.stack([current, speed])
-
-    half = 0.0 if rise is None else rise / 2
-
-    def slope(state, driven):
-        rate = motor.derivative(state, driven, load, drive)
-        return jax.jvp(lambda x: motor.sensors(x)[1], (state,), (rate,))[1]
-
-    return jnp.stack([current, speed, slope(before, value - half), slope(after, value + half)])
+    part, share = along.look
+    if rise is not None:
+        value, rise = value - (1 - share) / 2 * rise, share * rise
+    there = held_step(motor, part, drive, state, value, load, steps, rise)
+    return jnp.stack([current, speed, motor.sensors(there)[1]])
 
 
 def reported(motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]):
-    """Current and speed, the latter as late as the motor's sensor reports it.
-
-    Between samples by the cubic of Hermite: speeds and slopes at both ends of the sample, within which nothing
-    jumps, so that values and the derivative by the delay are good to the fourth and third order of the sample time.
-    """
+    """Current and speed, the latter as late as the motor's sensor reports it; before a run began, as it began."""
     delay = motor.speed_delay()
     if delay is None:
         return seen
-    speed, slope, slope_after = (seen[:, k].reshape(-1) for k in (1, 2, 3))
+    speed, within = (seen[:, k].reshape(-1) for k in (1, 2))
     step = jnp.repeat(jnp.asarray(tape.sample_time)[tape.grid], BLOCK)
     first = jnp.repeat(jnp.searchsorted(jnp.asarray(tape.run), tape.run) * BLOCK, BLOCK)
-    here = jnp.arange(len(speed))
-    position = jnp.clip(here - delay / step, first, here)
-    # the sample that reaches up to here from the left, but for the first of a run
-    left = jnp.clip(jnp.ceil(position).astype(int) - 1, first, jnp.maximum(here - 1, first))
-    x = position - left
-    rise = jnp.where(here > first, speed[jnp.minimum(left + 1, here)] - speed[left], 0.0)
-    start, end = slope[left] * step, slope_after[left] * step
-    late = speed[left] + x * (
-        start + x * (3 * rise - 2 * start - end + x * (start + end - 2 * rise))
-    )
+    at = jnp.arange(len(speed)) - 1 - jnp.floor(delay / step).astype(int)
+    late = jnp.where(at < first, speed[first], within[jnp.maximum(at, 0)])
     return jnp.stack([seen[:, 0], late.reshape(seen[:, 0].shape)], 1)
 
 

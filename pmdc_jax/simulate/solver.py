@@ -53,6 +53,13 @@ class Weights(NamedTuple):
     knocks: Float[Array, "powers n *#batch"] | None = None
 
 
+class Look(NamedTuple):
+    """To where within every sample a late sensor looks."""
+
+    along: Propagator  # a step up to there
+    share: Held  # of the sample, more than 0 and at most all of it
+
+
 class Propagator(NamedTuple):
     """Everything about a motor and a step length that does not change from step to step.
 
@@ -66,6 +73,7 @@ class Propagator(NamedTuple):
     apart: Propagator | None = None  # the same while teeth do not touch
     # h (phi_2 - phi_1 / 2)(A h): by what a drive acts that rises within a step, beyond what its mean does
     ramp: Matrix | None = None
+    look: Look | None = None  # where a sensor is late
 
 
 @eqx.filter_jit  # one trace serves all grids
@@ -234,7 +242,9 @@ def _step(
     if teeth is not None:
         touching = teeth.teeth(state).touch
         along = jax.tree.map(
-            lambda a, b: jnp.where(touching, a, b), along._replace(apart=None), along.apart
+            lambda a, b: jnp.where(touching, a, b),
+            along._replace(apart=None, look=None),
+            along.apart,
         )
     weights = along.weights
     assert weights is not None
@@ -361,16 +371,21 @@ def walk(solver: HeldInput, start: Walk, steps: int, saveat: diffrax.SaveAt) -> 
 
 def along_grids(motor: Motor, tape: Tape) -> Propagator:
     """The propagator of one step on every grid of the tape, stacked in front."""
-    steps = steps_in_sample(motor, tape)
-    grids = [
-        propagator(
-            motor,
-            tape.sample_time[g] / steps,
-            Drive(*(jnp.asarray(share)[g] for share in tape.drive)),
-            tape.rise is not None,
-        )
-        for g in range(tape.sample_time.shape[0])
-    ]
+    steps, delay = steps_in_sample(motor, tape), motor.speed_delay()
+
+    def of_grid(g: int) -> Propagator:
+        sample = jnp.asarray(tape.sample_time)[g]
+        drive = Drive(*(jnp.asarray(share)[g] for share in tape.drive))
+        straight = tape.rise is not None
+        along = propagator(motor, sample / steps, drive, straight)
+        if delay is None:
+            return along
+        samples = jnp.asarray(delay / sample)
+        share = 1 - (samples - jnp.floor(samples))
+        part = propagator(motor, share * sample / steps, drive, straight)
+        return along._replace(look=Look(part, share))
+
+    grids = map(of_grid, range(tape.sample_time.shape[0]))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *grids)
 
 

@@ -1,0 +1,45 @@
+"""What a coarse converter leaves of a motor that lacks nothing: errors that last as long as its reading stands still,
+which no filter of the noise takes out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ..identify.noise import quantum
+from .evidence import Block, Evidence
+from .model import Fit
+
+# Readings that are tried
+READINGS = 8
+# Errors of so many quanta blur them: what rounding adds to such noise is as white
+BLURRED = 0.6
+
+
+def readings(fit: Fit, run: int) -> Float[np.ndarray, "samples outputs readings"]:
+    """Errors of converters as coarse as a run's that read what is simulated, their steps at any height; none of
+    outputs whose errors blur the steps. The same for the same `run`, its number.
+
+    No noise is read with it: that of the sensors may come after the converter, or before it and be little.
+    """
+    random = np.random.default_rng(run)
+    known, values = fit.residual.known, fit.simulated.values
+    errors = np.zeros((*values.shape, READINGS))
+    pairs = zip(values.T, fit.residual.values.T, strict=True)
+    for k, (simulated, left) in enumerate(pairs):
+        step = quantum(np.diff((simulated + left)[known]))
+        if np.mean(np.square(left[known])) < (BLURRED * step) ** 2:
+            exact = simulated[:, None] + step * random.uniform(size=READINGS)
+            errors[:, k] = step * np.round(exact / step) - exact
+    return errors
+
+
+def gained_by_rounding(read: Sequence[Evidence], block: Block) -> float:
+    """How much more than by chance a block gains, in the mean, of what the converters leave; at least one.
+
+    **Arguments**: `read`, the evidence of every reading, none where nothing is coarse.
+    """
+    gains = [e.regress().squares - e.regress([block]).squares for e in read]
+    return float(max(np.mean(gains) / read[0].freedom(block), 1.0)) if read else 1.0
