@@ -7,12 +7,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from .alignment import alignment, sampling
-from .clock import evenly_stamped, is_even
+from .clock import GAP, evenly_stamped, is_even
 from .plausibility import angle_against_speed, plain_units, signs, speed_of
 from .recording import Finding, Recording
 from .unmeasured import flat_tops, noise_of
 
-GAP = 3.0  # median steps
 JITTER = 0.02  # of a step, root mean square
 LEAP = 0.2  # of the range
 

@@ -14,6 +14,9 @@ from .recording import Recording
 
 Samples = Float[np.ndarray, " samples"]
 
+# Stamps that are more than so many typical steps apart leave a gap, in which outputs are missing; exactly so
+# many, but for rounding, leave none
+GAP = 3.0 * (1 + 1e-9)
 # Largest distance of a time stamp from an even clock, in steps, that is taken for rounding of the stamps
 ROUNDING = 0.02
 # ... and beyond which it is none that a sampling clock gave

@@ -115,6 +115,11 @@ def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:
     return ratio if ratio > BEYOND else None
 
 
+def unlike_held_out(gap: Mapping[Role, Gap]) -> bool:
+    """Whether hold-outs show that something is missing of which the fitted runs do not tell."""
+    return beyond_fitted(gap) is not None or worse_held_out(gap)
+
+
 def worse_held_out(gap: Mapping[Role, Gap]) -> bool:
     """Whether the effects that were added make hold-outs worse: then others are missing that look alike in the fitted
     runs."""

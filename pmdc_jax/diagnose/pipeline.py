@@ -26,8 +26,7 @@ from .diagnosis import (
     LearnedCurve,
     Region,
     Verdict,
-    beyond_fitted,
-    worse_held_out,
+    unlike_held_out,
 )
 from .evidence import Block
 from .experiment import next_experiment
@@ -90,7 +89,7 @@ def diagnose(
     verdict = _verdict(naming)
     gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
     total = _total(gaps, base)
-    if beyond_fitted(total) or worse_held_out(total):
+    if unlike_held_out(total):
         verdict = "not_in_library"
     seconds = {
         "identify": identified - began,

@@ -14,7 +14,6 @@ from ..simulate import Tape
 from ..threads import beside, side_by_side_until
 from .averaged import without_averaging
 from .bounds import effect_bounds
-from .clock import on_clock
 from .identification import Search
 from .kinks import without_kinks
 from .parameters import Parameters
@@ -22,6 +21,7 @@ from .polish import IDLE, Polished, polish, with_own
 from .prepare import Prepared
 from .problem import Evaluation, Problem, Unknowns
 from .refine import Refined, refine
+from .resampling import on_clock
 from .search import Found
 from .search import search as global_search
 from .steps import with_steps

@@ -21,11 +21,11 @@ import numpy as np
 from ..recording import Recording
 from ..simulate import Tape, uniform
 from .averaged import as_recorded, of_averaged, seems_averaged, without_averaging
-from .clock import on_clock
 from .likelihood import LIKELIER, unlikely
 from .polish import Polished, polish
 from .prepare import Prepared
 from .problem import normal_matrix
+from .resampling import on_clock
 
 # Another timing is not even asked where the misfit shows less than this share of half a sample
 SHOWS = 0.3

@@ -7,7 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..diagnose.diagnosis import Detectable, Diagnosis, EffectFound, Region, worse_held_out
+from ..diagnose.diagnosis import (
+    Detectable,
+    Diagnosis,
+    EffectFound,
+    Region,
+    unlike_held_out,
+    worse_held_out,
+)
 from ..identify.identification import Estimate, Role, RunFit
 from .notation import (
     amount,
@@ -87,8 +94,9 @@ def _ambiguous(diagnosis: Diagnosis) -> list[str]:
 def _not_in_library(diagnosis: Diagnosis) -> list[str]:
     sentences = [_disagreement(diagnosis)]
     if diagnosis.effects:
-        elsewhere = diagnosis.beyond_fitted or worse_held_out(diagnosis.gap)
-        rest = "" if elsewhere else "; what is left is no effect of the library"
+        rest = (
+            "" if unlike_held_out(diagnosis.gap) else "; what is left is no effect of the library"
+        )
         sentences.append(f"{_capital(_found(diagnosis))} explains part of it and was added{rest}.")
     else:
         sentences.append("Something is missing that no effect of the library explains.")

@@ -5,12 +5,10 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from ..clock import is_even
+from ..clock import GAP, is_even
 from ..errors import InputError
 from ..recording import Recording
 
-# An interval longer than this many steps is a gap: outputs inside it count as missing.
-GAP = 3.0 * (1 + 1e-9)  # exactly three, but for rounding, are none
 # An even clock ticks no more often than so many times for every sample
 MOST = 20
 # ... and any that leaves this share of the most samples a tick of their own is as good

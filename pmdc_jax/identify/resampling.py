@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..clock import GAP
 from ..recording import Recording
 from ..simulate import Tape
 from ..simulate.uneven import seen_at_record
-from ..simulate.uniform import GAP
 from .polish import Polished, polish
 from .prepare import Prepared
 
