@@ -25,7 +25,7 @@ from pmdc_jax.diagnose.periodic import common_line, spectrum
 from pmdc_jax.diagnose.pipeline import may_be_none
 from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
-from pmdc_jax.diagnose.rounding import READINGS, gained_by_rounding, readings
+from pmdc_jax.diagnose.rounding import READINGS, readings
 from pmdc_jax.diagnose.screen import common_to_waves, log_chance
 from pmdc_jax.diagnose.seen import Seen
 from pmdc_jax.effects import EFFECTS
@@ -245,9 +245,9 @@ def test_what_a_coarse_reading_leaves_is_evidence_for_nothing():
             residual.values[..., None],
         )
         rows = np.concatenate([*parts, own.values], -1)[:, 0] * np.sqrt(12)
-        evidence, drag = products([[rows]], 1, 1), Block((1,))
+        evidence, drag = products([[rows]], 1, 1, READINGS), Block((1,))
         gain = evidence.regress().squares - evidence.regress([drag]).squares
-        noise = gained_by_rounding(evidence.of_readings(READINGS), drag)
+        noise = evidence.gained_by_rounding(drag)
         alarms["as if white"] += stats.chi2.sf(gain, 1) < 0.01
         alarms["by rounding"] += stats.chi2.sf(gain / noise, 1) < 0.01
     assert alarms["as if white"] > 25

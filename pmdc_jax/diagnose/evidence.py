@@ -52,51 +52,47 @@ class Evidence(NamedTuple):
     products: Float[np.ndarray, "runs columns columns"]
     parameters: int  # how many columns are the motor's
     rows: int
-
-    def of_readings(self, count: int) -> list[Evidence]:
-        """The evidence if the residual were what rounding leaves of the `count` readings, where it matters at all."""
-        found = []
-        for reading in range(-1 - count, -1):
-            order = [*range(self.products.shape[1] - 1), reading]
-            if np.any(self.products[:, reading, reading]):
-                found.append(self._replace(products=self.products[:, order][:, :, order]))
-        return found
+    readings: tuple[int, ...] = ()  # columns of what coarse converters leave
 
     def regress(self, blocks: Sequence[Block] = (), visible: float = VISIBLE) -> Regression:
         """Least squares of the residual on the motor's parameters and some blocks.
 
         Directions in which the rows say less than `visible`, as a share of the most, stay where they are.
         """
-        shared = [*range(self.parameters), *(c for b in blocks if not b.own for c in b.columns)]
-        own = [c for b in blocks if b.own for c in b.columns]
-        kept = [*shared, -1]
-        total, solved = np.zeros((len(kept), len(kept))), []
-        for product in self.products:
-            across = product[np.ix_(own, kept)]
-            inverse = _inverse(product[np.ix_(own, own)], visible)
-            total += product[np.ix_(kept, kept)] - across.T @ inverse @ across
-            solved.append((inverse, across))
-        inverse = _inverse(total[:-1, :-1], visible)
-        coefficients = inverse @ total[:-1, -1]
-        squares = float(total[-1, -1] - total[:-1, -1] @ coefficients)
-        errors = np.sqrt(np.maximum(np.diag(inverse), 0.0))
-        of_own = [i @ (a[:, -1] - a[:, :-1] @ coefficients) for i, a in solved]
-        own_errors = [np.sqrt(np.maximum(np.diag(i), 0.0)) for i, _ in solved]
-        place_shared, place_own = self.parameters, 0
-        found, spread = [], []
+        squares, shared, own = self._regressed(blocks, [-1], visible)
+        places, found, spread = [self.parameters, 0], [], []
         for block in blocks:
             n = len(block.columns)
-            if block.own:
-                part = slice(place_own, place_own + n)
-                found.append(np.array([c[part] for c in of_own]))
-                spread.append(np.array([e[part] for e in own_errors]))
-                place_own += n
-            else:
-                part = slice(place_shared, place_shared + n)
-                found.append(coefficients[part])
-                spread.append(errors[part])
-                place_shared += n
-        return Regression(squares, coefficients[: self.parameters], found, spread)
+            part = slice(places[block.own], places[block.own] + n)
+            coefficients, errors = own if block.own else shared
+            found.append(coefficients[..., part, 0])
+            spread.append(errors[..., part])
+            places[block.own] += n
+        moved = shared[0][: self.parameters, 0]
+        return Regression(float(squares[0]), moved, found, spread)
+
+    def _regressed(self, blocks: Sequence[Block], targets: Sequence[int], visible: float):
+        """Least squares of some columns at once: the squares left of each, and the coefficients with their standard
+        errors, those that all runs have in common and those of each run."""
+        own = np.array([c for b in blocks if b.own for c in b.columns], int)
+        shared = [*range(self.parameters), *(c for b in blocks if not b.own for c in b.columns)]
+        kept, n = np.array([*shared, *targets]), len(shared)
+        total = self.products[:, kept[:, None], kept].sum(0)
+        across = self.products[:, own[:, None], kept]
+        of_own = _inverse(self.products[:, own[:, None], own], visible)
+        total -= (across.swapaxes(1, 2) @ of_own @ across).sum(0)
+        inverse = _inverse(total[:n, :n], visible)
+        coefficients = inverse @ total[:n, n:]
+        squares = np.diag(total[n:, n:]) - np.sum(total[:n, n:] * coefficients, 0)
+        own_coefficients = of_own @ (across[..., n:] - across[..., :n] @ coefficients)
+        return squares, (coefficients, _errors(inverse)), (own_coefficients, _errors(of_own))
+
+    def gained_by_rounding(self, block: Block) -> float:
+        """How much more than by chance a block gains, in the mean, of what coarse converters leave; at least one."""
+        if not self.readings:
+            return 1.0
+        without, with_it = (self._regressed(b, self.readings, VISIBLE)[0] for b in ([], [block]))
+        return float(max(np.mean(without - with_it) / self.freedom(block), 1.0))
 
     def freedom(self, block: Block) -> int:
         """How many coefficients a block has."""
@@ -104,26 +100,34 @@ class Evidence(NamedTuple):
 
 
 def _inverse(
-    matrix: Float[np.ndarray, "n n"], visible: float = VISIBLE
-) -> Float[np.ndarray, "n n"]:
+    matrix: Float[np.ndarray, "*runs n n"], visible: float = VISIBLE
+) -> Float[np.ndarray, "*runs n n"]:
     """Inverse on what the rows can see of it."""
-    if not len(matrix):
+    if not matrix.size:
         return matrix
-    lengths = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    lengths = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 0.0))
     lengths = np.where(lengths > 0, lengths, 1.0)
-    values, vectors = np.linalg.eigh(matrix / lengths[:, None] / lengths)
+    units = lengths[..., :, None] * lengths[..., None, :]
+    values, vectors = np.linalg.eigh(matrix / units)
     seen = values > visible
     inverse = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
-    return (vectors * inverse) @ vectors.T / lengths[:, None] / lengths
+    return (vectors * inverse[..., None, :]) @ vectors.swapaxes(-2, -1) / units
+
+
+def _errors(inverse: Float[np.ndarray, "*runs n n"]) -> Float[np.ndarray, "*runs n"]:
+    return np.sqrt(np.maximum(np.diagonal(inverse, axis1=-2, axis2=-1), 0.0))
 
 
 def products(
-    runs: Iterable[Iterable[Float[np.ndarray, "rows _"]]], parameters: int, own: int
+    runs: Iterable[Iterable[Float[np.ndarray, "rows _"]]],
+    parameters: int,
+    own: int,
+    readings: int = 0,
 ) -> Evidence:
     """Gather the evidence from white rows, of every run some at a time.
 
     **Arguments**: the rows, whose first columns are those of the motor's `parameters`, then what may be missing, what
-    rounding may leave, the residual, and last the run's `own`.
+    coarse converters leave in some `readings`, the residual, and last the run's `own`.
     """
     gathered, rows = [], 0
     for pieces in runs:
@@ -136,4 +140,6 @@ def products(
         left = total[kept, kept] - across.T @ _inverse(total[alone, alone]) @ across
         seen = np.diag(left) > VISIBLE * np.diag(total)[kept]
         gathered.append(left * seen * seen[:, None])
-    return Evidence(np.array(gathered), parameters, rows)
+    found, last = np.array(gathered), gathered[0].shape[0] - 1
+    read = (k for k in range(last - readings, last) if found[:, k, k].any())
+    return Evidence(found, parameters, rows, tuple(read))

@@ -33,7 +33,6 @@ from .experiment import next_experiment
 from .library import Library
 from .model import model_of
 from .naming import Namer, Naming
-from .rounding import gained_by_rounding
 from .screen import Screen, log_chance
 from .seen import ALARM
 
@@ -258,7 +257,7 @@ def _detectable(found: Screen) -> tuple[Detectable, ...]:
         if field is None:
             continue
         error = float(np.min(found.evidence.regress([block]).errors[0][..., -1]))
-        error *= np.sqrt(gained_by_rounding(found.readings, block))
+        error *= np.sqrt(found.evidence.gained_by_rounding(block))
         amplitude = max(float(needed * error * candidate.unit), found.hidden(candidate))
         before = smallest.get(candidate.effect)
         if error > 0 and amplitude < (before.amplitude if before else candidate.largest):

@@ -3,13 +3,10 @@ which no filter of the noise takes out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
 
 from ..identify.noise import quantum
-from .evidence import Block, Evidence
 from .model import Fit
 
 # Readings that are tried
@@ -34,12 +31,3 @@ def readings(fit: Fit, run: int) -> Float[np.ndarray, "samples outputs readings"
             exact = simulated[:, None] + step * random.uniform(size=READINGS)
             errors[:, k] = step * np.round(exact / step) - exact
     return errors
-
-
-def gained_by_rounding(read: Sequence[Evidence], block: Block) -> float:
-    """How much more than by chance a block gains, in the mean, of what the converters leave; at least one.
-
-    **Arguments**: `read`, the evidence of every reading, none where nothing is coarse.
-    """
-    gains = [e.regress().squares - e.regress([block]).squares for e in read]
-    return float(max(np.mean(gains) / read[0].freedom(block), 1.0)) if read else 1.0

@@ -6,7 +6,7 @@ million samples has to fit into memory.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -81,16 +81,20 @@ def _response(bare: Motor, tape: Tape, path: Path, change: Change) -> Float32[Ar
 
 def _side_by_side(changes: Iterable[Change]) -> Iterator[tuple[Change, int]]:
     """The changes in parts of one width, for which the response is compiled once; how many columns each is of."""
-    waiting: Change | None = None
+    waiting: list[Change] = []
+    count = 0
     for change in changes:
-        waiting = change if waiting is None else _joined(waiting, change)
-        while waiting.kicks.shape[-1] >= TOGETHER:
-            yield Change(*(x[..., :TOGETHER] for x in waiting)), TOGETHER
-            waiting = Change(*(x[..., TOGETHER:] for x in waiting))
-    if waiting is not None and (count := waiting.kicks.shape[-1]):
+        waiting.append(change)
+        count += change.kicks.shape[-1]
+        while count >= TOGETHER:
+            together = _joined(waiting)
+            yield Change(*(x[..., :TOGETHER] for x in together)), TOGETHER
+            waiting = [Change(*(x[..., TOGETHER:] for x in together))]
+            count -= TOGETHER
+    if count:
         nothing = [(0, 0)] * 3 + [(0, TOGETHER - count)]
-        yield Change(*(np.pad(x, nothing) for x in waiting)), count
+        yield Change(*(np.pad(x, nothing) for x in _joined(waiting))), count
 
 
-def _joined(one: Change, other: Change) -> Change:
-    return Change(*(np.concatenate(both, -1) for both in zip(one, other, strict=True)))
+def _joined(changes: Sequence[Change]) -> Change:
+    return Change(*(np.concatenate(parts, -1) for parts in zip(*changes, strict=True)))

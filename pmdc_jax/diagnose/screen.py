@@ -16,7 +16,7 @@ from .candidates import Candidate
 from .evidence import Block, Evidence, blocks_of, products
 from .library import Curve, Library, curves_over
 from .model import Model
-from .rounding import READINGS, gained_by_rounding
+from .rounding import READINGS
 from .rows import Rows, gathered
 
 # How much stronger slow noise may be at the slowest waves than at most of them
@@ -36,7 +36,6 @@ class Screen(NamedTuple):
     evidence: Evidence  # white
     white: Whitener
     unfiltered: Evidence  # the same without a filter of the noise
-    readings: list[Evidence]  # white, of what coarse converters may leave
     candidates: list[Candidate]
     of_candidate: list[Block]
     curves: list[Curve]
@@ -79,7 +78,6 @@ def screen(model: Model, library: Library) -> Screen:
         evidence=unfiltered,
         white=as_they_are,
         unfiltered=unfiltered,
-        readings=[],
         candidates=library.candidates,
         of_candidate=blocks[: len(library.candidates)],
         curves=curves,
@@ -88,8 +86,7 @@ def screen(model: Model, library: Library) -> Screen:
         traces=library.traces,
     )
     white = whitener(_without_clearest(found, rows))
-    evidence = _evidence(rows, white)
-    return found._replace(evidence=evidence, white=white, readings=evidence.of_readings(READINGS))
+    return found._replace(evidence=_evidence(rows, white), white=white)
 
 
 def beyond_curves(found: Screen) -> float:
@@ -120,7 +117,7 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     drift, waver = (_drift(found), _waver(found)) if white else (None, None)
 
     def signal(of: Candidate | Curve, block: Block, gain: float, common: float = 0.0) -> Signal:
-        noise = gained_by_rounding(found.readings, block)
+        noise = found.evidence.gained_by_rounding(block)
         if drift is not None and _is_slow_torque(of):
             noise = max(noise, _beside(found, block, drift))
         if waver is not None and _is_voltage(of):
@@ -240,7 +237,7 @@ def log_chance(gain: float, freedom: int) -> float:
 def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
     """Inner products of all rows, made white by one filter."""
     white = (run.white(k, whiten) for k, run in enumerate(rows))
-    return products(white, rows[0].fit.shared.values.shape[-1], LOCAL)
+    return products(white, rows[0].fit.shared.values.shape[-1], LOCAL, READINGS)
 
 
 def _without_clearest(found: Screen, rows: Sequence[Rows]) -> list[Series]:
