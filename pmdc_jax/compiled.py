@@ -1,13 +1,26 @@
-"""What JAX compiles: in less time what runs but a few times, and room for it in programs that go on and on."""
+"""What JAX compiles: kept by the command, in less time what runs but a few times, and room for it where much is run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+import os
+import pickle
+import zlib
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from functools import cache, wraps
+from importlib.metadata import version
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from threading import Lock, get_ident
+from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jax.experimental import serialize_executable
+
+from .compilation_cache import programs
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -15,6 +28,10 @@ T = TypeVar("T")
 # Without its newer emitter of kernels XLA compiles in two thirds of the time. What it makes is as fast but for dry
 # friction and teeth, which take a quarter longer.
 QUICKLY = {"xla_cpu_use_fusion_emitters": False}
+# What else decides what a function of this package is compiled to
+LIBRARIES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy")
+# Bytes of programs that are kept; those for seven runs of 33,000 samples take some five million
+MOST = 500_000_000
 
 # Where Linux lists a process's memory maps, and says how many it may have
 MAPS, LIMIT = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
@@ -22,9 +39,59 @@ MAPS, LIMIT = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 FREE = 0.5
 
 
+class Program(NamedTuple):
+    """A function compiled for arguments of one kind, from their arrays to those of what it returns."""
+
+    run: jax.stages.Compiled
+    structure: Any  # of the tree of arrays that it returns
+    others: Any  # what it returns besides
+
+
+_programs: dict[str, Program] = {}
+_locks: defaultdict[str, Lock] = defaultdict(Lock)
+
+
+def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) -> Callable[P, T]:
+    """`equinox.filter_jit` whose programs the command keeps. JAX itself keeps what XLA makes of a traced function, and
+    traces it anew in every process, which takes longer than all else.
+
+    Called from compiled code, from a library that keeps nothing, or with a function within another one, it is
+    `equinox.filter_jit`.
+
+    **Arguments**: `function` of this package, which returns arrays, in tuples perhaps, but no modules of equinox, for
+    these cannot be written and read; `options` of XLA.
+    """
+    jitted = eqx.filter_jit(function, compiler_options=options)  # pyright: ignore[reportCallIssue]
+    if "<" in function.__qualname__:
+        return jitted
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        arrays, static = eqx.partition((args, kwargs), eqx.is_array)
+        leaves, structure = jax.tree.flatten(arrays)
+        if programs() is None or any(isinstance(leaf, Tracer) for leaf in leaves):
+            return jitted(*args, **kwargs)
+        try:
+            key = _key(function, options, leaves, structure, static)
+        except (pickle.PicklingError, AttributeError, TypeError):
+            return jitted(*args, **kwargs)
+
+        def of_arrays(*leaves):
+            args, kwargs = eqx.combine(structure.unflatten(leaves), static)
+            return cast(Callable, function)(*args, **kwargs)
+
+        with _locks[key]:
+            program = _programs.get(key) or _kept(key) or _made(key, of_arrays, leaves, options)
+            _programs[key] = program
+        returned = program.structure.unflatten(program.run(*leaves))
+        return cast(T, eqx.combine(returned, program.others))
+
+    return call
+
+
 def quickly_compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """`equinox.filter_jit` for what takes longer to compile than it ever runs; not to be called from compiled code."""
-    return eqx.filter_jit(function, compiler_options=QUICKLY)  # pyright: ignore[reportCallIssue]
+    """`compiled` for what takes longer to compile than it ever runs; not to be called from compiled code."""
+    return compiled(function, QUICKLY)
 
 
 def make_room() -> None:
@@ -38,4 +105,112 @@ def make_room() -> None:
     with MAPS.open("rb") as lines:
         used = sum(1 for _ in lines)
     if used > (1 - FREE) * int(LIMIT.read_text()):
+        _programs.clear()
         jax.clear_caches()
+
+
+def _key(function: Callable, options, leaves: Sequence, structure, static) -> str:
+    """The name of a program: of all that decides what it is."""
+    kinds = [(x.shape, str(x.dtype), getattr(x, "weak_type", False)) for x in leaves]
+    double = jax.config.read("jax_enable_x64")
+    of = (function.__module__, function.__qualname__, options, kinds, structure, static, double)
+    return hashlib.sha256(pickle.dumps((_source(), of))).hexdigest()
+
+
+@cache
+def _source() -> str:
+    """This package and what it builds on."""
+    files = sorted(Path(__file__).parent.rglob("*.py"))
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+    built_on = [jax.default_backend(), *map(version, LIBRARIES)]
+    return hashlib.sha256(" ".join([digest, *built_on]).encode()).hexdigest()[:16]
+
+
+def _kept(key: str) -> Program | None:
+    """A program that an earlier process kept, None without one that can be read."""
+    path = _path(key)
+    try:
+        kept = zlib.decompress(path.read_bytes())
+        _find_lapack()
+        serialized, structure, others = pickle.loads(kept)
+        program = serialize_executable.deserialize_and_load(*serialized)
+        os.utime(path)
+    except Exception:  # there is none, or it is damaged: whatever is wrong, another one is made
+        return None
+    return Program(program, structure, others)
+
+
+@cache
+def _find_lapack() -> None:
+    """JAX looks for it when it first lowers what calls it; a program that was kept calls it as if it had been found."""
+    jax.block_until_ready(jnp.linalg.cholesky(jnp.eye(1)))
+
+
+def _made(key: str, function: Callable, leaves: Sequence, options) -> Program:
+    """A program compiled now, and kept where it can be."""
+    returned: list[Any] = []
+
+    def flat(*leaves):
+        arrays, others = eqx.partition(function(*leaves), eqx.is_array)
+        out, structure = jax.tree.flatten(arrays)
+        returned[:] = structure, others
+        return out
+
+    # XLA's part is kept by JAX under this name, too, and found there only if the same program was not kept here
+    flat.__name__ = f"program_{key}"
+    lowered = jax.jit(flat).lower(*leaves)
+    found = _found_by_jax()  # what it finds for the small steps of a trace does not count
+    run = lowered.compile(options)
+    structure, others = returned
+    if _found_by_jax() == found:  # what JAX had kept cannot be taken apart again
+        try:
+            serialized = serialize_executable.serialize(run)
+            content = pickle.dumps((serialized, structure, others))
+            _write(_path(key), zlib.compress(content, level=1))
+        except (
+            Exception
+        ):  # XLA cannot write it, or the disk is full: then it is made anew the next time
+            pass
+    return Program(run, structure, others)
+
+
+def _found_by_jax() -> int:
+    """How many programs JAX has found in its own cache for this thread."""
+    return _hits()[get_ident()]
+
+
+@cache
+def _hits() -> Counter[int]:
+    hits: Counter[int] = Counter()
+
+    def count(event: str, **_) -> None:
+        hits[get_ident()] += event == "/jax/compilation_cache/cache_hits"
+
+    jax.monitoring.register_event_listener(count)
+    return hits
+
+
+def _path(key: str) -> Path:
+    folder = programs()
+    assert folder is not None
+    return folder / key
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _tidy(path.parent)
+    part = path.with_suffix(f".{os.getpid()}")
+    part.write_bytes(content)
+    part.replace(path)
+
+
+@cache
+def _tidy(folder: Path) -> None:
+    """Once in a process: without what was not used for longest, where there is too much."""
+    files = [(path.stat().st_mtime, path.stat().st_size, path) for path in folder.iterdir()]
+    spare = sum(size for _, size, _ in files) - MOST
+    for _, size, path in sorted(files):
+        if spare <= 0:
+            break
+        path.unlink(missing_ok=True)
+        spare -= size

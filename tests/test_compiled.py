@@ -1,12 +1,106 @@
-"""What is compiled for one set of recordings after another does not pile up until the process is killed."""
+"""What is compiled: kept for the next run of the command, and not piled up until the process is killed."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from pmdc_jax import compiled
+from pmdc_jax.compilation_cache import PROGRAMS
+
+
+class Roots(NamedTuple):
+    values: jax.Array
+    times: int
+
+
+def scaled_roots(matrix, times: int) -> Roots:
+    """By LAPACK. Says when it is traced."""
+    print("traced")
+    return Roots(times * jnp.linalg.eigh(matrix).eigenvalues, times)
+
+
+roots = compiled.compiled(scaled_roots)
+MATRIX = np.array([[2.0, 1.0], [1.0, 2.0]])
+
+
+@pytest.fixture
+def keeping(monkeypatch, tmp_path):
+    monkeypatch.setenv(PROGRAMS, str(tmp_path / "programs"))
+    monkeypatch.setattr(compiled, "_programs", {})
+    return tmp_path / "programs"
+
+
+def traced(capsys, call) -> bool:
+    """Whether a call traces the function; it is right either way."""
+    found = call()
+    assert np.asarray(found.values) == pytest.approx(found.times * np.array([1.0, 3.0]))
+    return "traced" in capsys.readouterr().out
+
+
+def test_a_program_is_traced_once_for_all_processes(tmp_path):
+    code = "from test_compiled import *; print(roots(MATRIX, 2))"
+    environment = os.environ | {PROGRAMS: str(tmp_path), "JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
+    run = [sys.executable, "-c", code]
+    here = Path(__file__).parent
+    first, second = (
+        subprocess.run(run, check=True, capture_output=True, text=True, env=environment, cwd=here)
+        for _ in range(2)
+    )
+    assert first.stdout == "traced\n" + second.stdout
+    assert second.stdout.startswith("Roots(")
+
+
+def test_another_argument_is_another_program(x64, keeping, monkeypatch, capsys):
+    assert traced(capsys, lambda: roots(MATRIX, 2))
+    assert not traced(capsys, lambda: roots(MATRIX, 2))
+    assert traced(capsys, lambda: roots(MATRIX, 3))
+    assert traced(capsys, lambda: roots(MATRIX.astype(np.float32), 2))
+    monkeypatch.setattr(compiled, "_programs", {})  # as in another process
+    assert not traced(capsys, lambda: roots(MATRIX, 2))
+    assert not traced(capsys, lambda: roots(MATRIX, 3))
+    monkeypatch.setattr(compiled, "_programs", {})
+    monkeypatch.setattr(compiled, "_source", lambda: "a later version")
+    assert traced(capsys, lambda: roots(MATRIX, 2))
+
+
+def test_a_damaged_program_is_made_anew(x64, keeping, monkeypatch, capsys):
+    assert traced(capsys, lambda: roots(MATRIX, 2))
+    (kept,) = keeping.iterdir()
+    whole = kept.read_bytes()
+    kept.write_bytes(whole[: len(whole) // 2])
+    monkeypatch.setattr(compiled, "_programs", {})
+    assert traced(capsys, lambda: roots(MATRIX, 2))
+    assert len(kept.read_bytes()) > len(whole) / 2
+
+
+def test_what_was_not_used_for_longest_goes_first(keeping, monkeypatch):
+    monkeypatch.setattr(compiled, "MOST", 250)
+    keeping.mkdir()
+    for age in range(5):
+        (keeping / f"of age {age}").write_bytes(bytes(100))
+        os.utime(keeping / f"of age {age}", (1e9 - age, 1e9 - age))
+    roots(MATRIX, 2)
+    assert {path.name for path in keeping.iterdir() if "age" in path.name} == {
+        "of age 0",
+        "of age 1",
+    }
+
+
+def test_in_compiled_code_and_without_a_name_it_is_filter_jit(keeping):
+    nameless = compiled.compiled(lambda x: 2 * x)
+    assert nameless(jnp.ones(2)).tolist() == [2.0, 2.0]
+    inner = jax.jit(lambda matrix: roots(matrix, 2).values)
+    assert inner(MATRIX) == pytest.approx([2.0, 6.0])
+    assert not keeping.exists()
 
 
 @pytest.mark.parametrize(("used", "times"), [(600, 2), (400, 1)], ids=["full", "room"])

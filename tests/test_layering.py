@@ -15,7 +15,8 @@ PACKAGE = Path(__file__).parents[1] / "pmdc_jax"
 # what a part may import at run time, beside what lies in itself; parts not named may import anything
 BELOW = {
     "errors": set(),
-    "compiled": set(),
+    "compilation_cache": set(),
+    "compiled": {"compilation_cache"},
     "precision": set(),
     "threads": set(),
     "units": {"errors"},
@@ -24,7 +25,16 @@ BELOW = {
     "recording": {"columns", "errors", "tables", "units"},
     "effects": set(),
     "motor": {"effects"},
-    "simulate": {"clock", "effects", "errors", "motor", "precision", "recording", "threads"},
+    "simulate": {
+        "clock",
+        "compiled",
+        "effects",
+        "errors",
+        "motor",
+        "precision",
+        "recording",
+        "threads",
+    },
     "clock": {"recording"},
     "unmeasured": {"recording"},
     "check": {"alignment", "clock", "plausibility", "recording", "unmeasured"},

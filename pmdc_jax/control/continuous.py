@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import diffrax
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..compiled import compiled
 from ..effects.base import State
 from ..motor import Motor
 from .controllers import AbstractController, Memory, Number
@@ -17,7 +17,7 @@ from .steady import steady_state
 CURRENT_LOOP = 50.0
 
 
-@eqx.filter_jit
+@compiled
 def continuous_loop(
     motor: Motor,
     controller: AbstractController,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from ..compiled import compiled
 from ..motor import Motor
 from .gains import GainSpace
 from .law import Model
@@ -68,12 +68,12 @@ def _costs(task, space, model, motors, coordinates, width):
     return jnp.nan_to_num(jax.vmap(cost)(coordinates), nan=1e6, posinf=1e6)
 
 
-@eqx.filter_jit
+@compiled
 def _screen(task, space, model, motors, coordinates) -> Float[Array, " starts"]:
     return _costs(task, space, model, motors, coordinates, WIDTHS[0])
 
 
-@eqx.filter_jit
+@compiled
 def _rank(task, space, model, motors, coordinates) -> Float[Array, " starts"]:
     def cost(x):
         return exact_cost(task, score(task, model, motors, space.controller(x)))
@@ -81,7 +81,7 @@ def _rank(task, space, model, motors, coordinates) -> Float[Array, " starts"]:
     return jnp.nan_to_num(jax.vmap(cost)(coordinates), nan=1e6, posinf=1e6)
 
 
-@eqx.filter_jit
+@compiled
 def _descend(task, space, model, motors, start: Coordinates) -> tuple[Coordinates, Costs]:
     """All starts at once: the sum of their costs has each one's own gradient."""
     lower, upper = (jnp.asarray(bound) for bound in space.bounds())

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from attrs import field, frozen
 from jaxtyping import Array, Float
 
+from ..compiled import compiled
 from ..motor import Motor
 from .controllers import AbstractController
 from .law import Law, Model
@@ -67,13 +67,13 @@ def judged(
     return Candidate(name, controller, *found, robust, margins(motor, law).stable)
 
 
-@eqx.filter_jit
+@compiled
 def simulated(task: Task, motor: Motor, law: Law) -> Response:
     """The whole course, ten instants a sample."""
     return closed_loop(motor, law, task.course(), SUBSTEPS * task.substeps)
 
 
-@eqx.filter_jit
+@compiled
 def speeds(task: Task, motors: Motor, law: Law) -> Float[Array | np.ndarray, "motors samples"]:
     """Of every motor at every sample, rad/s."""
 
@@ -102,4 +102,4 @@ def _robustness(found: Score) -> Robustness:
     )
 
 
-_score = eqx.filter_jit(score)
+_score = compiled(score)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..compiled import compiled
 from ..effects.base import State
 from ..motor import Drive, Motor
 from ..precision import double_precision
@@ -69,7 +69,7 @@ def _with_one_switch(motor: Motor, duration: float, *bounds) -> float:
     return float(settled)
 
 
-@eqx.filter_jit
+@compiled
 def _dash(
     motor: Motor,
     duration: Float[Array, ""],

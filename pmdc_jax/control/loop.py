@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..compiled import compiled
 from ..motor import Drive, Motor
 from ..simulate.solver import held_step, propagator
 from .controllers import Number
@@ -85,7 +85,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
     return Response(time, current.ravel(), speed.ravel(), voltage.ravel())
 
 
-closed_loop_jit = eqx.filter_jit(closed_loop)
+closed_loop_jit = compiled(closed_loop)
 
 
 def _earlier(past: Float[Array, " remembered"], samples: Number) -> Float[Array, ""]:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..compiled import compiled
 from ..effects import State
 from ..motor import Drive, Motor
 from ..simulate import Tape
@@ -34,7 +34,7 @@ class Path(NamedTuple):
     held: Bool[Array, "samples blocks"]
 
 
-@eqx.filter_jit
+@compiled
 def path_of(
     seen: Float[Array, "blocks 2 samples"],
     tape: Tape,
@@ -56,7 +56,7 @@ def path_of(
     return Path(current, speed, angle.T, (speed == 0) & dry)
 
 
-@eqx.filter_jit
+@compiled
 def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
     """By how much `motor` goes elsewhere than `bare` in the sample after each of the path: current and speed."""
     after = _one_sample(motor, tape, path)
@@ -64,7 +64,7 @@ def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
     return jnp.stack([after.current - without.current, after.speed - without.speed], 1)
 
 
-@eqx.filter_jit
+@compiled
 def sensed(motor: Motor, tape: Tape, path: Path) -> Outputs:
     """By how much the sensors of `motor` report something else than the path."""
     along, drive = _of_blocks(motor, tape)
@@ -76,7 +76,7 @@ def sensed(motor: Motor, tape: Tape, path: Path) -> Outputs:
     return late.transpose(2, 1, 0) - jnp.stack([path.current, path.speed], 1)
 
 
-@eqx.filter_jit
+@compiled
 def pushes(motor: Motor, tape: Tape) -> tuple[Outputs, Outputs]:
     """What a volt, and a newton metre that opposes motion, over one sample do to current and speed."""
     along, _ = _of_blocks(motor, tape)
@@ -86,7 +86,7 @@ def pushes(motor: Motor, tape: Tape) -> tuple[Outputs, Outputs]:
     return ones * along.inputs[:, 0, 0] * voltage, ones * along.inputs[:, 1, 0]
 
 
-@eqx.filter_jit
+@compiled
 def respond(
     motor: Motor,
     tape: Tape,
@@ -136,7 +136,7 @@ def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Drive]:
     return jax.tree.map(spread, along), drive
 
 
-@eqx.filter_jit  # one trace of the bare motor serves all effects
+@compiled  # one trace of the bare motor serves all effects
 def _one_sample(motor: Motor, tape: Tape, path: Path) -> State:
     along, drive = _of_blocks(motor, tape)
     value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T

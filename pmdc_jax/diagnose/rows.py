@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32
 
+from ..compiled import compiled
 from ..identify.colour import Series, Whitener
 from ..identify.sharpen import series_of
 from ..motor import Motor
@@ -71,7 +71,7 @@ def gathered(
     return rows
 
 
-@eqx.filter_jit
+@compiled
 def _response(bare: Motor, tape: Tape, path: Path, change: Change) -> Float32[Array, "..."]:
     response = respond(bare, tape, path, change.kicks) + change.seen
     # a setting that cannot be simulated says nothing

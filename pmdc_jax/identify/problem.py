@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..compiled import compiled
 from ..simulate import LOCAL, Tape, sensitivities
 from .parameters import Parameters
 from .whitening import Whitening
@@ -125,7 +126,7 @@ def weighed(problem: Problem, plain: Evaluation) -> Evaluation:
     return plain if problem.whitening is None else _whitened(problem, plain)
 
 
-@eqx.filter_jit
+@compiled
 def _evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     tape, local = problem.tape, unknowns.local
     seen, jacobian = sensitivities(problem.parameters, unknowns.coordinates, tape, *apart(local))
@@ -139,7 +140,7 @@ def _less_unknown(problem: Problem, plain: Evaluation) -> Evaluation:
     return plain if problem.unknown is None else _orthogonal(problem, plain)
 
 
-@eqx.filter_jit
+@compiled
 def _orthogonal(problem: Problem, plain: Evaluation) -> Evaluation:
     tape = problem.tape
     assert problem.unknown is not None
@@ -157,7 +158,7 @@ def _orthogonal(problem: Problem, plain: Evaluation) -> Evaluation:
     return Evaluation(plain.seen, left[..., -1], left[..., :-1])
 
 
-@eqx.filter_jit
+@compiled
 def _whitened(problem: Problem, plain: Evaluation) -> Evaluation:
     both = jnp.concatenate([plain.jacobian, plain.residuals[..., None]], -1)
     assert problem.whitening is not None
@@ -165,7 +166,7 @@ def _whitened(problem: Problem, plain: Evaluation) -> Evaluation:
     return Evaluation(plain.seen, both[..., -1], both[..., :-1])
 
 
-@eqx.filter_jit
+@compiled
 def normal_matrix(
     evaluation: Evaluation, tape: Tape, counts: Bool[Array, " runs"] | np.ndarray
 ) -> Float[Array, "unknowns unknowns"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache, partial
+from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..compiled import QUICKLY
+from ..compiled import quickly_compiled
 from ..errors import InputError
 from ..simulate import Tape, squared_errors
 from .parameters import Parameters
@@ -101,20 +101,20 @@ def search(
     low, high = np.asarray(parameters.lower), np.asarray(parameters.upper)
     fitness_of = _Fitness(parameters, tape, noise)
 
-    begin, go_on = _programs(method, size, len(low))
+    kind, seeds = Kind(method, size, len(low)), np.asarray(seed)
     start = _scattered(seed, SCATTERED if chosen.distribution else size, len(low))
     seen = [(start, fitness_of.scattered(low + (high - low) * start, size))]
     if chosen.distribution:
-        asked, state = begin(seed, start[np.argmin(seen[0][1])])
+        asked, state = _begin(kind, seeds, start[np.argmin(seen[0][1])])
     else:
-        asked, state = begin(seed, start, seen[0][1])
+        asked, state = _begin(kind, seeds, start, seen[0][1])
 
     interrupted = False
     try:
         for generation in range(1, rounds):
             cube = np.asarray(asked)
             fitness = fitness_of(low + (high - low) * cube)
-            asked, state = go_on(seed, generation, cube, fitness, state)
+            asked, state = _go_on(kind, seeds, np.asarray(generation), cube, fitness, state)
             seen.append((cube, fitness))
             if progress:
                 best = min(f.min() for _, f in seen)
@@ -127,36 +127,59 @@ def search(
     return _collect(seen, low, high, interrupted)
 
 
+Value = Array | np.ndarray
+
+
+class Kind(NamedTuple):
+    """Of a search, what its programs are compiled for."""
+
+    method: str
+    population: int
+    dimensions: int
+
+
+# Two programs, for step by step evosax compiles dozens. They hand on the state of evosax's algorithm as a tuple: where
+# the programs were kept, evosax need not even be imported.
+
+
+@quickly_compiled
+def _begin(kind: Kind, seed: Value, *start: Value):
+    """The first points of the unit cube to try, (population, dimensions), and the state to go on from."""
+    algorithm, settings = _algorithm(kind)
+    return _asked(kind, seed, 1, algorithm.init(jax.random.key(seed), *start, settings))
+
+
+@quickly_compiled
+def _go_on(kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Value, state):
+    """The next points to try after those of the `cube` turned out so fit, and the state to go on from."""
+    algorithm, settings = _algorithm(kind)
+    start = (cube[0],) if METHODS[kind.method].distribution else (cube, fitness)
+    like = algorithm.init(
+        jax.random.key(0), *start, settings
+    )  # of which only the structure is made use of
+    whole = jax.tree.unflatten(jax.tree.structure(like), state)
+    whole, _ = algorithm.tell(_keys(seed, generation)[1], cube, fitness, whole, settings)
+    return _asked(kind, seed, generation + 1, whole)
+
+
+def _asked(kind: Kind, seed, generation, state):
+    algorithm, settings = _algorithm(kind)
+    asked, state = algorithm.ask(_keys(seed, generation)[0], state, settings)
+    return jnp.clip(asked, 0.0, 1.0), tuple(map(_settled, jax.tree.leaves(state)))
+
+
+def _keys(seed, generation) -> Array:
+    return jax.random.split(jax.random.fold_in(jax.random.key(seed), generation))
+
+
 @cache
-def _programs(method: str, population: int, dimensions: int):
-    """How a search begins and how it goes on, compiled as two programs: step by step evosax compiles dozens.
-
-    `begin(seed, *start)` and `go_on(seed, generation, cube, fitness, state)` give the next points of the unit cube
-    to try, (population, dimensions), and the state to go on from. Cached, as are then the programs.
-    """
-    algorithm = METHODS[method].algorithm()(population, jnp.zeros(dimensions))
-
-    def settings():
+def _algorithm(kind: Kind):
+    """evosax's algorithm and its settings."""
+    method = METHODS[kind.method]
+    with jax.ensure_compile_time_eval():  # it is kept, and asked for while a program is traced
+        algorithm = method.algorithm()(kind.population, jnp.zeros(kind.dimensions))
         default = algorithm.default_params
-        return default.replace(std_init=SPREAD) if METHODS[method].distribution else default
-
-    def keys(seed, generation):
-        return jax.random.split(jax.random.fold_in(jax.random.key(seed), generation))
-
-    def ask(seed, generation, state):
-        asked, state = algorithm.ask(keys(seed, generation)[0], state, settings())
-        return jnp.clip(asked, 0.0, 1.0), jax.tree.map(_settled, state)
-
-    @partial(jax.jit, compiler_options=QUICKLY)
-    def begin(seed, *start):
-        return ask(seed, 1, algorithm.init(jax.random.key(seed), *start, settings()))
-
-    @partial(jax.jit, compiler_options=QUICKLY)
-    def go_on(seed, generation, cube, fitness, state):
-        state, _ = algorithm.tell(keys(seed, generation)[1], cube, fitness, state, settings())
-        return ask(seed, generation + 1, state)
-
-    return begin, go_on
+    return algorithm, default.replace(std_init=SPREAD) if method.distribution else default
 
 
 def _settled(leaf: Array) -> Array:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..compiled import compiled
 from ..effects.base import State
 from ..motor import Motor
 from ..threads import CORES, side_by_side
@@ -47,10 +48,10 @@ def squared_errors(
     cores = CORES if jax.default_backend() == "cpu" else 1
     shares = max(1, min(cores, size // least))
     if shares == 1 or size % shares:  # unequal shares would be compiled once more
-        return _errors(motors, tape, 0)
+        return _errors(motors, tape, np.asarray(0), 1)
 
     def part(k: int):
-        return jax.block_until_ready(_errors(motors, tape, k, shares))
+        return jax.block_until_ready(_errors(motors, tape, np.asarray(k), shares))
 
     # XLA walks a population on one core; the cores share it out among them
     parts = side_by_side(part, range(shares))
@@ -59,8 +60,8 @@ def squared_errors(
 
 
 # The widest vectors, where the processor has them: by default XLA uses half of their width.
-@partial(jax.jit, static_argnames="shares", compiler_options={"xla_cpu_prefer_vector_width": 512})
-def _errors(motors: Motor, tape: Tape, share: int | Int[Array, ""], shares: int = 1):
+@partial(compiled, options={"xla_cpu_prefer_vector_width": 512})
+def _errors(motors: Motor, tape: Tape, share: Int[Array | np.ndarray, ""], shares: int):
     """Of one of the equal shares of a population."""
     if shares > 1:
         size = motors.R.shape[0] // shares

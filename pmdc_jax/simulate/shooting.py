@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..compiled import compiled
 from ..effects.base import State
 from ..motor import Drive, Motor
 from .solver import (
@@ -67,7 +68,7 @@ class Own(NamedTuple):
     twist: Float[Array, " runs"]
 
 
-@eqx.filter_jit
+@compiled
 def free_run(
     motor: Motor,
     tape: Tape,
