@@ -61,24 +61,31 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
     **Arguments**: `function` of this package, which returns arrays, in tuples perhaps, but no modules of equinox, for
     these cannot be written and read; `options` of XLA.
     """
-    jitted = eqx.filter_jit(function, compiler_options=options)  # pyright: ignore[reportCallIssue]
+    # within compiled code there are no options but its own
+    within, alone = (
+        eqx.filter_jit(function, compiler_options=o)  # pyright: ignore[reportCallIssue]
+        for o in (None, options)
+    )
     if "<" in function.__qualname__:
-        return jitted
+        return alone
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays, static = eqx.partition((args, kwargs), eqx.is_array)
         leaves, structure = jax.tree.flatten(arrays)
-        if programs() is None or any(isinstance(leaf, Tracer) for leaf in leaves):
-            return jitted(*args, **kwargs)
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
+            return within(*args, **kwargs)
+        if programs() is None:
+            return alone(*args, **kwargs)
         try:
             key = _key(function, options, leaves, structure, static)
         except (pickle.PicklingError, AttributeError, TypeError):
-            return jitted(*args, **kwargs)
+            return alone(*args, **kwargs)
 
         def of_arrays(*leaves):
             args, kwargs = eqx.combine(structure.unflatten(leaves), static)
-            return cast(Callable, function)(*args, **kwargs)
+            # not the function itself: traces within other compiled code are found again
+            return cast(Callable, within)(*args, **kwargs)
 
         with _locks[key]:
             program = _programs.get(key) or _kept(key) or _made(key, of_arrays, leaves, options)
@@ -90,7 +97,7 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
 
 
 def quickly_compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """`compiled` for what takes longer to compile than it ever runs; not to be called from compiled code."""
+    """`compiled` for what takes longer to compile than it ever runs."""
     return compiled(function, QUICKLY)
 
 

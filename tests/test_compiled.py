@@ -32,18 +32,30 @@ roots = compiled.compiled(scaled_roots)
 MATRIX = np.array([[2.0, 1.0], [1.0, 2.0]])
 
 
+class Keeping:
+    """The programs of one process: which were made, and whether the last one found what it asked for."""
+
+    def __init__(self, monkeypatch, folder: Path):
+        self.monkeypatch, self.folder, self.made, make = monkeypatch, folder, [], compiled._made
+        monkeypatch.setenv(PROGRAMS, str(folder))
+        monkeypatch.setattr(compiled, "_made", lambda *args: self.made.append(args) or make(*args))
+        self.begin_another_process()
+
+    def begin_another_process(self) -> None:
+        self.monkeypatch.setattr(compiled, "_programs", {})
+
+    def makes(self, matrix, times: int) -> bool:
+        """Whether a call has to make a program; it is right either way."""
+        before = len(self.made)
+        found = roots(matrix, times)
+        assert np.asarray(found.values) == pytest.approx(times * np.array([1.0, 3.0]))
+        assert found.times == times
+        return len(self.made) > before
+
+
 @pytest.fixture
 def keeping(monkeypatch, tmp_path):
-    monkeypatch.setenv(PROGRAMS, str(tmp_path / "programs"))
-    monkeypatch.setattr(compiled, "_programs", {})
-    return tmp_path / "programs"
-
-
-def traced(capsys, call) -> bool:
-    """Whether a call traces the function; it is right either way."""
-    found = call()
-    assert np.asarray(found.values) == pytest.approx(found.times * np.array([1.0, 3.0]))
-    return "traced" in capsys.readouterr().out
+    return Keeping(monkeypatch, tmp_path / "programs")
 
 
 def test_a_program_is_traced_once_for_all_processes(tmp_path):
@@ -59,40 +71,38 @@ def test_a_program_is_traced_once_for_all_processes(tmp_path):
     assert second.stdout.startswith("Roots(")
 
 
-def test_another_argument_is_another_program(x64, keeping, monkeypatch, capsys):
-    assert traced(capsys, lambda: roots(MATRIX, 2))
-    assert not traced(capsys, lambda: roots(MATRIX, 2))
-    assert traced(capsys, lambda: roots(MATRIX, 3))
-    assert traced(capsys, lambda: roots(MATRIX.astype(np.float32), 2))
-    monkeypatch.setattr(compiled, "_programs", {})  # as in another process
-    assert not traced(capsys, lambda: roots(MATRIX, 2))
-    assert not traced(capsys, lambda: roots(MATRIX, 3))
-    monkeypatch.setattr(compiled, "_programs", {})
+def test_another_argument_is_another_program(x64, keeping, monkeypatch):
+    assert keeping.makes(MATRIX, 2)
+    assert not keeping.makes(MATRIX, 2)
+    assert keeping.makes(MATRIX, 3)
+    assert keeping.makes(MATRIX.astype(np.float32), 2)
+    keeping.begin_another_process()
+    assert not keeping.makes(MATRIX, 2)
+    assert not keeping.makes(MATRIX, 3)
+    keeping.begin_another_process()
     monkeypatch.setattr(compiled, "_source", lambda: "a later version")
-    assert traced(capsys, lambda: roots(MATRIX, 2))
+    assert keeping.makes(MATRIX, 2)
 
 
-def test_a_damaged_program_is_made_anew(x64, keeping, monkeypatch, capsys):
-    assert traced(capsys, lambda: roots(MATRIX, 2))
-    (kept,) = keeping.iterdir()
+def test_a_damaged_program_is_made_anew(x64, keeping):
+    assert keeping.makes(MATRIX, 2)
+    (kept,) = keeping.folder.iterdir()
     whole = kept.read_bytes()
     kept.write_bytes(whole[: len(whole) // 2])
-    monkeypatch.setattr(compiled, "_programs", {})
-    assert traced(capsys, lambda: roots(MATRIX, 2))
+    keeping.begin_another_process()
+    assert keeping.makes(MATRIX, 2)
     assert len(kept.read_bytes()) > len(whole) / 2
 
 
 def test_what_was_not_used_for_longest_goes_first(keeping, monkeypatch):
     monkeypatch.setattr(compiled, "MOST", 250)
-    keeping.mkdir()
-    for age in range(5):
-        (keeping / f"of age {age}").write_bytes(bytes(100))
-        os.utime(keeping / f"of age {age}", (1e9 - age, 1e9 - age))
+    keeping.folder.mkdir()
+    ages = [keeping.folder / f"of age {age}" for age in range(5)]
+    for age, path in enumerate(ages):
+        path.write_bytes(bytes(100))
+        os.utime(path, (1e9 - age, 1e9 - age))
     roots(MATRIX, 2)
-    assert {path.name for path in keeping.iterdir() if "age" in path.name} == {
-        "of age 0",
-        "of age 1",
-    }
+    assert [path.exists() for path in ages] == [True, True, False, False, False]
 
 
 def test_in_compiled_code_and_without_a_name_it_is_filter_jit(keeping):
@@ -100,7 +110,7 @@ def test_in_compiled_code_and_without_a_name_it_is_filter_jit(keeping):
     assert nameless(jnp.ones(2)).tolist() == [2.0, 2.0]
     inner = jax.jit(lambda matrix: roots(matrix, 2).values)
     assert inner(MATRIX) == pytest.approx([2.0, 6.0])
-    assert not keeping.exists()
+    assert not keeping.made
 
 
 @pytest.mark.parametrize(("used", "times"), [(600, 2), (400, 1)], ids=["full", "room"])

@@ -11,7 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from ..compiled import compiled
+from ..compiled import quickly_compiled
 from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
 STEPS = 60
@@ -62,7 +62,7 @@ def _unscaled(problem: Problem, flat, begun, scale) -> Unknowns:
     return unflatten(problem, jnp.where(scale > 0, flat * scale, begun))
 
 
-@compiled
+@quickly_compiled
 def _levenberg_marquardt(problem: Problem, start: Unknowns, scale, size, tolerance):
     begun = flatten(start)
     solution = optx.least_squares(
