@@ -138,6 +138,14 @@ def test_steps_of_counts_over_a_time_are_steps():
     assert quantum(np.diff(np.gradient(counts, time))) == pytest.approx(0.5 / 7e-4)
 
 
+def test_steps_of_printed_counts_are_known_to_more_digits_than_one_has():
+    """Speeds of 2.80848 rad/s a count in seven digits: their smallest difference is 2.8084, and 2762.08 lines."""
+    rng = np.random.default_rng(2)
+    counts = np.cumsum(rng.integers(-3, 4, 3000)) * 2 * np.pi / 2762 / 8.1e-4
+    speed = np.array([float(f"{x:.7g}") for x in counts])
+    assert 2 * np.pi / quantum(np.diff(speed)) / 8.1e-4 == pytest.approx(2762, abs=2e-3)
+
+
 @pytest.mark.parametrize("known_by", ["angle", "difference"])
 def test_a_spline_is_mended_where_steps_bend_the_motion(known_by):
     """Exact angles by the matrix exponential, sampled slowly: the spline alone is off by 0.27 rad/s and more."""

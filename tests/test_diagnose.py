@@ -13,6 +13,7 @@ from scipy import stats
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import Recording
+from pmdc_jax.diagnose import naming
 from pmdc_jax.diagnose.candidates import FULLER, TABLE, Scales
 from pmdc_jax.diagnose.compare import Fitted
 from pmdc_jax.diagnose.evidence import Block, products
@@ -26,7 +27,7 @@ from pmdc_jax.diagnose.pipeline import may_be_none
 from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
 from pmdc_jax.diagnose.rounding import READINGS, readings
-from pmdc_jax.diagnose.screen import common_to_waves, log_chance
+from pmdc_jax.diagnose.screen import Screen, Signal, common_to_waves, log_chance
 from pmdc_jax.diagnose.seen import Seen
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.colour import Series, whitener
@@ -87,6 +88,26 @@ def test_what_was_left_for_a_better_model_is_not_come_back_to():
     namer = Undecided()
     assert namer.name().chosen is namer.other
     assert namer.trials == 3
+
+
+@pytest.mark.parametrize(("count", "left", "asked"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])
+def test_a_full_set_exchanges_what_acts_in_the_same_equation(monkeypatch, count, left, asked):
+    """Dry friction, a delay and an offset, where a peak of friction is what promises most."""
+    effects = ("asymmetric_friction", "speed_sensor_delay", "current_sensor_offset")[:count]
+    peak = Mock(spec=Signal, candidate=Mock(effect="stribeck_friction"), gain=1.0)
+    monkeypatch.setattr(naming, "clear", lambda found: [peak])
+    namer = Undecided()
+    namer.refits = Mock(without=Mock(return_value=Mock(spec=Model)))
+    namer.refits.with_signal.return_value = Mock(spec=Model)
+    namer._see = lambda model: Mock(spec=Seen, of_candidates=[peak], screen=Mock(spec=Screen))
+    namer._better = lambda current, found, tried: tried[0] if tried else None
+    found = Mock(spec=Seen, left=left, is_trace=lambda model: False, screen=Mock(white="white"))
+    current = Mock(spec=Model, effects=effects)
+    better = namer._in_exchange(current, found)
+    assert namer.refits.without.call_count == asked
+    if asked:
+        namer.refits.without.assert_called_with(current, "asymmetric_friction", "white")
+        assert better is namer.refits.with_signal.return_value
 
 
 def test_a_motor_that_cannot_be_simulated_suggests_no_run(x64):
@@ -254,12 +275,22 @@ def test_what_a_coarse_reading_leaves_is_evidence_for_nothing():
     assert alarms["by rounding"] <= 3
 
 
-@pytest.mark.parametrize(("noise", "coarse"), [(0.0, True), (0.1, True), (1.0, False)])
-def test_only_steps_that_nothing_blurs_are_coarse(noise, coarse):
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize(
+    ("read", "coarse"),
+    [
+        (lambda exact, rng: np.round(exact), True),
+        (lambda exact, rng: np.round(exact + 2 * rng.normal(size=exact.shape)), False),
+        # counts of an encoder from sample to sample: no error lasts
+        (lambda exact, rng: np.diff(np.round(np.cumsum(exact, 0)), axis=0, prepend=0), False),
+    ],
+    ids=["rounded", "blurred", "counted"],
+)
+def test_only_steps_that_nothing_blurs_are_coarse(read, coarse):
     exact, known = np.linspace(0, 20, 2000)[:, None], np.ones(2000, bool)
-    measured = 0.5 * np.round((exact + noise * rng.normal(size=exact.shape)) / 0.5)
-    left, simulated = (Series(x, known, (1e-3, (0,))) for x in (measured - exact, exact))
+    left, simulated = (
+        Series(0.5 * x, known, (1e-3, (0,)))
+        for x in (read(exact, np.random.default_rng(0)) - exact, exact)
+    )
     errors = readings(Fit(simulated, simulated, left, simulated), 0)
     assert bool(errors.any()) is coarse
     assert np.abs(errors).max() <= 0.25 + 1e-12

@@ -103,6 +103,7 @@ class Namer:
         ways = [self._by_evidence, self._settling, self._by_plain_squares]
         if found.unexplained < SWALLOWED:
             ways = [self._by_plain_squares, self._by_evidence, self._settling]
+        ways.append(self._in_exchange)
         return next(filter(None, (way(current, found) for way in ways)), None)
 
     def _by_evidence(self, current: Model, found: Seen) -> Model | None:
@@ -169,6 +170,24 @@ class Namer:
         tried = [self.refits.with_signal(current, s, pointed) for s in most]
         better = [m for m in tried if m is not None and m.polished.refined.fitness < far]
         return self._better(current, found, better)
+
+    def _in_exchange(self, current: Model, found: Seen) -> Model | None:
+        """A model that has no room for one more effect, with the one that promises most in the place of each of those
+        in the same equation."""
+        if len(current.effects) < MOST or found.left >= ALARM or found.is_trace(current):
+            return None
+        others = [s for s in clear(found) if effect_of(s) not in current.effects]
+        if not others:
+            return None
+        new = effect_of(max(others, key=lambda s: s.gain))
+        tried: list[Model | None] = []
+        for old in current.effects:
+            if EFFECTS[old].equation == EFFECTS[new].equation:
+                smaller = self.refits.without(current, old, found.screen.white)
+                seen = self._see(smaller)
+                most = [s for s in seen.of_candidates if effect_of(s) == new][:1]
+                tried += self._with(smaller, seen, most)
+        return self._better(current, found, tried)
 
     def without(self, named: Naming, effect: str) -> Naming:
         """The set without one of its effects."""

@@ -11,8 +11,9 @@ from .model import Fit
 
 # Readings that are tried
 READINGS = 8
-# Errors of so many quanta blur them: what rounding adds to such noise is as white
-BLURRED = 0.6
+# Errors of so many steps blur them: what rounding adds to such noise is as white. So do errors that come and go by so
+# many times more than those of the readings, as those of an encoder whose counts are taken from sample to sample
+BLURRED, RESTLESS = 0.6, 1.5
 
 
 def readings(fit: Fit, run: int) -> Float[np.ndarray, "samples outputs readings"]:
@@ -26,8 +27,17 @@ def readings(fit: Fit, run: int) -> Float[np.ndarray, "samples outputs readings"
     errors = np.zeros((*values.shape, READINGS))
     pairs = zip(values.T, fit.residual.values.T, strict=True)
     for k, (simulated, left) in enumerate(pairs):
-        step = quantum(np.diff((simulated + left)[known]))
-        if np.mean(np.square(left[known])) < (BLURRED * step) ** 2:
-            exact = simulated[:, None] + step * random.uniform(size=READINGS)
-            errors[:, k] = step * np.round(exact / step) - exact
+        measured = (simulated + left)[known]
+        step = quantum(np.diff(measured))
+        if np.mean(np.square(left[known])) >= (BLURRED * step) ** 2:
+            continue
+        exact = simulated[:, None] + step * random.uniform(size=READINGS)
+        read = step * np.round(exact / step)
+        if _restlessness(measured) < RESTLESS * _restlessness(read[known]):
+            errors[:, k] = read - exact
     return errors
+
+
+def _restlessness(signals: Float[np.ndarray, "samples *signals"]) -> float:
+    """How much signals come and go from sample to sample."""
+    return float(np.std(np.diff(signals, 2, axis=0)))

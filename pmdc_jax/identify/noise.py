@@ -64,7 +64,17 @@ def quantum(steps: Float[np.ndarray, " steps"]) -> float:
         return 0.0
     # the smallest one may be none, the next ones may be two or more
     for smallest in (np.quantile(sizes, 0.01), np.min(sizes)):
-        off = np.abs(sizes / smallest - np.round(sizes / smallest))
+        step = _of_multiples(sizes, float(smallest))
+        off = np.abs(sizes / step - np.round(sizes / step))
         if np.mean(off < 0.02) > 0.95:
-            return float(smallest)
+            return step
     return 0.0
+
+
+def _of_multiples(sizes: Float[np.ndarray, " steps"], step: float) -> float:
+    """The step of which sizes are multiples, from one of a few digits: the larger the multiple the more it tells."""
+    for reach in (10, 100, np.inf):
+        near = sizes[sizes < reach * step]
+        counts = np.round(near / step)
+        step = float(near @ counts / (counts @ counts))
+    return step
