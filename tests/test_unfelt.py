@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import cont2discrete
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import identify
@@ -75,6 +76,29 @@ def test_noise_of_the_voltage_sensor_does_not_bend_the_parameters():
         *("prbs", "loaded", "stairs")
     ]
     assert np.max(np.abs(errors(found))) < 3.5
+
+
+def controlled(samples: int = 3000, step: float = 1e-3) -> Recording:
+    """A run whose voltage answers to the noise of the measured speed, exact from sample to sample."""
+    m, rng = vb.paper_motor(), np.random.default_rng(12)
+    A = np.array([[-m.R / m.L, -m.Kb / m.L], [m.Kt / m.J, -m.f / m.J]])
+    B = np.array([[1 / m.L], [0.0]])
+    F, G, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), step)
+    wanted = np.repeat(rng.uniform(-300, 300, samples // 250), 250)
+    state, rows, sum_of_errors = np.zeros(2), [], 0.0
+    for k in range(samples):
+        current, speed = state + rng.standard_normal(2) * [0.1, 0.5]
+        sum_of_errors += (wanted[k] - speed) * step
+        volts = 0.05 * (wanted[k] - speed) + sum_of_errors
+        rows.append((volts, current, speed))
+        state = F @ state + G[:, 0] * volts
+    return Recording("controlled", step * np.arange(samples), *np.transpose(rows))
+
+
+def test_a_held_out_voltage_that_answers_to_a_noisy_speed_is_left_alone():
+    found = identify(recorded(felt=0.0, unfelt=0.0), [controlled()])
+    assert not [m for m in found.messages if "did not feel" in m]
+    assert found.fit["controlled"].current_rmse == pytest.approx(0.1, rel=0.05)
 
 
 def test_a_rough_voltage_that_the_motor_felt_is_left_alone():

@@ -35,6 +35,8 @@ WINDOWS = ((-1, 0), (0, 0), (1, 0), (-1, 1), (0, 2), (1, 1))
 DEPARTURE = 1.25
 # Rough parts of which the motor felt less than this share, so many standard errors below all, are noise
 FELT, CLEAR = 0.5, 5.0
+# ... unless without them a run is missed by so many times more, in squares: a filter then took for noise what they did
+MISSED = 1.1
 
 
 def without_unfelt(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
@@ -91,7 +93,12 @@ def _felt(problem: Problem, rough: Polished, smooth: Polished) -> list[float]:
         power = response @ response
         share = 1 + rest @ response / power if power > 0 else 1.0
         error = np.std(rest) / np.sqrt(power) if power > 0 else 1.0
-        clear = share < FELT and share + CLEAR * error < 1
+        mine = problem.tape.blocks_of(run)
+        squares, smoothly = (
+            np.square(residual[mine] / rough.noise[:, None]).sum()
+            for residual in (left, left_smooth)
+        )
+        clear = share < FELT and share + CLEAR * error < 1 and smoothly < MISSED * squares
         shares.append(float(np.clip(share, 0.0, 1.0)) if clear else 1.0)
     return shares
 
