@@ -48,7 +48,11 @@ def test_a_simulation_without_noise_lacks_nothing():
         assert found.final.parameters[name].value == pytest.approx(PAPER[name], rel=1e-3)
 
 
-@pytest.mark.parametrize("noise", [NOISE, SHAKEN], ids=["white", "coloured"])
+@pytest.mark.parametrize(
+    "noise",
+    [pytest.param(NOISE, marks=pytest.mark.slow), SHAKEN],
+    ids=["white", "coloured"],
+)
 def test_hidden_friction_is_named_and_closes_the_gap(noise):
     truth = vb.BenchMotor(**PAPER, coulomb_Nm=0.08)
     # the loaded run is among those fitted: without a known load only ratios of torques are seen

@@ -127,6 +127,7 @@ def in_a_speed_loop() -> Recording:
     return Recording("loop", dt * np.arange(len(wanted)), voltage, *seen.T)
 
 
+@pytest.mark.slow
 def test_an_unknown_load_does_not_pass_for_a_voltage_that_the_motor_did_not_feel():
     found = identify([in_a_speed_loop()])
     assert not [m for m in found.messages if "did not feel" in m]
