@@ -29,8 +29,19 @@ T = TypeVar("T")
 # friction and teeth, which take a quarter longer.
 QUICKLY = {"xla_cpu_use_fusion_emitters": False}
 # What else decides what a function of this package is compiled to
-LIBRARIES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy")
-# Bytes of programs that are kept; those for seven runs of 33,000 samples take some five million
+LIBRARIES = (
+    "jax",
+    "jaxlib",
+    "equinox",
+    "diffrax",
+    "lineax",
+    "optimistix",
+    "optax",
+    "evosax",
+    "numpy",
+)
+FLAGS = "XLA_FLAGS"
+# Bytes of programs that are kept; a diagnosis of recordings of a new shape leaves a few million
 MOST = 500_000_000
 
 # Where Linux lists a process's memory maps, and says how many it may have
@@ -129,7 +140,7 @@ def _source() -> str:
     """This package and what it builds on."""
     files = sorted(Path(__file__).parent.rglob("*.py"))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
-    built_on = [jax.default_backend(), *map(version, LIBRARIES)]
+    built_on = [jax.default_backend(), os.environ.get(FLAGS, ""), *map(version, LIBRARIES)]
     return hashlib.sha256(" ".join([digest, *built_on]).encode()).hexdigest()[:16]
 
 
@@ -142,7 +153,8 @@ def _kept(key: str) -> Program | None:
         serialized, structure, others = pickle.loads(kept)
         program = serialize_executable.deserialize_and_load(*serialized)
         os.utime(path)
-    except Exception:  # there is none, or it is damaged: whatever is wrong, another one is made
+    # there is none, or it is damaged: whatever is wrong, another one is made
+    except Exception:
         return None
     return Program(program, structure, others)
 
@@ -174,9 +186,8 @@ def _made(key: str, function: Callable, leaves: Sequence, options) -> Program:
             serialized = serialize_executable.serialize(run)
             content = pickle.dumps((serialized, structure, others))
             _write(_path(key), zlib.compress(content, level=1))
-        except (
-            Exception
-        ):  # XLA cannot write it, or the disk is full: then it is made anew the next time
+        # XLA cannot write it, or the disk is full: then it is made anew the next time
+        except Exception:
             pass
     return Program(run, structure, others)
 

@@ -154,9 +154,7 @@ def _go_on(kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Val
     """The next points to try after those of the `cube` turned out so fit, and the state to go on from."""
     algorithm, settings = _algorithm(kind)
     start = (cube[0],) if METHODS[kind.method].distribution else (cube, fitness)
-    like = algorithm.init(
-        jax.random.key(0), *start, settings
-    )  # of which only the structure is made use of
+    like = algorithm.init(jax.random.key(0), *start, settings)
     whole = jax.tree.unflatten(jax.tree.structure(like), state)
     whole, _ = algorithm.tell(_keys(seed, generation)[1], cube, fitness, whole, settings)
     return _asked(kind, seed, generation + 1, whole)
