@@ -82,12 +82,12 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        arrays, static = eqx.partition((args, kwargs), eqx.is_array)
-        leaves, structure = jax.tree.flatten(arrays)
-        if any(isinstance(leaf, Tracer) for leaf in leaves):
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
             return within(*args, **kwargs)
         if programs() is None:
             return alone(*args, **kwargs)
+        arrays, static = eqx.partition((args, kwargs), eqx.is_array)
+        leaves, structure = jax.tree.flatten(arrays)
         try:
             key = _key(function, options, leaves, structure, static)
         except (pickle.PicklingError, AttributeError, TypeError):
