@@ -237,7 +237,8 @@ def _column(header: str, quantity: str, unit: str | None) -> Column:
 def _readings(header: str) -> Iterator[tuple[str, str | None, bool]]:
     """Ways to read a header as name and unit, the surest first; True where it has brackets."""
     header = header.strip()
-    if brackets := re.fullmatch(r"(.*?)[\s_]*[\[({]\s*(.*?)\s*[\])}]", header):
+    # a colon in brackets is MATLAB's, and means a column or a row of a matrix
+    if brackets := re.fullmatch(r"(.*?)[\s_]*[\[({]\s*([^:]*?)\s*[\])}]", header):
         name, unit = brackets.groups()
         yield name, None if unit in ("", "-") else unit, True
         return

@@ -259,7 +259,7 @@ def binary_cases() -> Iterator[Case]:
     hdf5 = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n" * 20
     yield Case("MATLAB v7.3", raw(hdf5, "run.mat"), "-v7")
     yield Case("mat of texts", mat(note="hello"), "no vectors")
-    yield Case("mat of one matrix", mat(data=np.eye(30)), "no vectors")
+    yield Case("mat of one matrix", mat(data=np.eye(30)), "no time column")
     yield Case("mat without time", mat(**good_mat(time_s="none")), "no time column")
     yield Case(
         "mat of unequal lengths",

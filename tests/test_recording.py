@@ -314,6 +314,58 @@ def test_matlab_vectors_of_any_orientation(tmp_path, shape, nested):
     np.testing.assert_array_equal(run.time, T)
 
 
+def _structures(*fields: dict) -> np.ndarray:
+    """An array of structures as savemat takes it."""
+    made = np.zeros(len(fields), [(name, object) for name in fields[0]])
+    made[:] = [tuple(one.values()) for one in fields]
+    return made
+
+
+def _simulink(*signals: tuple[np.ndarray, str]) -> dict:
+    signals = _structures(
+        *({"values": v, "dimensions": 1.0, "label": label} for v, label in signals)
+    )
+    return {"time": T[:, None], "signals": signals, "blockName": "model/To Workspace"}
+
+
+@pytest.mark.parametrize(
+    ("content", "columns"),
+    [
+        # Simulink's "structure with time": labelled signals, one for each, and without labels
+        ({"simout": _simulink((T, "voltage_V"), (T, "Speed [rpm]"))}, {}),
+        ({"voltage_V": _simulink((T, "")), "Speed_rpm": _simulink((T, ""))}, {}),
+        (
+            {"yout": _simulink((np.stack([T, T], 1), ""))},
+            {"voltage": "yout(:,1)", "speed": "yout(:,2):rpm"},
+        ),
+        # its block "To File" has a row for each signal
+        (
+            {"ans": np.stack([T, T, T])},
+            {"time": "ans(1,:)", "voltage": "ans(2,:)", "speed": "ans(3,:):rpm"},
+        ),
+        # dSPACE ControlDesk
+        (
+            {
+                "exp_001": {
+                    "X": _structures({"Name": "time", "Data": T, "Unit": "s"}),
+                    "Y": _structures(
+                        {"Name": "voltage", "Data": T, "Unit": "V"},
+                        {"Name": "Speed", "Data": T, "Unit": "rpm"},
+                    ),
+                }
+            },
+            {},
+        ),
+    ],
+)
+def test_what_simulink_and_controldesk_save(tmp_path, content, columns):
+    savemat(tmp_path / "run.mat", content)
+    run = read_recording(tmp_path / "run.mat", columns)
+    np.testing.assert_array_equal(run.time, T)
+    np.testing.assert_array_equal(run.voltage, T)
+    np.testing.assert_allclose(run.speed, T * RPM)
+
+
 def test_integers_in_parquet_and_matlab(tmp_path):
     whole = np.arange(12)
     columns = {"time_s": whole, "voltage_V": whole, "speed_rad_s": whole}
