@@ -318,13 +318,17 @@ def test_current_and_speed_tell_the_mechanical_half():
 
 
 def held_rotor(seed: int, **columns) -> Recording:
-    """A locked-rotor test, by the closed form of a coil whose voltage holds between samples."""
+    """A locked-rotor test: twenty voltages."""
     rng = np.random.default_rng(seed)
-    time, voltage = 5e-4 * np.arange(SAMPLES), np.repeat(rng.uniform(-3, 3, 20), SAMPLES // 20)
-    decay = np.exp(-PAPER.R / PAPER.L * 5e-4)
+    voltage = np.repeat(rng.uniform(-3, 3, 20), SAMPLES // 20)
+    return of_coil(voltage, 5e-4, NOISE.current_A * rng.standard_normal(SAMPLES), **columns)
+
+
+def of_coil(voltage: np.ndarray, step: float, noise: np.ndarray, **columns) -> Recording:
+    """By the closed form of a coil whose voltage holds between samples."""
+    decay = np.exp(-PAPER.R / PAPER.L * step)
     current = lfilter([0, (1 - decay) / PAPER.R], [1, -decay], voltage)
-    noise = NOISE.current_A * rng.standard_normal(SAMPLES)
-    return Recording("held", time, voltage, current + noise, **columns)
+    return Recording("held", step * np.arange(len(voltage)), voltage, current + noise, **columns)
 
 
 @pytest.mark.parametrize(
@@ -337,6 +341,19 @@ def test_a_held_rotor_tells_the_electrical_half(columns):
         assert abs(estimate.value - true) < 3 * estimate.stderr < 0.01 * true
     assert {found.parameters[n].status for n in ("Kb", "Kt", "J", "f")} == {"not_identifiable"}
     assert found.converged
+
+
+@pytest.mark.parametrize(("step", "samples"), [(2e-4, 150), (2e-5, 500)])
+def test_a_single_rise_of_the_current_tells_the_electrical_half(step, samples):
+    """As a scope catches it: a few time constants long, which is far longer than a sample."""
+    voltage = np.where(np.arange(samples) < samples // 6, 0.0, 3.0)
+    noise = 0.05 * np.random.default_rng(9).standard_normal(samples)
+    found = identify([of_coil(voltage, step, noise, held=True)])
+    for name, true in (("R", PAPER.R), ("L", PAPER.L)):
+        estimate = found.parameters[name]
+        assert estimate.status == "identified"
+        assert abs(estimate.value - true) < 3 * estimate.stderr < 0.02 * true
+    assert not any("times its white noise" in message for message in found.messages)
 
 
 def test_a_held_rotor_goes_with_free_ones(runs, found):

@@ -11,6 +11,8 @@ from ..recording import Recording
 
 # How far a crude estimate may be off, as a factor either way. Wide: the search is cheap.
 CRUDE = 30.0
+# Longest L / R, in means (geometric) of sample time and duration: a scope catches a single rise of the current
+LONGEST = 5.0
 # Back-EMF constant, V s/rad, where nothing tells of it
 USUAL = 0.05
 # By how much what an effect does may be smaller than what drives the motor, and still show
@@ -30,7 +32,7 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
     friction = torque / speed
     return {
         "R": _around(R),
-        "L": (R * step / 300, R * np.sqrt(step * duration)),
+        "L": (R * step / 300, R * min(LONGEST * np.sqrt(step * duration), duration)),
         "Kb": _around(Kb),
         "Kt": _around(Kb),
         "J": (inertia / CRUDE**2, inertia * CRUDE**2),
@@ -78,8 +80,9 @@ def _armature(recordings: Sequence[Recording]) -> tuple[float, float]:
     """R and Kb by least squares on means over short stretches, where L di/dt is small."""
     rows = []
     for run in recordings:
-        if run.voltage is not None and run.current is not None and run.speed is not None:
-            columns = np.stack([run.voltage, run.current, run.speed])
+        speed = np.zeros(len(run)) if run.held else run.speed
+        if run.voltage is not None and run.current is not None and speed is not None:
+            columns = np.stack([run.voltage, run.current, speed])
             rows.append(_means(columns[:, ~np.isnan(columns).any(0)], 20))
     if rows:
         voltage, current, speed = np.concatenate(rows, axis=1)
@@ -89,7 +92,8 @@ def _armature(recordings: Sequence[Recording]) -> tuple[float, float]:
         # short-circuited, it shows no more than how one is to the other
         steady = (np.linalg.norm(voltage) or USUAL * scale[1]) / scale
         # a motor that only stalls, or only runs light, shows one of the two: then the other is open
-        return (R if R > 0 else steady[0]), (Kb if Kb > 0 else steady[1])
+        unseen = steady[1] if np.any(speed) else USUAL
+        return (R if R > 0 else steady[0]), (Kb if Kb > 0 else unseen)
     gains = [
         _rms(r.voltage) / _rms(r.speed)
         for r in recordings

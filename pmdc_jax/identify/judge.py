@@ -67,7 +67,7 @@ def judge(given: Prepared, solved: Solved) -> Identification:
         findings=given.findings,
         covariance=info.covariance,
         covariance_names=parameters.names,
-        messages=_messages(given, solved, best, _missed(left, noise), chosen is not polished),
+        messages=_messages(given, solved, best, _missed(left), chosen is not polished),
     )
 
 
@@ -255,16 +255,14 @@ def _left(fit: Mapping[str, RunFit], name: str) -> list[np.ndarray]:
     return [m - s for m, s in pairs if m is not None and s is not None]
 
 
-def _missed(
-    left: Mapping[str, list[np.ndarray]], noise: Mapping[str, float | None]
-) -> Iterator[str]:
-    """What to say of outputs of which far more is left than their noise."""
+def _missed(left: Mapping[str, list[np.ndarray]]) -> Iterator[str]:
+    """What to say of outputs of which far more is left than the noise of their runs."""
     for name, errors in left.items():
-        size = np.sqrt(np.nanmean(np.square(np.concatenate(errors)))) if errors else 0.0
-        white = noise[name]
-        if white and size > MISSED * white:
+        scaled = [e / white for e in errors if (white := white_noise([e]))]
+        times = np.sqrt(np.nanmean(np.square(np.concatenate(scaled)))) if scaled else 0.0
+        if times > MISSED:
             yield (
-                f"what the fit leaves of the {name} is {size / white:.2g} times its white noise: `pmdc diagnose` tells "
+                f"what the fit leaves of the {name} is {times:.2g} times its white noise: `pmdc diagnose` tells "
                 "whether the model lacks something, or the motor or a sensor was disturbed"
             )
 
