@@ -71,7 +71,7 @@ def open_table(path: Path) -> Table:
 class CsvTable:
     """Text with a header line; separated by comma, semicolon or tab.
 
-    Lines that begin with # and empty lines are skipped, and what an instrument writes before the header. Numbers may
+    Lines that begin with # and empty ones are skipped, and what an instrument writes before the header. Numbers may
     have a decimal comma unless the comma separates. A second line of units belongs to the header. Dates with times are
     read as seconds since the first of them.
     """
@@ -97,7 +97,8 @@ class CsvTable:
         if frame[str(len(self.headers) - 1)].null_count():
             self._refuse_ragged()  # polars fills short lines without a word
         if frame.height and all(frame[i].null_count() for i in wanted):
-            self._kept = np.array([bool(line.strip()) for _, line in self._lines()])
+            # a spreadsheet ends with lines of empty cells
+            self._kept = np.array([bool(line.strip(b" \t\r,;")) for _, line in self._lines()])
             if len(self._kept) != frame.height:
                 what = "it breaks lines inside quotes"
                 raise InputError(str(self._path), what, "Export it as plain CSV")
@@ -348,7 +349,11 @@ def _past_preamble(raw: bytes, line: str, number: int, start: int) -> tuple[str,
             if count < 2 or len(_fields(line, separator)) == count:
                 break
             alike = [text for text in texts if len(_fields(text[0], separator)) == count]
-            return alike[-1] if alike else header
+            # a row with a remark in it is none of numbers, and no header either
+            words = [
+                text for text in alike if not any(map(_is_number, _fields(text[0], separator)))
+            ]
+            return (words or alike or [header])[-1]
         texts.append((now, number, end))
         start = end
     return header
@@ -360,7 +365,7 @@ def _find_units(raw: bytes, start: int, separator: str, count: int) -> tuple[lis
     end = raw.find(b"\n", start) + 1 or len(raw)
     line = raw[start:end].decode().strip("\r\n")
     fields = [field.strip() for field in _fields(line, separator)]
-    if len(fields) != count or any(_is_numbers(f.replace(",", ".")) for f in fields if f):
+    if len(fields) != count or any(map(_is_number, fields)):
         return None, start
     units = [field.strip("()[]") for field in fields]
     return (units, end) if any(units) else (None, start)
@@ -395,9 +400,14 @@ def _seconds(stamps: pl.Series) -> pl.Series:
 
 
 def _is_numbers(line: str) -> bool:
-    fields = line.replace(",", " ").replace(";", " ").split()
+    """Whether a line holds nothing but numbers, in quotes perhaps, and empty cells."""
+    cells = " ".join(_fields(line, _separator(line))).replace(",", " ").split()
+    return all(map(_is_number, cells))
+
+
+def _is_number(cell: str) -> bool:
     try:
-        [float(field) for field in fields]
+        float(cell.replace(",", "."))
     except ValueError:
         return False
     return True

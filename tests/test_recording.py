@@ -433,6 +433,18 @@ def test_a_header_of_another_width_is_no_preamble(tmp_path):
         read_recording(file)
 
 
+def test_a_table_of_quoted_cells_with_remarks_and_empty_lines_at_its_end(tmp_path):
+    """As a spreadsheet exports it."""
+    rows = [f'"{line.replace(",", chr(34) + "," + chr(34))}",""' for line in ROWS.splitlines()]
+    rows[0] = f'{rows[0][:-3]},"cold, at first"'
+    file = tmp_path / "run.csv"
+    header = '"Time (s)","Motor Voltage (V)","Motor Current (A)","Shaft Speed (rad/s)","Remark"'
+    file.write_text("\r\n".join(['"Bench 3, ""north"""', "", header, *rows, ",,,,", ""]))
+    run = read_recording(file)
+    assert len(run) == 20
+    assert (run.voltage[1], run.current[1], run.speed[1]) == (13.0, 0.1, 1.0)
+
+
 def test_a_column_is_mapped_by_its_name_without_the_unit_below(tmp_path):
     file = tmp_path / "scope.csv"
     file.write_text(f"x-axis,1,2,3\nsecond,Volt,Ampere,Volt\n{ROWS}")
