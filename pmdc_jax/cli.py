@@ -103,7 +103,7 @@ def identify(
     and whether the recordings determine it at all. A run without current or voltage is used for
     what it can say.
     """
-    from .report.files import check_outputs
+    from .files import check_outputs
 
     check_outputs({"--save": save, "--json": json, "--report": report}, [*runs, *holdout])
     columns = dict(pairs("--column", column))
@@ -145,7 +145,7 @@ def diagnose(
     Says where simulation and measurement disagree, names the missing effect, adds it, and shows
     how much of the disagreement is gone. The motor saved is the completed one.
     """
-    from .report.files import check_outputs
+    from .files import check_outputs
 
     outputs = {"--save": save, "--json": json, "--report": report, "--experiment": experiment}
     check_outputs(outputs, [*runs, *holdout])
@@ -176,7 +176,7 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
 
     Voltage and load come from the recording; current and speed are written to another.
     """
-    from .report.files import check_outputs
+    from .files import check_outputs
 
     check_outputs({"--out": out}, [motor, input])
     columns = dict(pairs("--column", column))
@@ -215,7 +215,7 @@ def tune(
     They work on the sampled, late and limited loop, and over the uncertainty of the motor; beside
     them stands the fastest settling that voltage and current allow.
     """
-    from .report.files import check_outputs
+    from .files import check_outputs
 
     check_outputs({"--save": save, "--json": json, "--report": report}, [motor])
     from .control.tuning import tune
@@ -266,7 +266,7 @@ def export(controller: ControllerFile, c: HeaderFile) -> None:
 
     Plain C99 in one header: the sampled law with its limits and anti-windup.
     """
-    from .report.files import check_outputs
+    from .files import check_outputs
 
     check_outputs({"--c": c}, [controller])
     from .control.controller_file import load_controller

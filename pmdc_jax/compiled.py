@@ -21,6 +21,7 @@ from jax.core import Tracer
 from jax.experimental import serialize_executable
 
 from .compilation_cache import programs
+from .files import replacing
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -217,9 +218,8 @@ def _path(key: str) -> Path:
 def _write(path: Path, content: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     _tidy(path.parent)
-    part = path.with_suffix(f".{os.getpid()}")
-    part.write_bytes(content)
-    part.replace(path)
+    with replacing(path) as part:
+        part.write_bytes(content)
 
 
 @cache

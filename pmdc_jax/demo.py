@@ -70,7 +70,7 @@ def demo(
 def result_folder(path: Path, first: str) -> Path:
     """Make the folder now, and see whether a file `first` can be written there: better to fail before the work than
     after it."""
-    from .report.files import check_writable
+    from .files import check_writable
 
     try:
         path.mkdir(parents=True, exist_ok=True)

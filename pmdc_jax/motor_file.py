@@ -11,6 +11,7 @@ import numpy as np
 
 from .effects import EFFECTS, AbstractEffect
 from .errors import InputError
+from .files import write_text
 from .motor import PARAMETERS, Motor
 
 if TYPE_CHECKING:
@@ -27,8 +28,6 @@ def save_motor(
     **Arguments**: `motor`, of scalars; `identification`, whose standard errors, statuses and covariance (of the
     coordinates: natural logarithms of positive parameters) are kept beside the values.
     """
-    from .report.files import write_text
-
     content: dict[str, Any] = {
         "format": FORMAT,
         "parameters": {name: float(getattr(motor, name)) for name in PARAMETERS},

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from .columns import QUANTITIES, Column, looks_like, match_columns, mixed_axes
 from .errors import InputError
+from .files import replacing
 from .tables import Table, open_table
 
 Samples = Float[np.ndarray, " samples"]
@@ -195,17 +196,13 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
         raise InputError(str(path), what, "Name it .csv or .parquet")
     data = recording.columns()
     frame = pl.DataFrame({QUANTITIES[quantity].header: array for quantity, array in data.items()})
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with draft.open("wb") as file:
+        with replacing(path) as part, part.open("wb") as file:
             frame.write_csv(file) if suffix == ".csv" else frame.write_parquet(file)
-        draft.replace(path)
     except OSError as error:
         what = f"it cannot be written ({error.strerror or error})"
         mend = "Choose a folder that exists and that you may write to"
         raise InputError(str(path), what, mend) from None
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 class _Fault(NamedTuple):

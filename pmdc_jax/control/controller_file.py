@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..files import write_text
 from .controllers import CONTROLLERS, AbstractController, Number
 from .hardware import Hardware
 from .law import Law, Model
@@ -43,8 +44,6 @@ def law_content(law: Law) -> dict[str, Any]:
 
 def save_controller(path: str | Path, law: Law) -> None:
     """Write a law as JSON, atomically, for `load_controller` and `pmdc export`."""
-    from ..report.files import write_text
-
     write_text(path, json.dumps(law_content(law), indent=2, allow_nan=False) + "\n")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from string import Template
 
+from ..files import write_text
 from .controller_file import gains_of
 from .law import Law
 
@@ -80,8 +81,6 @@ def export(law: Law, c: str | Path) -> None:
 
     **Arguments**: `law`, from `tune(...).law` or `load_controller`; `c`, the file to write.
     """
-    from ..report.files import write_text
-
     write_text(c, c_header(law))
 
 

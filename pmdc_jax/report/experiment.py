@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..diagnose.diagnosis import Diagnosis
-from .files import write_text
+from ..files import write_text
 
 
 def write_experiment(diagnosis: Diagnosis, path: str | Path) -> bool:

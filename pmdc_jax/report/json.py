@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from attrs import asdict
 
+from ..files import write_text
 from ..identify.identification import Estimate, Identification, RunFit, Search
 from ..recording import Finding
-from .files import write_text
 
 if TYPE_CHECKING:
     from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, NextExperiment

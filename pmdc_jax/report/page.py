@@ -13,7 +13,7 @@ import plotly.graph_objects as go
 from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
-from .files import write_text
+from ..files import write_text
 
 PACKAGES = ("pmdc_jax", "jax", "diffrax", "equinox", "optimistix", "evosax", "numpy", "plotly")
 

@@ -189,5 +189,7 @@ def _first(samples: np.ndarray | None) -> float:
 
 
 def _round_up(blocks: int) -> int:
-    step = max(4, 2 ** (blocks.bit_length() - 4))
+    """To a power of two where little is to be simulated, then to multiples of 32, then by a sixteenth at most."""
+    power = max(8, 1 << (blocks - 1).bit_length())
+    step = min(power, max(32, power // 16))
     return -(-blocks // step) * step

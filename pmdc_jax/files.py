@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from ..errors import InputError
+from .errors import InputError
 
 
 def check_outputs(outputs: dict[str, Path | str | None], inputs: list[Path]) -> None:
@@ -43,13 +45,20 @@ def check_writable(option: str, path: Path) -> None:
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a file atomically: readers see the old one or the new one, never half of it."""
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Where to write what is to stand in `path` once it is whole; nothing is left of it where writing fails."""
     path = Path(path).resolve()  # through a link, so that the link stays
     if path.exists() and not path.is_file():  # a device such as /dev/stdout cannot be replaced
-        path.write_text(text, encoding="utf-8")
+        yield path
         return
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.write_text(text, encoding="utf-8")
+        yield part
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
