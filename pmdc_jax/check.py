@@ -8,7 +8,7 @@ import numpy as np
 
 from .alignment import alignment, sampling
 from .clock import GAP, evenly_stamped, is_even
-from .plausibility import angle_against_speed, plain_units, signs, speed_of
+from .plausibility import angle_against_speed, lost_signs, plain_units, signs, speed_of
 from .recording import Finding, Recording
 from .unmeasured import flat_tops, noise_of
 
@@ -215,6 +215,7 @@ LOOKS = (
     leaps,
     spare_torque,
     signs,
+    lost_signs,
     angle_against_speed,
     alignment,
     sampling,

@@ -10,6 +10,7 @@ derivative of noisy data:
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,11 @@ from .recording import Finding, Recording
 MAX_WINDOWS = 4000
 MIN_WINDOWS = 20
 LONGER = (1, 4, 16)  # windows this many times as long are tried too: rates of noisy channels
+UNSIGNED = ("current", "speed")  # channels of which some sensors give no sign
+SIGNED = (
+    0.2  # share of the voltage that these leave unexplained at most, if they are given its sign
+)
+ONE_WAY = 0.02  # share of its range to which a channel that has no sign may be negative
 CLEAR = 3.0  # a term is seen when it moves the fit by this many residuals
 RPM, DEGREES = 30 / np.pi, 180 / np.pi  # numbers per rad/s or rad
 TOP_SPEED = 6000.0  # rad/s, 57,000 rpm: no brushed motor turns faster
@@ -45,6 +51,32 @@ def signs(run: Recording) -> Iterator[Finding]:
     for column, what in _reversed(run):
         mend = f"Turn the sign of the {column} column, or swap its wires"
         yield Finding(run.name, column, "warning", what, "whole run", mend)
+
+
+def lost_signs(run: Recording) -> Iterator[Finding]:
+    """Channels that tell how much and not which way, as many sensors do."""
+    w = _windows(run)
+    if run.drive != "voltage" or not {"current", "speed"} <= set(w):
+        return
+    if not np.quantile(w["voltage"], 0.05) < 0 < np.quantile(w["voltage"], 0.95):
+        return
+
+    def missed(*turned: str) -> float:
+        """Share of the voltage that R i + Kb w does not explain, if some have the sign of the voltage."""
+        way = np.sign(w["voltage"])
+        terms = {name: w[name] * (way if name in turned else 1.0) for name in UNSIGNED}
+        return 1 - regress(w["voltage"], terms, intercept=False)[1]
+
+    one_way = [name for name in UNSIGNED if np.min(w[name]) > -ONE_WAY * np.max(w[name])]
+    least, lost = min(
+        ((missed(*some), some) for k in (1, 2) for some in combinations(one_way, k)),
+        default=(1.0, ()),
+    )
+    if least < min(SIGNED, missed() / 2) and missed() > SIGNED / 2:
+        for column in lost:
+            what = "it is never negative, though the voltage is: it has lost its sign"
+            mend = "Record which way it goes as well, or only one direction"
+            yield Finding(run.name, column, "warning", what, "whole run", mend)
 
 
 def _reversed(run: Recording) -> Iterator[tuple[str, str]]:

@@ -268,6 +268,15 @@ def test_signs_are_found_for_every_motor_and_excitation():
             assert [f.column for f in found if "sign" in f.what] == [column]
 
 
+@pytest.mark.parametrize("columns", [("speed",), ("current",), ("current", "speed")])
+def test_channels_without_a_sign_are_found(columns):
+    for seed in range(6):
+        run = good_run(seed, "steps")
+        bare = evolve(run, **{column: np.abs(getattr(run, column)) for column in columns})
+        found = [f for f in told([bare]) if "lost its sign" in f.what]
+        assert [f.column for f in found] == list(columns), seed
+
+
 def test_nothing_at_all_is_an_error():
     t = np.arange(100) / 100
     flat = Recording("flat", t, np.full(100, 5.0), np.ones(100), np.full(100, 40.0))

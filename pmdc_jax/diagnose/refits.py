@@ -236,7 +236,7 @@ class Refits:
         """Where to begin by the evidence for a signal, None where that is none that physics allows."""
         candidate, fit = signal.candidate, found.evidence.regress([signal.block])
         assert candidate is not None
-        coefficients, angles = fit.coefficients[0], np.zeros(len(current.given.roles))
+        coefficients, angles = fit.coefficients[0], np.zeros(current.given.problem.tape.runs)
         if candidate.own_phase:
             assert candidate.amplitude is not None
             periods = candidate.columns[0]["periods"]

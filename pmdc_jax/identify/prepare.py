@@ -96,12 +96,13 @@ def prepare(
     untouched = _untouched(training, tie)
     parameters = Parameters.of(search_bounds(training), effects, untouched | dict(known or {}), tie)
     # hold-outs lie on the tape too, but do not count: only what is their own is fitted to them
+    tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True))
     problem = Problem(
         parameters,
-        jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True)),
+        tape,
         jnp.asarray(noise),
         free=jnp.ones(len(parameters.names), bool),
-        counts=jnp.arange(len(runs)) < len(recordings),
+        counts=jnp.arange(tape.runs) < len(recordings),
     )
     roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
     return Prepared(

@@ -84,10 +84,11 @@ class Problem(eqx.Module):
     @property
     def turnable(self) -> Bool[Array, " runs"]:
         """Which runs may begin at any angle."""
-        known = jnp.asarray(self.tape.angle_known)
+        tape, known = self.tape, jnp.asarray(self.tape.angle_known)
         # where nobody knows an angle, that of the first run is the zero from which phases count
-        zero = ~jnp.any(known) & (jnp.arange(self.tape.runs) == 0)
-        return ~known & ~zero
+        zero = ~jnp.any(known) & (jnp.arange(tape.runs) == 0)
+        measured = jax.ops.segment_sum(jnp.sum(tape.weight, (1, 2)), tape.run, tape.runs) > 0
+        return measured & ~known & ~zero
 
     def moves(self) -> Bool[Array, "runs columns"]:
         """Which coordinates and which of its own unknowns each run may tell of."""

@@ -50,7 +50,7 @@ def without_unfelt(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     if not any(map(np.any, rough)):
         return given, fit
     smooth = _driven(given, [d - r for d, r in zip(drives, rough, strict=True)])
-    felt = _felt(given.problem, fit, polish(smooth, fit.refined, steps=0))
+    felt = _felt(given, fit, polish(smooth, fit.refined, steps=0))
     if not any(share < 1 for share in felt):
         return given, fit
     lost = [(1 - share) * r for share, r in zip(felt, rough, strict=True)]
@@ -76,24 +76,24 @@ def _driven(given: Prepared, drives: list[np.ndarray]) -> Problem:
     return replace(given.problem, tape=replace(tape, value=value, rise=rise))
 
 
-def _felt(problem: Problem, rough: Polished, smooth: Polished) -> list[float]:
+def _felt(given: Prepared, rough: Polished, smooth: Polished) -> list[float]:
     """Of every run the share of the rough part that the motor felt, one unless it is clearly less than half.
 
     By regression of what the whole drive leaves on the response to its rough part, both made white by what the smooth
     drive leaves.
     """
-    shares = []
+    shares, tape = [], given.problem.tape
     left, left_smooth = (
         -np.asarray(fit.evaluation.residuals) * fit.noise[:, None] for fit in (rough, smooth)
     )
-    for run in range(problem.tape.runs):
-        both = series_of(problem.tape, run, np.stack([left, left_smooth - left], -1))
-        white = whitener([series_of(problem.tape, run, left_smooth)])(0, both)
+    for run in range(len(given.runs)):
+        both = series_of(tape, run, np.stack([left, left_smooth - left], -1))
+        white = whitener([series_of(tape, run, left_smooth)])(0, both)
         rest, response = white[:, 0], white[:, 1]
         power = response @ response
         share = 1 + rest @ response / power if power > 0 else 1.0
         error = np.std(rest) / np.sqrt(power) if power > 0 else 1.0
-        mine = problem.tape.blocks_of(run)
+        mine = tape.blocks_of(run)
         squares, smoothly = (
             np.square(residual[mine] / rough.noise[:, None]).sum()
             for residual in (left, left_smooth)

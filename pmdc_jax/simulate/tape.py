@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -26,6 +26,9 @@ BLOCK = 128
 
 class Tape(eqx.Module):
     """Runs laid end to end; a run begins with a new block, and its last block is filled up with weight 0.
+
+    So that recordings of another number or length meet the same array shapes, and with them programs that are compiled
+    already, runs of a few blocks of which nothing was measured follow.
 
     A sample time, a drive (voltage, current or torque) and a rotor that is free or held make a *grid*; blocks of
     one grid share the exact step. The drive and the load of sample k hold until sample k + 1; a drive with a `rise`
@@ -71,8 +74,8 @@ class Tape(eqx.Module):
         runs = [_Run(recording, straight) for recording in recordings]
         rises = straight or any(recording.uneven is not None for recording in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
-        # few distinct lengths, so that few shapes are ever compiled
-        blocks = _round_up(sum(run.blocks for run in runs))
+        spare = _power_of_two(len(runs)) - len(runs)
+        blocks = _round_up(sum(run.blocks for run in runs) + spare)
         tape = {
             "value": np.zeros((blocks, BLOCK)),
             "load": np.zeros((blocks, BLOCK)),
@@ -80,7 +83,7 @@ class Tape(eqx.Module):
             "weight": np.zeros((blocks, 2, BLOCK)),
             "turn": np.full((blocks, BLOCK), np.nan),
             "rise": np.zeros((blocks, BLOCK)) if rises else None,
-            "run": np.full(blocks, len(runs) - 1),
+            "run": np.full(blocks, len(runs) + spare - 1),
             "begins": np.zeros(blocks, bool),
             "grid": np.full(blocks, grids.index(runs[-1].grid)),
         }
@@ -100,8 +103,14 @@ class Tape(eqx.Module):
             tape["run"][part], tape["grid"][part] = index, grids.index(run.grid)
             tape["begins"][first] = True
             first += run.blocks
+        tape["run"][first : first + spare] = np.arange(len(runs), len(runs) + spare)
         # what is filled up begins anew in every block, so that nobody waits for it to be joined
         tape["begins"][first:], tape["turn"][first:] = True, 0.0
+
+        def of_runs(values: Iterable[float]) -> np.ndarray:
+            known = np.array(list(values))
+            return np.append(known, np.zeros(spare, known.dtype))
+
         kinds, free = np.array([drive for _, drive, _ in grids]), np.array([f for *_, f in grids])
         return cls(
             **tape,
@@ -110,18 +119,18 @@ class Tape(eqx.Module):
                 *(np.where(kinds == kind, 1.0, 0.0) for kind in Drive._fields[:3]),
                 free=np.where(free, 1.0, 0.0),
             ),
-            initial=np.array([run.initial for run in runs]),
-            load_unknown=np.array(
-                [r.load is None and not unloaded and not r.held for r in recordings]
+            initial=np.array([run.initial for run in runs] + spare * [(0.0, 0.0)]),
+            load_unknown=of_runs(
+                r.load is None and not unloaded and not r.held for r in recordings
             ),
-            angle=np.array([_first(r.angle) for r in recordings]),
-            angle_known=np.array([r.angle is not None for r in recordings]),
+            angle=of_runs(_first(r.angle) for r in recordings),
+            angle_known=of_runs(r.angle is not None for r in recordings),
             longest=2.0 ** math.ceil(math.log2(max(s for s, *_ in grids) / 1e-3) - 1e-6) * 1e-3,
         )
 
     @property
     def runs(self) -> int:
-        """Number of runs."""
+        """Number of runs, with those of which nothing was measured."""
         return self.initial.shape[0]
 
     def blocks_of(self, run: int) -> Bool[np.ndarray, " blocks"]:
@@ -190,6 +199,10 @@ def _first(samples: np.ndarray | None) -> float:
 
 def _round_up(blocks: int) -> int:
     """To a power of two where little is to be simulated, then to multiples of 32, then by a sixteenth at most."""
-    power = max(8, 1 << (blocks - 1).bit_length())
+    power = max(8, _power_of_two(blocks))
     step = min(power, max(32, power // 16))
     return -(-blocks // step) * step
+
+
+def _power_of_two(least: int) -> int:
+    return 1 << (least - 1).bit_length()
