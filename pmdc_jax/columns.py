@@ -92,11 +92,20 @@ QUANTITIES = {
 }
 
 
+# Quantities that a unit tells, if one column has it: a torque may be the load or the motor's
+BY_UNIT = ("time", "voltage", "current", "speed", "angle")
+# ... and words in the names of columns that hold something else than what was measured
+NOT_MEASURED = re.compile(
+    r"(?i)(?<![a-z])(ref|set|soll|cmd|command|target|demand|desired|limit|max|min|supply|bat)"
+)
+
+
 @frozen
 class Column:
     """A header understood: SI value = scale * number + offset.
 
-    `unit` is None where the header names none and SI was assumed; `base` is the SI unit.
+    `unit` is None where the header names none and SI was assumed; `base` is the SI unit; `by_unit` where the unit alone
+    says what it is.
     """
 
     header: str
@@ -105,6 +114,7 @@ class Column:
     base: str
     scale: float = 1.0
     offset: float = 0.0
+    by_unit: bool = False
 
 
 def match_columns(
@@ -145,7 +155,31 @@ def match_columns(
     for quantity, error in refused.items():
         if quantity not in found:
             raise error
-    return found
+    return found | _by_unit(headers, found)
+
+
+def _by_unit(headers: Sequence[str], found: Mapping[str, Column]) -> dict[str, Column]:
+    """Quantities that no name tells of, where the unit of one header alone does."""
+    taken = {column.header for column in found.values()}
+    known: dict[str, Column] = {}
+    for quantity in (q for q in BY_UNIT if q not in found):
+        alike = [
+            (header, unit)
+            for header in headers
+            if header not in taken and (unit := _measured_unit(header, quantity))
+        ]
+        if len(alike) == 1:
+            ((header, unit),) = alike
+            known[quantity] = evolve(_column(header, quantity, unit), by_unit=True)
+    return known
+
+
+def _measured_unit(header: str, quantity: str) -> str | None:
+    """The unit in a header if it is one of the quantity, on a shaft, and the name is of nothing that was asked for."""
+    for name, unit, _ in _readings(header):
+        if unit and _is_unit_of(unit, quantity, QUANTITIES[quantity].units[:1]):
+            return None if NOT_MEASURED.search(name) else unit
+    return None
 
 
 def understand(header: str) -> Column | None:

@@ -319,6 +319,9 @@ def _notes(
     for quantity, column in found.items():
         if quantity in empty:
             yield note(column.header, "the column is empty", "It is left out")
+        elif column.by_unit:
+            mend = f"If it is something else, say what is: --column {quantity}=HEADER:UNIT"
+            yield note(column.header, f"taken for the {quantity}, by its unit", mend)
         elif column.unit is None:
             mend = f"If it is not, write the unit into the header: {QUANTITIES[quantity].header}"
             yield note(column.header, f"the header has no unit: taken as {column.base}", mend)

@@ -157,6 +157,27 @@ def test_a_torque_of_unknown_name_is_not_passed_over_in_silence(tmp_path):
     assert note.column == "M_Nm" and "looks like load" in note.what
 
 
+def test_a_unit_alone_tells_what_a_column_is(tmp_path):
+    run = read_text(tmp_path, table("time_s,U_mot/V,I_mot [mA],n_ist [U/min]", T, T, T, T))
+    np.testing.assert_allclose((run.voltage, run.current, run.speed), (T, T / 1e3, T * RPM))
+    assert [(n.column, "by its unit" in n.what) for n in run.notes] == [
+        ("U_mot/V", True),
+        ("I_mot [mA]", True),
+        ("n_ist [U/min]", True),
+    ]
+
+
+def test_a_unit_that_several_columns_have_tells_nothing(tmp_path):
+    text = table("time_s,voltage_V,n1 [rpm],n2 [rpm],current_A", T, T, T, T, T)
+    run = read_text(tmp_path, text)
+    assert run.speed is None and run.ignored == ("n1 [rpm]", "n2 [rpm]")
+
+
+def test_what_was_asked_for_is_not_what_was_measured(tmp_path):
+    text = table("time_s,voltage_V,n_soll [rpm],n_ist [rpm],current_A", T, T, T, 2 * T, T)
+    np.testing.assert_allclose(read_text(tmp_path, text).speed, 2 * T * RPM)
+
+
 def test_numbers_become_si_and_the_rest_is_remembered(tmp_path):
     text = table("time_ms,voltage_V,Speed [rpm],flag", 1000 * T, T, 60 + T, T)
     run = read_text(tmp_path, text)

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from attrs import evolve as replace
 
+from pmdc_jax import files
 from pmdc_jax.errors import InputError
 from pmdc_jax.identify.identification import Direction, Estimate, Identification, RunFit, Search
 from pmdc_jax.recording import Finding
-from pmdc_jax.report import figures, files, notation
+from pmdc_jax.report import figures, notation
 from pmdc_jax.report.identification import write_report
 from pmdc_jax.report.json import identification_json, write_json
 from pmdc_jax.report.summary import summary
