@@ -112,4 +112,16 @@ def _flat_top(values: np.ndarray, extreme: float) -> tuple[int, int, float]:
     inner = values[(values != extreme) & np.isfinite(values)]
     repeats = (np.count_nonzero(np.diff(inner) == 0) + 1) / len(inner)
     expected = 1 + np.log(FLAT_TOP / len(values)) / np.log(min(repeats, 0.999))
-    return int(starts[longest]), int(ends[longest] - starts[longest]), max(float(expected), 5.0)
+    # a speed in counts stays wherever the motor turns steadily
+    elsewhere = 2.0 * _second_longest_stay(inner[inner != 0])
+    return (
+        int(starts[longest]),
+        int(ends[longest] - starts[longest]),
+        max(float(expected), elsewhere, 5.0),
+    )
+
+
+def _second_longest_stay(values: Float[np.ndarray, " samples"]) -> int:
+    """How long a signal stays at one value, but for once."""
+    ends = np.flatnonzero(np.diff(values, append=np.nan) != 0)
+    return int(np.sort(np.diff(ends, prepend=-1))[-2:][0])

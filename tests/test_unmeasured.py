@@ -5,6 +5,7 @@ from __future__ import annotations
 import attrs
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from test_check import EXCITATIONS, good_run
 
 from pmdc_jax.identify.prepare import prepare
@@ -61,3 +62,18 @@ def test_what_is_clipped_is_missing():
     np.testing.assert_array_equal(np.isnan(mended.current), run.current >= limit)
     (note,) = mended.notes
     assert "looks clipped" in note.what
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_speed_in_counts_that_stays_at_its_largest_is_not_clipped(seed):
+    """A motor that turns steadily at levels near whole counts: the highest one stays no longer than the others."""
+    rng = np.random.default_rng(seed)
+    levels = np.repeat([20.1, 61.05, 108.95, 81.0, 40.1, 95.4, 70.6, 30.5], 150)
+    rising = lfilter([0.1], [1, -0.9], levels) + 0.2 * rng.standard_normal(len(levels))
+    time = 1e-3 * np.arange(len(levels))
+    run = Recording(
+        "counts", time, levels / 5, levels / 50 + rng.standard_normal(), np.round(rising)
+    )
+    assert without_unmeasured(run) is run
+    clipped = attrs.evolve(run, speed=np.minimum(rising, 105.0))
+    assert any("looks clipped" in note.what for note in without_unmeasured(clipped).notes)
