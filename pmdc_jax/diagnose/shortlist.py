@@ -25,12 +25,14 @@ def shortlist(current: Model, found: Seen) -> list[Signal]:
     """The most significant shape of each of the few effects that explain most.
 
     If that is an effect which is there already and little is left, its own formula is what is left to be desired,
-    or else an effect that does more than its columns show; but a sensor's formula is exact. One that contains an
+    or else an effect that does more than its columns show; but a sensor's formula is exact, and one that explains far
+    more is missing, however much like slow noise it looks. One that contains an
     effect which is there, and explains most of what is left, needs no other beside it.
     """
     obvious = clear(found)
     ranked = [s for s in obvious if effect_of(s) not in current.effects]
-    own = bool(obvious) and effect_of(obvious[0]) in current.effects
+    most = max((s.gain for s in obvious), default=0.0)
+    own = any(effect_of(s) in current.effects and s.gain > MUCH_OF_IT * most for s in obvious[:1])
     exact = own and EFFECTS[effect_of(obvious[0])].equation == "sensor"
     if own and not exact and found.unexplained < FORMULA:
         ranked = [s for s in ranked if effect_of(s) in STARTS]
