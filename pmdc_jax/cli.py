@@ -184,7 +184,8 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
     from .recording import read_recording, write_recording
     from .simulate import simulate
 
-    write_recording(simulate(load_motor(motor), read_recording(input, columns)), out)
+    driven = read_recording(input, columns, to_simulate=True)
+    write_recording(simulate(load_motor(motor), driven), out)
 
 
 @app.command(

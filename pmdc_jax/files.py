@@ -51,7 +51,10 @@ def write_text(path: str | Path, text: str) -> None:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Where to write what is to stand in `path` once it is whole; nothing is left of it where writing fails."""
+    """Where to write what is to stand in `path` once it is whole; nothing is left of it where writing fails.
+
+    **Raises**: `InputError` where it cannot be written.
+    """
     path = Path(path).resolve()  # through a link, so that the link stays
     if path.exists() and not path.is_file():  # a device such as /dev/stdout cannot be replaced
         yield path
@@ -60,5 +63,9 @@ def replacing(path: str | Path) -> Iterator[Path]:
     try:
         yield part
         part.replace(path)
+    except OSError as error:
+        what = f"it cannot be written ({error.strerror or error})"
+        mend = "Choose a folder that exists, has room and lets you write"
+        raise InputError(str(path), what, mend) from None
     finally:
         part.unlink(missing_ok=True)

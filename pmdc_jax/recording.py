@@ -23,10 +23,9 @@ Samples = Float[np.ndarray, " samples"]
 MIN_SAMPLES = 10
 MAX_MISSING = 0.2  # share of an output's samples that may be missing
 OUTPUTS = ("speed", "angle", "current")
-TOO_LITTLE = (
-    "Needed beside time: voltage with current, speed or angle; "
-    "or current or torque with speed or angle"
-)
+# What is needed beside time, to simulate and to identify
+DRIVES = "voltage, current or torque"
+OUTPUTS_TOO = "voltage with current, speed or angle; or current or torque with speed or angle"
 
 
 @frozen
@@ -64,7 +63,7 @@ class Recording:
     `source`, the file; `ignored`, headers not used; `notes`, what was assumed while reading; `uneven`, the record
     that this one lays on an even clock, None where it is a record itself.
 
-    **Raises**: `InputError` where nothing could be identified from it.
+    **Raises**: `InputError` where nothing drives the motor, or the arrays are no record of it.
     """
 
     name: str
@@ -116,6 +115,11 @@ class Recording:
         return "current" if self.torque is None else "torque"
 
     @property
+    def tells(self) -> bool:
+        """Whether anything was measured of what the motor does, so that it can be identified from it."""
+        return _tells(self.columns())
+
+    @property
     def stands_still(self) -> bool:
         """Whether the rotor never moves in the least, whatever the voltage and the current."""
         if self.voltage is None or self.current is None or not np.any(np.nan_to_num(self.current)):
@@ -132,12 +136,15 @@ class Recording:
 
 
 def read_recording(
-    path: str | os.PathLike[str], columns: Mapping[str, str] | None = None
+    path: str | os.PathLike[str],
+    columns: Mapping[str, str] | None = None,
+    to_simulate: bool = False,
 ) -> Recording:
     """Read one run from a CSV, Parquet or MAT file.
 
     **Arguments**: `path`; `columns`, what the headers do not say by themselves: quantity (time,
-    voltage, current, speed, load, angle, temperature, torque) to "header" or "header:unit".
+    voltage, current, speed, load, angle, temperature, torque) to "header" or "header:unit"; `to_simulate`, whether it
+    is enough that something drives the motor.
 
     **Returns**: the run in SI, named after the file.
 
@@ -147,13 +154,13 @@ def read_recording(
     path = Path(path)
     table = open_table(path)
     found = match_columns(table.headers, columns, str(path))
-    _refuse_too_little(found, table, str(path))
+    _refuse_too_little(found, table, str(path), to_simulate)
     numbers = table.read([column.header for column in found.values()])
     values = {q: numbers[column.header] for q, column in found.items()}
     values = {q: _to_si(column, values[q]) for q, column in found.items()}
     empty = [q for q, v in values.items() if q != "time" and len(v) and np.isnan(v).all()]
     present: dict[str, Any] = {q: v for q, v in values.items() if q not in empty}
-    _refuse_too_little(present, table, str(path))
+    _refuse_too_little(present, table, str(path), to_simulate)
     for fault in _faults(present):
         raise _in_file(fault, found, table, str(path))
     used = {column.header for column in found.values()}
@@ -171,13 +178,16 @@ Run = Recording | str | os.PathLike[str]
 Runs = Run | Sequence[Run]
 
 
-def recordings_of(runs: Runs) -> list[Recording]:
-    """Runs as they are, and files read.
+def recordings_of(runs: Runs, to_simulate: bool = False) -> list[Recording]:
+    """Runs as they are, and files read; see `read_recording`.
 
     **Raises**: `InputError` where a file cannot be read.
     """
     several = [runs] if isinstance(runs, Recording | str | os.PathLike) else runs
-    return [run if isinstance(run, Recording) else read_recording(run) for run in several]
+    return [
+        run if isinstance(run, Recording) else read_recording(run, to_simulate=to_simulate)
+        for run in several
+    ]
 
 
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
@@ -196,13 +206,8 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
         raise InputError(str(path), what, "Name it .csv or .parquet")
     data = recording.columns()
     frame = pl.DataFrame({QUANTITIES[quantity].header: array for quantity, array in data.items()})
-    try:
-        with replacing(path) as part, part.open("wb") as file:
-            frame.write_csv(file) if suffix == ".csv" else frame.write_parquet(file)
-    except OSError as error:
-        what = f"it cannot be written ({error.strerror or error})"
-        mend = "Choose a folder that exists and that you may write to"
-        raise InputError(str(path), what, mend) from None
+    with replacing(path) as part, part.open("wb") as file:
+        frame.write_csv(file) if suffix == ".csv" else frame.write_parquet(file)
 
 
 class _Fault(NamedTuple):
@@ -216,9 +221,9 @@ class _Fault(NamedTuple):
 
 def _faults(columns: Mapping[str, np.ndarray]) -> Iterator[_Fault]:
     """All that makes these columns unusable, the most basic first."""
-    if not _drives(columns):
-        what = f"nothing to identify from {', '.join(columns)}"
-        yield _Fault(None, None, what, TOO_LITTLE)
+    if not _is_driven(columns):
+        what = f"nothing drives the motor in {', '.join(columns)}"
+        yield _Fault(None, None, what, f"Needed beside time: {DRIVES}")
     time = columns["time"]
     for quantity, values in columns.items():
         if values.ndim != 1 or len(values) != len(time):
@@ -234,7 +239,11 @@ def _faults(columns: Mapping[str, np.ndarray]) -> Iterator[_Fault]:
     yield from _time_order(time)
 
 
-def _drives(columns: Mapping[str, object]) -> bool:
+def _is_driven(columns: Mapping[str, object]) -> bool:
+    return any(drive in columns for drive in ("voltage", "current", "torque"))
+
+
+def _tells(columns: Mapping[str, object]) -> bool:
     moves = "speed" in columns or "angle" in columns
     if "voltage" in columns:
         return moves or "current" in columns
@@ -281,7 +290,9 @@ def _time_order(time: np.ndarray) -> Iterator[_Fault]:
     yield _Fault("time", row, what, mend)
 
 
-def _refuse_too_little(found: Mapping[str, object], table: Table, where: str) -> None:
+def _refuse_too_little(
+    found: Mapping[str, object], table: Table, where: str, to_simulate: bool
+) -> None:
     headers = ", ".join(filter(None, table.headers[:20])) or "none"
     seen = f"columns in the file: {headers}"
     if len(table.headers) == 1:
@@ -289,10 +300,14 @@ def _refuse_too_little(found: Mapping[str, object], table: Table, where: str) ->
     if "time" not in found:
         mend = f"Name it time_s, or map it by --column time=HEADER:UNIT; {seen}"
         raise InputError(where, "there is no time column", mend)
-    if not _drives(found):
-        what = f"nothing to identify from {', '.join(found)}"
-        mend = f"{TOO_LITTLE}. Map others by --column speed=HEADER:UNIT; {seen}"
-        raise InputError(where, what, mend)
+    if to_simulate and not _is_driven(found):
+        what, needed, lacking = "nothing drives the motor in", DRIVES, "voltage"
+    elif not to_simulate and not _tells(found):
+        what, needed, lacking = "nothing to identify from", OUTPUTS_TOO, "speed"
+    else:
+        return
+    mend = f"Needed beside time: {needed}. Map others by --column {lacking}=HEADER:UNIT; {seen}"
+    raise InputError(where, f"{what} {', '.join(found)}", mend)
 
 
 def _to_si(column: Column, values: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ import pytest
 from scipy.io import savemat
 
 from pmdc_jax.errors import InputError
+from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.recording import Recording, read_recording, write_recording
 
 HEADER = "time_s,voltage_V,current_A,speed_rad_s"
@@ -361,7 +362,7 @@ def test_bad_output(tmp_path, name, what):
     [
         ({"time": np.zeros(20)}, "sample 2, column time: the time stamp"),
         ({"speed": np.zeros(19)}, "column speed: shape"),
-        ({"speed": None}, "nothing to identify"),
+        ({"voltage": None}, "nothing drives the motor"),
         ({"voltage": np.full(20, np.inf)}, "infinite"),
     ],
 )
@@ -369,6 +370,20 @@ def test_recordings_made_in_python_are_checked_too(changes, what):
     t = np.arange(20) / 10
     with pytest.raises(InputError, match=what):
         Recording(**{"name": "run", "time": t, "voltage": t, "speed": t} | changes)
+
+
+def test_a_voltage_alone_is_enough_to_simulate_and_nothing_to_identify(tmp_path):
+    t = np.arange(20) / 10
+    run = Recording("run", t, voltage=t)
+    with pytest.raises(InputError, match="nothing to identify from time, voltage"):
+        prepare([run], ())
+    write_recording(run, tmp_path / "run.csv")
+    with pytest.raises(InputError, match="nothing to identify from time, voltage"):
+        read_recording(tmp_path / "run.csv")
+    assert read_recording(tmp_path / "run.csv", to_simulate=True).speed is None
+    (tmp_path / "speed.csv").write_text("time_s,speed_rad_s\n0,0\n0.1,1\n")
+    with pytest.raises(InputError, match="nothing drives the motor in time, speed"):
+        read_recording(tmp_path / "speed.csv", to_simulate=True)
 
 
 def test_damaged_text_is_read_or_refused_but_never_breaks(tmp_path):

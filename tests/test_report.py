@@ -354,7 +354,7 @@ def test_files_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patched:
         patched.setattr("pathlib.Path.replace", fails)
-        with pytest.raises(OSError, match="No space"):
+        with pytest.raises(InputError, match="it cannot be written"):
             files.write_text(path, "new")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from attrs import evolve
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy import linalg, signal
@@ -21,7 +22,7 @@ from benchmarks import virtual_bench as vb
 from pmdc_jax.clock import is_even
 from pmdc_jax.effects import CoulombFriction, ResistanceHeating
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.recording import Recording
+from pmdc_jax.recording import Recording, write_recording
 from pmdc_jax.simulate import Tape, free_run, reference_solution, squared_errors, uniform
 from pmdc_jax.simulate.exponential import phi_functions
 from pmdc_jax.threads import side_by_side
@@ -305,6 +306,17 @@ def test_a_run_driven_by_current(x64):
     found = pmdc_jax.simulate(motor(), run)
     np.testing.assert_allclose(found.speed, expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(found.current, run.current)
+
+
+def test_a_voltage_alone_is_simulated_from_rest(x64, tmp_path):
+    run = recording(load=None)
+    measured = pmdc_jax.simulate(motor(), evolve(run, current=0 * run.time, speed=0 * run.time))
+    bare = evolve(run, current=None, speed=None)
+    write_recording(bare, tmp_path / "run.csv")
+    for one in (bare, tmp_path / "run.csv"):
+        found = pmdc_jax.simulate(motor(), one)
+        np.testing.assert_array_equal(found.speed, measured.speed)
+        np.testing.assert_array_equal(found.current, measured.current)
 
 
 # ------------------------------------------------------------------------------- squared errors

@@ -52,8 +52,7 @@ def judge(given: Prepared, solved: Solved) -> Identification:
     fit = _fits(
         given.runs, given.roles, problem.tape, np.asarray(ended.seen), np.asarray(unknowns.local)
     )
-    left = {name: _left(fit, name) for name in ("current", "speed")}
-    noise = {name: white_noise(errors) for name, errors in left.items()}
+    noise = {name: white_noise(_left(fit, name)) for name in ("current", "speed")}
     return Identification(
         motor=_plain(parameters(best.unknowns.coordinates)),
         parameters=_estimates(parameters, best, info, given, _intervals(problem, best, info)),
@@ -67,7 +66,7 @@ def judge(given: Prepared, solved: Solved) -> Identification:
         findings=given.findings,
         covariance=info.covariance,
         covariance_names=parameters.names,
-        messages=_messages(given, solved, best, _missed(left), chosen is not polished),
+        messages=_messages(given, solved, chosen is not polished),
     )
 
 
@@ -255,10 +254,10 @@ def _left(fit: Mapping[str, RunFit], name: str) -> list[np.ndarray]:
     return [m - s for m, s in pairs if m is not None and s is not None]
 
 
-def _missed(left: Mapping[str, list[np.ndarray]]) -> Iterator[str]:
+def missed(fit: Mapping[str, RunFit]) -> Iterator[str]:
     """What to say of outputs of which far more is left than the noise of their runs."""
-    for name, errors in left.items():
-        scaled = [e / white for e in errors if (white := white_noise([e]))]
+    for name in ("current", "speed"):
+        scaled = [e / white for e in _left(fit, name) if (white := white_noise([e]))]
         times = np.sqrt(np.nanmean(np.square(np.concatenate(scaled)))) if scaled else 0.0
         if times > MISSED:
             yield (
@@ -267,9 +266,7 @@ def _missed(left: Mapping[str, list[np.ndarray]]) -> Iterator[str]:
             )
 
 
-def _messages(
-    given: Prepared, solved: Solved, best: Refined, missed: Iterator[str], tied: bool
-) -> tuple[str, ...]:
+def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:
     messages = [
         f"{run.name}: the {run.drive} holds {given.unfelt[run.name]:.3g} {UNITS[run.drive]} of noise that the motor "
         "did not feel: it was taken out"
@@ -284,9 +281,6 @@ def _messages(
         )
     if solved.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
-    if not best.converged:
-        messages.append("the refinement did not converge: the gradient is not zero at its end")
-    messages += missed
     if tied:
         messages.append("Kt was set equal to Kb, as they are in SI, and J and f go with it")
     return tuple(messages)

@@ -13,7 +13,7 @@ from ..precision import double_precision
 from ..recording import Runs
 from .colour import whitener
 from .identification import Identification
-from .judge import judge
+from .judge import judge, missed
 from .parameters import effects_named
 from .prepare import prepare
 from .sharpen import last_fit, residuals_of
@@ -62,4 +62,4 @@ def identify(
     given, polished = last_fit(given, plainly, plainly, white)
     found = judge(given, solved._replace(polished=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
-    return attrs.evolve(found, seconds=seconds)
+    return attrs.evolve(found, seconds=seconds, messages=(*found.messages, *missed(found.fit)))

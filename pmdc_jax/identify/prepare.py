@@ -15,7 +15,7 @@ from ..clock import evenly_stamped
 from ..effects import AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS
-from ..recording import Finding, Recording, Runs, recordings_of
+from ..recording import OUTPUTS_TOO, Finding, Recording, Runs, recordings_of
 from ..simulate import Tape, uniform
 from ..unmeasured import without_unmeasured
 from .bounds import search_bounds
@@ -122,6 +122,10 @@ def prepare(
 def _refuse(recordings, holdout, tie, known) -> None:
     if not recordings:
         raise InputError("RUN", "there is no recording to fit", "Name at least one")
+    for run in (*recordings, *holdout):
+        if not run.tells:
+            what = f"nothing to identify from {', '.join(run.columns())}"
+            raise InputError(run.source or run.name, what, f"Needed beside time: {OUTPUTS_TOO}")
     names = [r.name for r in (*recordings, *holdout)]
     for name in names:
         if names.count(name) > 1:

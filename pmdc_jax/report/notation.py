@@ -37,7 +37,7 @@ class Written:
 
 def write_estimate(estimate: Estimate) -> Written:
     """Write an estimate with as many decimals as its standard error deserves (two digits of it)."""
-    exponent = engineering_exponent(estimate.value or 0.0)
+    exponent = engineering_exponent(estimate.value or 0.0, estimate.unit)
     scale = 10.0**exponent
     decimals = _decimals((estimate.value or 0.0) / scale, (estimate.stderr or 0.0) / scale)
 
@@ -65,7 +65,7 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 def amount(value: float, unit: str, digits: int = 3) -> str:
     """A number with its unit, (0.00321, "N m") as "3.21 mN·m"."""
-    exponent = engineering_exponent(value)
+    exponent = engineering_exponent(value, unit)
     scaled = significant(value / 10.0**exponent, digits)
     return f"{scaled} {scaled_unit(unit, exponent)}".strip()
 
@@ -75,9 +75,9 @@ def thousands(count: int) -> str:
     return f"{count:,}".replace(",", NARROW)
 
 
-def engineering_exponent(value: float) -> int:
-    """The multiple of three that leaves 1 to 999 before the decimal point."""
-    if not value or not isfinite(value):
+def engineering_exponent(value: float, unit: str) -> int:
+    """The multiple of three that leaves 1 to 999 before the decimal point; none for a mere number from 0.001 on."""
+    if not value or not isfinite(value) or (not unit and 1e-3 <= abs(value) < 1e6):
         return 0
     return max(-12, min(9, 3 * floor(log10(abs(value)) / 3)))
 

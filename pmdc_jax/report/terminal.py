@@ -6,13 +6,15 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+from attrs import evolve
 from rich.console import Console, Group, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
 from ..identify.identification import Identification
-from .notation import percent, significant, write_estimate
+from ..recording import Finding
+from .notation import enumerate_words, percent, significant, write_estimate
 from .summary import runs_in_order, status_word, summary
 
 STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
@@ -48,9 +50,12 @@ def print_messages(messages: Iterable[str]) -> None:
 def print_findings(identification: Identification) -> None:
     """What the data checks found, and remarks of the identification, on standard error."""
     console = console_for(stderr=True)
+    runs: dict[Finding, list[str]] = {}  # what is the same in several is told once
     for finding in identification.findings:
+        runs.setdefault(evolve(finding, run=""), []).append(finding.run)
+    for finding, names in runs.items():
         line = Text(f"{finding.severity}: ", SEVERITY_STYLES.get(finding.severity, ""))
-        place = ", ".join(str(part) for part in (finding.run, finding.column) if part)
+        place = ", ".join(filter(None, [enumerate_words(names), finding.column]))
         where = f", {finding.where}" if finding.where else ""
         line.append(f"{place}: {finding.what}{where}. {finding.mend or ''}", "default")
         console.print(line, soft_wrap=True)

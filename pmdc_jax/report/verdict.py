@@ -15,6 +15,7 @@ from ..diagnose.diagnosis import (
     unlike_held_out,
     worse_held_out,
 )
+from ..diagnose.kinship import CONTAINS
 from ..identify.identification import Estimate, Role, RunFit
 from .notation import (
     amount,
@@ -135,7 +136,7 @@ def disagreement(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> str:
 
 
 def stretch(variable: str, intervals: Sequence[Interval], reach: float | None = None) -> str:
-    """Intervals of one variable in words; `reach` is the largest size the runs have of it."""
+    """Intervals of one variable in words; `reach` is the largest size the runs have of it, but for a few samples."""
     joined = _joined(intervals)
     if variable == "time":
         parts = [f"{percent(100 * low)} to {percent(100 * high)}" for low, high in joined]
@@ -186,7 +187,8 @@ def _hull(intervals: Sequence[Interval]) -> Interval:
 
 def _reach(variable: str, fits: Mapping[str, RunFit]) -> float | None:
     values = [getattr(fit, variable, None) for fit in fits.values()]
-    sizes = [np.nanmax(np.abs(one)) for one in values if one is not None and len(one)]
+    # the knots of the curves reach as far
+    sizes = [np.nanquantile(np.abs(one), 0.999) for one in values if one is not None and len(one)]
     return float(max(sizes)) if sizes else None
 
 
@@ -242,8 +244,9 @@ def _next(diagnosis: Diagnosis) -> str:
 
 
 def would_be_seen(diagnosis: Diagnosis) -> list[Detectable]:
-    """The smallest amplitudes of the effects that were not found."""
+    """The smallest amplitudes of the effects that were not found, nor are part of one that was."""
     found = {effect.name for effect in diagnosis.effects}
+    found |= {part for name in found for part in CONTAINS.get(name, set())}
     return [one for one in diagnosis.detectable if one.effect not in found]
 
 

@@ -41,7 +41,7 @@ def simulate(motor: Motor, recording: Run) -> Recording:
     is not driven by voltage has no simulated current.
     """
     motor = jax.tree.map(jnp.asarray, motor)
-    (recording,) = recordings_of(recording)
+    (recording,) = recordings_of(recording, to_simulate=True)
     even = uniform(recording)
     tape = Tape.from_recordings([even], unloaded=True)
     outputs = free_run(motor, tape, jnp.asarray(tape.initial), jnp.zeros(1))
