@@ -343,7 +343,7 @@ def test_a_held_rotor_tells_the_electrical_half(columns):
     assert found.converged
 
 
-@pytest.mark.parametrize(("step", "samples"), [(2e-4, 150), (2e-5, 500)])
+@pytest.mark.parametrize(("step", "samples"), [(2e-4, 150), (5e-6, 2000)])
 def test_a_single_rise_of_the_current_tells_the_electrical_half(step, samples):
     """As a scope catches it: a few time constants long, which is far longer than a sample."""
     voltage = np.where(np.arange(samples) < samples // 6, 0.0, 3.0)

@@ -11,8 +11,8 @@ from ..recording import Recording
 
 # How far a crude estimate may be off, as a factor either way. Wide: the search is cheap.
 CRUDE = 30.0
-# Longest L / R, in means (geometric) of sample time and duration: a scope catches a single rise of the current
-LONGEST = 5.0
+# L / R of large motors, s: a scope that catches a single rise of the current samples it a thousand times
+LONGEST = 0.3
 # Back-EMF constant, V s/rad, where nothing tells of it
 USUAL = 0.05
 # By how much what an effect does may be smaller than what drives the motor, and still show
@@ -24,7 +24,7 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
 
     R and Kb from the quasi-steady balance v = R i + Kb w (stall current and no-load speed); Kt around Kb, its
     equal in SI; J and f from the torque that is there, the speed that it keeps up and the change of speed that
-    it brings about; L from R and the time constants that the sampling can show.
+    it brings about; L from R and the time constants that the sampling can show, or those that motors have.
     """
     R, Kb = _armature(recordings)
     torque, speed, change, step, duration = _motion(recordings, Kb)
@@ -32,7 +32,7 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
     friction = torque / speed
     return {
         "R": _around(R),
-        "L": (R * step / 300, R * min(LONGEST * np.sqrt(step * duration), duration)),
+        "L": (R * step / 300, R * min(max(np.sqrt(step * duration), LONGEST), duration)),
         "Kb": _around(Kb),
         "Kt": _around(Kb),
         "J": (inertia / CRUDE**2, inertia * CRUDE**2),
