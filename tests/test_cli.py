@@ -45,7 +45,7 @@ def faked(monkeypatch, tmp_path):
         identify(recordings, **options)
         return calls.diagnosis
 
-    def read_recording(path, columns=None):
+    def read_recording(path, columns=None, to_simulate=False):
         calls.read.append((str(path), columns))
         return Path(path).stem
 

@@ -293,7 +293,7 @@ RUNS = recordings()
 def simulated(motor: Motor, runs: list[Recording]) -> list[np.ndarray]:
     """Current and speed of every run, (samples, 2)."""
     tape = Tape.from_recordings(runs)
-    seen = free_run(motor, tape, jnp.asarray(tape.initial), jnp.zeros(len(runs)))
+    seen = free_run(motor, tape, jnp.asarray(tape.initial), jnp.zeros(tape.runs))
     return [
         np.stack([tape.samples_of(k, seen[:, c], len(run)) for c in range(2)], 1)
         for k, run in enumerate(runs)
@@ -524,7 +524,12 @@ def test_a_run_may_begin_twisted(x64, name):
         start[-1] += twist
         expected.append(integrated(case, run, start, run.time)[:2])
     seen = free_run(
-        with_effect(name), tape, jnp.asarray(tape.initial), jnp.zeros(3), None, jnp.full(3, twist)
+        with_effect(name),
+        tape,
+        jnp.asarray(tape.initial),
+        jnp.zeros(tape.runs),
+        None,
+        jnp.full(tape.runs, twist),
     )
     for k, (run, right) in enumerate(zip(RUNS, expected, strict=True)):
         for channel in range(2):
@@ -576,9 +581,9 @@ def test_sensitivities_are_central_differences(x64, name):
     scales = zip(parameters.names, parameters.logarithmic, strict=True)
     at = np.array([np.log(truth[n]) if log else truth[n] for n, log in scales])
     tape = Tape.from_recordings(RUNS)
-    local = np.column_stack([tape.initial, np.full((3, 3), [0.01, 0.2, 0.02])])
+    local = np.column_stack([tape.initial, np.full((tape.runs, 3), [0.01, 0.2, 0.02])])
     # away from zero, where a dry element has no derivative
-    local[2, :2] = 1.0, 5.0
+    local[2:, :2] = 1.0, 5.0
     seen, jacobian = sensitivities(parameters, jnp.asarray(at), tape, *apart(jnp.asarray(local)))
 
     def run(at, local):
@@ -607,7 +612,7 @@ def test_the_search_sees_what_the_free_run_sees(x64, name):
     """Sums of squared errors of a population are those of its members; the search rounds delays to samples."""
     motor = with_effect(name, CASES[name].values | ({"delay_s": 3e-3} if "delay" in name else {}))
     tape = Tape.from_recordings(RUNS)
-    seen = free_run(motor, tape, tape.initial, jnp.zeros(3))
+    seen = free_run(motor, tape, tape.initial, jnp.zeros(tape.runs))
     expected = (((seen - tape.measured) ** 2) * tape.weight).sum((0, 2))
     found = squared_errors(jax.tree.map(lambda x: np.full(2, x), motor), tape)
     np.testing.assert_allclose(np.array(found)[:, 1], expected, rtol=1e-6)
@@ -640,7 +645,7 @@ def test_finite_all_over_its_ranges(x64, name):
     limits = np.stack([parameters.lower[6:], parameters.upper[6:]])
     for corner in np.ndindex(*(2,) * limits.shape[1]):
         at = jnp.asarray(np.append(base, limits[list(corner), np.arange(limits.shape[1])]))
-        seen, jacobian = sensitivities(parameters, at, tape, tape.initial, np.zeros(3))
+        seen, jacobian = sensitivities(parameters, at, tape, tape.initial, np.zeros(tape.runs))
         assert jnp.all(jnp.isfinite(seen)) and jnp.all(jnp.isfinite(jacobian)), (corner, at[6:])
 
 

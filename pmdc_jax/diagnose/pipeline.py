@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import attrs
@@ -12,8 +12,9 @@ from scipy import stats
 
 from ..compiled import make_room
 from ..effects import EFFECTS
-from ..identify.identification import Identification, Role
+from ..identify.identification import Identification, Role, RunFit
 from ..identify.judge import judge
+from ..identify.noise import FLOOR
 from ..identify.prepare import prepare
 from ..identify.solve import Solved, solve
 from ..precision import double_precision
@@ -269,9 +270,10 @@ def _detectable(found: Screen) -> tuple[Detectable, ...]:
 def _gaps(base: Identification, final: Identification, share: float) -> dict[str, Gap]:
     """Of every run the misfit before and after, over the noise.
 
-    The noise is the `share` of what the final model leaves of the training runs that no curve takes away.
+    The noise is the `share` of what the final model leaves of the training runs that no curve takes away, and no less
+    than a simulation is scaled by.
     """
-    noise = {c: share * _rms_of_all(final, c) for c in ("current", "speed")}
+    noise = {c: max(share * _left(final, c), FLOOR * _size(final, c)) for c in ("current", "speed")}
 
     def misfit(found: Identification, run: str) -> float:
         ratios = [
@@ -288,14 +290,26 @@ def _gaps(base: Identification, final: Identification, share: float) -> dict[str
     return gaps
 
 
-def _rms_of_all(found: Identification, channel: str) -> float:
-    errors = [
-        (getattr(f, f"{channel}_rmse"), len(f.time))
-        for f in found.fit.values()
-        if f.role == "train" and getattr(f, f"{channel}_rmse") is not None
-    ]
-    samples = sum(n for _, n in errors)
-    return float(np.sqrt(sum(e * e * n for e, n in errors) / samples)) if samples else 0.0
+def _left(found: Identification, channel: str) -> float:
+    """Root mean square of what is left of a channel in the training runs."""
+    return _rms_of_all((getattr(f, f"{channel}_rmse"), len(f.time)) for f in _fitted(found))
+
+
+def _size(found: Identification, channel: str) -> float:
+    """Root mean square of a channel in the training runs."""
+    values = ((getattr(f, channel), len(f.time)) for f in _fitted(found))
+    return _rms_of_all((None if x is None else np.sqrt(np.nanmean(x**2)), n) for x, n in values)
+
+
+def _fitted(found: Identification) -> list[RunFit]:
+    return [f for f in found.fit.values() if f.role == "train"]
+
+
+def _rms_of_all(runs: Iterable[tuple[float | None, int]]) -> float:
+    """Of several runs, each with its root mean square and its samples; zero where none has any."""
+    known = [(rms, samples) for rms, samples in runs if rms is not None]
+    samples = sum(n for _, n in known)
+    return float(np.sqrt(sum(x * x * n for x, n in known) / samples)) if samples else 0.0
 
 
 def _total(gaps: Mapping[str, Gap], base: Identification) -> dict[Role, Gap]:

@@ -11,8 +11,10 @@ from ..recording import Recording
 
 # How far a crude estimate may be off, as a factor either way. Wide: the search is cheap.
 CRUDE = 30.0
-# L / R of large motors, s: a scope that catches a single rise of the current samples it a thousand times
-LONGEST = 0.3
+# ... and L where the current rises over many samples, as when a scope catches it
+FINELY = 5.0
+# Means are taken over so many samples, and fewer in short runs
+STRETCH, STRETCHES = 20, 30
 # Back-EMF constant, V s/rad, where nothing tells of it
 USUAL = 0.05
 # By how much what an effect does may be smaller than what drives the motor, and still show
@@ -22,17 +24,17 @@ DECADES = 1e3
 def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, float]]:
     """Search bounds of R, L, Kb, Kt, J and f in SI, a decade and a half either way of crude estimates.
 
-    R and Kb from the quasi-steady balance v = R i + Kb w (stall current and no-load speed); Kt around Kb, its
-    equal in SI; J and f from the torque that is there, the speed that it keeps up and the change of speed that
-    it brings about; L from R and the time constants that the sampling can show, or those that motors have.
+    R and Kb from the balance v = R i + Kb w + L di/dt over short stretches (stall current and no-load speed); Kt around
+    Kb, its equal in SI; J and f from the torque that is there, the speed that it keeps up and the change of speed that
+    it brings about; L from R and the time constants that the sampling can show, or from that balance if it is larger.
     """
-    R, Kb = _armature(recordings)
+    R, Kb, L = _armature(recordings)
     torque, speed, change, step, duration = _motion(recordings, Kb)
     inertia = torque * np.sqrt(step * duration) / change
     friction = torque / speed
     return {
         "R": _around(R),
-        "L": (R * step / 300, R * min(max(np.sqrt(step * duration), LONGEST), duration)),
+        "L": (R * step / 300, max(R * np.sqrt(step * duration), FINELY * L)),
         "Kb": _around(Kb),
         "Kt": _around(Kb),
         "J": (inertia / CRUDE**2, inertia * CRUDE**2),
@@ -45,7 +47,7 @@ def effect_bounds(
 ) -> dict[str, tuple[float, float]]:
     """Where to search for the parameters of effects that show, by their units: three decades below the torque, speed,
     voltage and current of the recordings. What is not measured in those keeps the range of its table."""
-    _, Kb = _armature(recordings)
+    _, Kb, _ = _armature(recordings)
     torque, speed, _, step, duration = _motion(recordings, Kb)
     volts, amperes = (max(_largest(recordings, n), 1e-9) for n in ("voltage", "current"))
     scales = {
@@ -76,24 +78,24 @@ def _largest(recordings: Sequence[Recording], name: str) -> float:
     return max(_rms(getattr(run, name)) for run in recordings)
 
 
-def _armature(recordings: Sequence[Recording]) -> tuple[float, float]:
-    """R and Kb by least squares on means over short stretches, where L di/dt is small."""
+def _armature(recordings: Sequence[Recording]) -> tuple[float, float, float]:
+    """R, Kb and L by least squares on means over short stretches; L is zero where no current shows it."""
     rows = []
     for run in recordings:
         speed = np.zeros(len(run)) if run.held else run.speed
         if run.voltage is not None and run.current is not None and speed is not None:
             columns = np.stack([run.voltage, run.current, speed])
-            rows.append(_means(columns[:, ~np.isnan(columns).any(0)], 20))
+            rows.append(_stretches(columns[:, ~np.isnan(columns).any(0)], run.sample_time))
     if rows:
-        voltage, current, speed = np.concatenate(rows, axis=1)
-        inputs = np.stack([current, speed], 1)
+        voltage, *inputs = np.concatenate(rows, axis=1)
+        inputs = np.stack(inputs, 1)
         scale = np.linalg.norm(inputs, axis=0) + 1e-300
-        R, Kb = np.linalg.lstsq(inputs / scale, voltage, rcond=1e-6)[0] / scale
+        R, Kb, L = np.linalg.lstsq(inputs / scale, voltage, rcond=1e-6)[0] / scale
         # short-circuited, it shows no more than how one is to the other
         steady = (np.linalg.norm(voltage) or USUAL * scale[1]) / scale
         # a motor that only stalls, or only runs light, shows one of the two: then the other is open
-        unseen = steady[1] if np.any(speed) else USUAL
-        return (R if R > 0 else steady[0]), (Kb if Kb > 0 else unseen)
+        unseen = steady[1] if np.any(inputs[:, 1]) else USUAL
+        return (R if R > 0 else steady[0]), (Kb if Kb > 0 else unseen), max(L, 0.0)
     gains = [
         _rms(r.voltage) / _rms(r.speed)
         for r in recordings
@@ -105,7 +107,7 @@ def _armature(recordings: Sequence[Recording]) -> tuple[float, float]:
         if r.voltage is not None and r.current is not None
     ]
     Kb = float(np.median(gains)) if gains else USUAL
-    return (float(np.median(loads)) / 3 if loads else 1.0), Kb
+    return (float(np.median(loads)) / 3 if loads else 1.0), Kb, 0.0
 
 
 def _motion(recordings: Sequence[Recording], Kt: float):
@@ -133,9 +135,13 @@ def _around(value: float) -> tuple[float, float]:
     return value / CRUDE, value * CRUDE
 
 
-def _means(columns: np.ndarray, length: int) -> np.ndarray:
+def _stretches(columns: np.ndarray, sample_time: float) -> np.ndarray:
+    """Means of voltage, current and speed over short stretches, and how fast the current changes in each, A/s."""
+    length = max(2, min(STRETCH, columns.shape[1] // STRETCHES))
     whole = columns.shape[1] // length
-    return columns[:, : whole * length].reshape(len(columns), whole, length).mean(2)
+    parts = columns[:, : whole * length].reshape(len(columns), whole, length)
+    change = parts[1, :, -1] - parts[1, :, 0]
+    return np.vstack([parts.mean(2), change / ((length - 1) * sample_time)])
 
 
 def _rms(samples: np.ndarray | None) -> float:
