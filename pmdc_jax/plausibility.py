@@ -21,9 +21,7 @@ MAX_WINDOWS = 4000
 MIN_WINDOWS = 20
 LONGER = (1, 4, 16)  # windows this many times as long are tried too: rates of noisy channels
 UNSIGNED = ("current", "speed")  # channels of which some sensors give no sign
-SIGNED = (
-    0.2  # share of the voltage that these leave unexplained at most, if they are given its sign
-)
+SIGNED = 0.2  # share of the voltage that these leave unexplained, if they are given its sign
 ONE_WAY = 0.02  # share of its range to which a channel that has no sign may be negative
 CLEAR = 3.0  # a term is seen when it moves the fit by this many residuals
 RPM, DEGREES = 30 / np.pi, 180 / np.pi  # numbers per rad/s or rad

@@ -124,4 +124,5 @@ def _flat_top(values: np.ndarray, extreme: float) -> tuple[int, int, float]:
 def _second_longest_stay(values: Float[np.ndarray, " samples"]) -> int:
     """How long a signal stays at one value, but for once."""
     ends = np.flatnonzero(np.diff(values, append=np.nan) != 0)
-    return int(np.sort(np.diff(ends, prepend=-1))[-2:][0])
+    stays = np.sort(np.diff(ends, prepend=-1))
+    return int(stays[-2]) if len(stays) > 1 else 0

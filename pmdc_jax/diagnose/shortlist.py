@@ -32,7 +32,8 @@ def shortlist(current: Model, found: Seen) -> list[Signal]:
     obvious = clear(found)
     ranked = [s for s in obvious if effect_of(s) not in current.effects]
     most = max((s.gain for s in obvious), default=0.0)
-    own = any(effect_of(s) in current.effects and s.gain > MUCH_OF_IT * most for s in obvious[:1])
+    own = bool(obvious) and effect_of(obvious[0]) in current.effects
+    own = own and obvious[0].gain > MUCH_OF_IT * most
     exact = own and EFFECTS[effect_of(obvious[0])].equation == "sensor"
     if own and not exact and found.unexplained < FORMULA:
         ranked = [s for s in ranked if effect_of(s) in STARTS]
