@@ -117,10 +117,10 @@ def wrapped_angle(run: Recording) -> Iterator[Finding]:
         yield Finding(
             run.name,
             "angle",
-            "warning",
-            f"it starts again after each turn, {len(wraps)} times",
+            "note",
+            f"it starts again after each turn, {len(wraps)} times: it is taken as going on",
             f"first at {place(run, int(wraps[0]) + 1)}",
-            "Unwrap it, for example by numpy.unwrap",
+            "If it does not, unwrap it yourself, for example by numpy.unwrap",
         )
 
 

@@ -92,6 +92,11 @@ QUANTITIES = {
 }
 
 
+# Symbols that say whose they are, such as u_motor and Vmot, and need no unit
+OF_MOTOR = {
+    quantity: re.compile(rf"({symbol})_?(mot|motor|arm|armature)")
+    for quantity, symbol in {"voltage": "u|v", "current": "i", "speed": "w|omega"}.items()
+}
 # Quantities that a unit tells, if one column has it: a torque may be the load or the motor's
 BY_UNIT = ("time", "voltage", "current", "speed", "angle")
 # ... and words in the names of columns that hold something else than what was measured
@@ -129,12 +134,11 @@ def match_columns(
 
     **Raises**: `InputError` on unknown names or units, and where two headers mean the same.
     """
-    found = {
-        column.quantity: column
-        for column in (
-            _by_hand(name, spec, headers, where) for name, spec in (columns or {}).items()
-        )
-    }
+    if not isinstance(columns, Mapping | None):
+        what = f"columns are {columns!r}, and no mapping"
+        raise InputError(where, what, 'Write for example {"speed": "rpm_meas:rpm"}')
+    by_hand = [_by_hand(name, spec, headers, where) for name, spec in (columns or {}).items()]
+    found = {column.quantity: column for column in by_hand}
     _refuse_shared(found, where)
     taken = {column.header for column in found.values()}
     refused: dict[str, InputError] = {}
@@ -155,22 +159,25 @@ def match_columns(
     for quantity, error in refused.items():
         if quantity not in found:
             raise error
-    return found | _by_unit(headers, found)
+    return found | _less_surely(headers, found)
 
 
-def _by_unit(headers: Sequence[str], found: Mapping[str, Column]) -> dict[str, Column]:
-    """Quantities that no name tells of, where the unit of one header alone does."""
+def _less_surely(headers: Sequence[str], found: Mapping[str, Column]) -> dict[str, Column]:
+    """Quantities that no name tells of, where the unit or the symbol of one header alone does."""
     taken = {column.header for column in found.values()}
+    free = [header for header in headers if header not in taken]
     known: dict[str, Column] = {}
     for quantity in (q for q in BY_UNIT if q not in found):
         alike = [
-            (header, unit)
-            for header in headers
-            if header not in taken and (unit := _measured_unit(header, quantity))
+            evolve(_column(header, quantity, unit), by_unit=True)
+            for header in free
+            if (unit := _measured_unit(header, quantity))
         ]
+        if symbol := OF_MOTOR.get(quantity):
+            marked = (header for header in free if symbol.fullmatch(_key(header)))
+            alike += [_column(header, quantity, None) for header in marked]
         if len(alike) == 1:
-            ((header, unit),) = alike
-            known[quantity] = evolve(_column(header, quantity, unit), by_unit=True)
+            known[quantity] = alike[0]
     return known
 
 

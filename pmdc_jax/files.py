@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,8 +40,17 @@ def check_writable(option: str, path: Path) -> None:
         raise InputError(
             option, f"the folder {folder} does not exist", "Make it first, or choose another"
         )
-    if not os.access(folder if not path.exists() else path, os.W_OK):
+    if not (_takes_files(folder) if not path.exists() else os.access(path, os.W_OK)):
         raise InputError(option, f"{path} cannot be written", "Choose another place")
+
+
+def _takes_files(folder: Path) -> bool:
+    """Whether a file can be made in a folder: to the superuser, all of them seem to let one."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .identify.identification import Identification
 
 FORMAT = "pmdc motor 1"
+UNDETERMINED = ("not_identifiable", "at_bound")
 
 
 def save_motor(
@@ -50,10 +51,12 @@ def save_motor(
 
 
 class Uncertainty(NamedTuple):
-    """How sure a motor is: names of its coordinates, and their covariance."""
+    """How sure a motor is: names of its coordinates, and their covariance; and the parameters that no recording
+    determined."""
 
     names: tuple[str, ...]
     covariance: np.ndarray
+    undetermined: tuple[str, ...] = ()
 
 
 def load_uncertainty(path: str | Path) -> Uncertainty | None:
@@ -77,7 +80,9 @@ def load_uncertainty(path: str | Path) -> Uncertainty | None:
             '"covariance" is not a matrix with its names',
             "Write it with pmdc identify --save",
         )
-    return Uncertainty(names, matrix)
+    statuses = content.get("status", {})
+    undetermined = (name for name, status in statuses.items() if status in UNDETERMINED)
+    return Uncertainty(names, matrix, tuple(undetermined))
 
 
 def load_motor(path: str | Path) -> Motor:
@@ -108,6 +113,11 @@ def _content(path: str | Path) -> dict[str, Any]:
         ) from None
     if not isinstance(content, dict) or not isinstance(content.get("parameters"), dict):
         raise InputError(where, 'has no "parameters"', "Write one with pmdc identify --save")
+    if content.get("format", FORMAT) != FORMAT:
+        what = f'"format" is {content["format"]!r}, not {FORMAT!r}'
+        raise InputError(where, what, "Update pmdc_jax, or write the file with this version")
+    if not isinstance(content.get("status", {}), dict):
+        raise InputError(where, '"status" is not an object', "Write one with pmdc identify --save")
     return content
 
 
@@ -140,7 +150,9 @@ def _numbers(where: str, given: object, wanted, of: str) -> dict[str, np.ndarray
         raise InputError(where, f"{of}: parameters are {given!r}", "Give an object of numbers")
     numbers = {}
     for name in wanted:
-        value = given.get(name)
+        if name not in given:
+            raise InputError(where, f"{of}: {name} is missing", "Give a number in SI")
+        value = given[name]
         if not _is_finite_number(value):
             shown = repr(value) if len(repr(value)) < 40 else "beyond what a double holds"
             raise InputError(where, f"{of}: {name} is {shown}, not a number", "Give a number in SI")

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 MISSING = ["NA", "N/A", "n/a", "null", "NULL", "None"]
 # Lines that an instrument may write before its header
 PREAMBLE = 200
+# Numbers that a spreadsheet shows with a sign between thousands, by that sign; only where the decimal sign tells it
+GROUPED = {",": r"^[+-]?\d{1,3}(,\d{3})+\.\d*$", ".": r"^[+-]?\d{1,3}(\.\d{3})+,\d*$"}
 NUMBERS_ONLY = "Recordings hold plain numbers; leave a cell empty where a sample is missing"
 
 
@@ -155,7 +157,8 @@ class CsvTable:
 
         text = text.str.strip_chars().replace("", None)
         comma = self._separator != ","
-        plain = text.str.replace(",", ".", literal=True) if comma else text
+        plain = _ungrouped(text)
+        plain = plain.str.replace(",", ".", literal=True) if comma else plain
         numbers = plain.cast(pl.Float64, strict=False)
         wrong = (numbers.is_null() & text.is_not_null()).arg_true()
         if not len(wrong):
@@ -381,6 +384,14 @@ def _with_unit(name: str, unit: str) -> str:
     """A header with the unit below it, unless it says that by itself, as speed_rad_s does of rad/s."""
     said, new = (re.sub(r"\W+|_+", "_", text).strip("_") for text in (name, unit))
     return name if not new or said.endswith(f"_{new}") else f"{name} [{unit}]"
+
+
+def _ungrouped(text: pl.Series) -> pl.Series:
+    """Numbers without a sign between thousands."""
+    for sign, pattern in GROUPED.items():
+        grouped = text.str.contains(pattern).fill_null(False)
+        text = text.str.replace_all(sign, "", literal=True).zip_with(grouped, text)
+    return text
 
 
 def _stamps(text: pl.Series) -> pl.Series | None:

@@ -70,6 +70,7 @@ def late(runs: list[Recording], samples: int) -> list[Recording]:
     return [attrs.evolve(r, speed=np.roll(r.speed, samples)) for r in runs]
 
 
+@pytest.mark.slow
 def test_what_is_later_than_a_mean_over_a_sample_is_none():
     found = identify(late(recorded("tachometer"), 9))
     assert not any("mean over" in m for m in found.messages)

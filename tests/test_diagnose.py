@@ -29,6 +29,7 @@ from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
 from pmdc_jax.diagnose.rounding import READINGS, readings
 from pmdc_jax.diagnose.screen import Screen, Signal, common_to_waves, log_chance
 from pmdc_jax.diagnose.seen import Seen
+from pmdc_jax.diagnose.shortlist import effect_of, shortlist
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.colour import Series, whitener
 from pmdc_jax.identify.identification import Estimate, Identification
@@ -41,6 +42,34 @@ from pmdc_jax.simulate import LOCAL, Tape, free_run
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 SCALES = Scales(10.0, 300.0, 10.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0)
+
+
+def promises_of(gains: dict[str, float], unexplained: float) -> Seen:
+    """Evidence of effects with such gains, the first of them the most significant."""
+    candidates = [TABLE[name](name, SCALES)[0] for name in gains]
+    signals = [
+        Signal(gain, -1e3 + k, candidate, Mock(spec=Block))
+        for k, (gain, candidate) in enumerate(zip(gains.values(), candidates, strict=True))
+    ]
+    found = Mock(spec=Seen, of_candidates=signals, of_curves=signals[:1], unexplained=unexplained)
+    found.screen = Mock(spec=Screen, candidates=candidates)
+    found.clearest = max(signals, key=lambda s: s.gain)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("gains", "first"),
+    [
+        # what is left of a dead zone's own formula hides nothing that would explain fourteen times as much
+        ({"input_dead_zone": 10.0, "coulomb_friction": 140.0}, ["coulomb_friction"]),
+        # ... and leaves no room for what explains as little as it does itself
+        ({"input_dead_zone": 10.0, "quadratic_drag": 11.0}, []),
+    ],
+)
+def test_an_effects_own_formula_is_no_reason_to_leave_out_a_larger_one(gains, first):
+    current = Mock(spec=Model, effects={"input_dead_zone": {"width_V": 0.8}})
+    listed = shortlist(current, promises_of(gains, unexplained=0.05))
+    assert [effect_of(signal) for signal in listed] == first
 
 
 def test_every_effect_has_a_row():

@@ -39,6 +39,7 @@ NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
 SHAKEN = vb.Noise(current_A=0.1, speed_rad_s=0.5, torque_Nm=0.01, torque_correlation_s=0.02)
 
 
+@pytest.mark.slow
 def test_a_simulation_without_noise_lacks_nothing():
     """Two simulators differ by far less than any sensor, and by far more than nothing."""
     held_out, *training = recorded(vb.BenchMotor(**PAPER), 4, vb.Noise(0.0, 0.0))
@@ -121,6 +122,7 @@ def test_a_constant_load_would_not_have_shown_beside_a_load_that_nobody_knows():
     assert not {"constant_load", "coulomb_friction"} & visible
 
 
+@pytest.mark.slow
 def test_the_packaged_sample_hides_a_dry_friction():
     """What the tour shows: 12 mN m, in torque noise."""
     folder = resources.files("pmdc_jax") / "sample"

@@ -60,6 +60,7 @@ def test_linear_force_error_is_within_one_point_of_least_squares():
     assert errors == pytest.approx(FORCE_ERRORS[LINEAR], abs=1.0)
 
 
+@pytest.mark.slow
 @needs_emps
 def test_mass_with_coulomb_friction_is_the_published_one():
     assert emps.estimate_of(emps_of(COULOMB))["M"] == pytest.approx(95.109, rel=0.03)

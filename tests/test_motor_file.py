@@ -121,6 +121,8 @@ BAD = {
     "effects not in a list": (changed("effects", to={"coulomb_friction": 0.1}), "effect"),
     "effects null": (changed("effects", to=None), "effects"),
     "effects a number": (changed("effects", to=5), "effects"),
+    "of a later version": (json.dumps(GOOD | {"format": "pmdc motor 2"}), "format"),
+    "status a text": (json.dumps(GOOD | {"status": "identified"}), "status"),
 }
 
 

@@ -167,6 +167,13 @@ def test_a_unit_alone_tells_what_a_column_is(tmp_path):
     ]
 
 
+def test_symbols_of_the_motor_tell_what_a_column_is(tmp_path):
+    run = read_text(tmp_path, table("Time,Vmot,i_motor,RPM", T, T, T, T))
+    np.testing.assert_allclose((run.voltage, run.current, run.speed), (T, T, T * RPM))
+    # `i` counts lines as often as it is a current
+    assert read_text(tmp_path, table("i,time_s,u_mot,omega_mot", T, T, T, T)).current is None
+
+
 def test_a_unit_that_several_columns_have_tells_nothing(tmp_path):
     text = table("time_s,voltage_V,n1 [rpm],n2 [rpm],current_A", T, T, T, T, T)
     run = read_text(tmp_path, text)
@@ -452,6 +459,25 @@ def test_a_header_of_another_width_is_no_preamble(tmp_path):
     file.write_text(f"time_s,voltage_V,current_A\n{ROWS}")
     with pytest.raises(InputError, match="it has 4 fields where the header"):
         read_recording(file)
+
+
+@pytest.mark.parametrize(
+    ("separator", "number"),
+    [(",", "1,234.5"), (";", "1.234,5"), ("\t", "1,234.50"), (";", "-12,345,678.5")],
+)
+def test_thousands_may_be_set_apart(tmp_path, separator, number):
+    rows = [
+        line.split(",")
+        for line in table("time_s,voltage_V,current_A,speed_rad_s", T, T, T, T).splitlines()
+    ]
+    rows[5][3] = f'"{number}"'
+    run = read_text(tmp_path, "\n".join(map(separator.join, rows)))
+    plain = (
+        number.replace(".", "").replace(",", ".")
+        if number == "1.234,5"
+        else number.replace(",", "")
+    )
+    assert run.speed[4] == float(plain)
 
 
 def test_a_table_of_quoted_cells_with_remarks_and_empty_lines_at_its_end(tmp_path):

@@ -44,7 +44,7 @@ def off(found: Identification, name: str) -> float:
     return abs(found.parameters[name].value - TRUE[name])
 
 
-@pytest.mark.parametrize("clocked", [False, True])
+@pytest.mark.parametrize("clocked", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_steps_come_when_they_did(clocked):
     """Taken for held, the voltage is up to a sample late: L is then known to 4.7 % instead of 0.3."""
     found = identify(runs(clocked=clocked))

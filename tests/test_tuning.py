@@ -7,12 +7,14 @@ import json
 import math
 from functools import cache
 
+import jax
 import numpy as np
 import pytest
-from attrs import evolve
+from attrs import evolve, fields
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, cli, load_controller, load_uncertainty, save_motor, tune
+from pmdc_jax.control.specification import Asked
 from pmdc_jax.control.tuning import Tuning
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.report.tuning import summary, tuning_json, write_tuning_report
@@ -41,6 +43,10 @@ def test_the_tuned_loop_comes_close_to_the_limit():
     second = found.candidates[0].second
     assert second["Overshoot"] < 3
     assert second["SettlingTime"] < found.fastest_possible_settling
+    small = found.candidates[0].small
+    assert 0.9 * 24.05 < small["Peak"] < 1.2 * 24.05
+    told = any("24.1 rad/s, which no limit slows down" in message for message in found.messages)
+    assert told == (small["Overshoot"] > 1.2)
 
 
 @pytest.mark.slow
@@ -94,6 +100,16 @@ def test_a_loop_that_misses_is_said_to_miss():
     never = evolve(found, candidates=(evolve(found.candidates[0], metrics=slow),))
     assert "does not settle" in summary(never)[0]
     assert not never.meets_specification
+
+
+@pytest.mark.parametrize(("sample_time", "noted"), [(1e-3, False), (0.02, True)])
+def test_samples_too_far_apart_are_noted(sample_time, noted):
+    left_open = dict.fromkeys(f.name for f in fields(Asked))
+    given = {"controller": "pi", "setpoint": 481.0, "voltage_limit": 30.0, "delay": 1}
+    numbers = {"sample_time": sample_time, "max_overshoot": 1.0, "speed_noise": 0.0}
+    with jax.enable_x64(True):
+        notes = Asked(**left_open | given | numbers).completed(MOTOR).notes
+    assert any("takes 2.2 samples of 0.02 s" in note for note in notes) == noted
 
 
 IMPOSSIBLE = {
@@ -192,9 +208,12 @@ def test_the_uncertainty_of_a_motor_file_is_read(motor_file):
     content = json.loads((motor_file / "motor.json").read_text())
     content["covariance"] = {"names": ["R", "J"], "matrix": [[1e-4, 0.0], [0.0, 4e-4]]}
     (motor_file / "motor.json").write_text(json.dumps(content))
-    names, covariance = load_uncertainty("motor.json")
-    assert names == ("R", "J")
-    assert covariance.tolist() == [[1e-4, 0.0], [0.0, 4e-4]]
+    found = load_uncertainty("motor.json")
+    assert (found.names, found.undetermined) == (("R", "J"), ())
+    assert found.covariance.tolist() == [[1e-4, 0.0], [0.0, 4e-4]]
+    content["status"] = {"R": "identified", "L": "at_bound", "Kt": "not_identifiable"}
+    (motor_file / "motor.json").write_text(json.dumps(content))
+    assert load_uncertainty("motor.json").undetermined == ("L", "Kt")
     for broken in ({"names": ["R"]}, {"names": ["Z"], "matrix": [[1.0]]}, 3, {"names": 1}):
         content["covariance"] = broken
         (motor_file / "motor.json").write_text(json.dumps(content))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,10 +18,11 @@ from .controllers import AbstractController
 from .law import Law, Model
 from .loop import Response, closed_loop
 from .margins import margins
-from .metrics import load_metrics, step_metrics
+from .metrics import StepMetrics, load_metrics, step_metrics
 from .objective import LOWER, Score, Task, score
 
 SUBSTEPS = 10  # instants a sample in what is reported
+SMALL = 0.05  # a small step, over the set point
 
 
 @frozen
@@ -43,6 +45,7 @@ class Candidate:
     metrics: Mapping[str, float | None]
     load: Mapping[str, float | None]
     second: Mapping[str, float | None]  # of the step from the set point to half of it
+    small: Mapping[str, float | None]  # of a step so small that no limit binds
     robust: Robustness | None
     stable: bool
 
@@ -59,12 +62,28 @@ def judged(
     if judges is not None:
         model = Model.of(motor, task.hardware.sample_time)
         robust = _robustness(_score(task, model, judges, controller))
-    found = (
-        _by_name(step_metrics(*step, task.setpoint)),
-        _by_name(load_metrics(*loaded, task.setpoint)),
-        _by_name(step_metrics(*second, LOWER * task.setpoint, task.setpoint)),
+    return Candidate(
+        name=name,
+        controller=controller,
+        metrics=_by_name(step_metrics(*step, task.setpoint)),
+        load=_by_name(load_metrics(*loaded, task.setpoint)),
+        second=_by_name(step_metrics(*second, LOWER * task.setpoint, task.setpoint)),
+        small=_by_name(_small_step(task, motor, law)),
+        robust=robust,
+        stable=margins(motor, law).stable,
     )
-    return Candidate(name, controller, *found, robust, margins(motor, law).stable)
+
+
+def _small_step(task: Task, motor: Motor, law: Law) -> StepMetrics:
+    """The set point's own step, twenty times smaller. Gains that never overshoot where the voltage is at its limit may
+    do so here."""
+    small = eqx.tree_at(
+        lambda t: (t.setpoint, t.load, t.noise),
+        task,
+        (SMALL * task.setpoint, 0 * task.load, 0 * task.noise),
+    )
+    (time, speed), *_ = small.parts(simulated(small, motor, law), SUBSTEPS * task.substeps)
+    return step_metrics(time, speed, small.setpoint)
 
 
 @compiled

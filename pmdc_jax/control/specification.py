@@ -21,6 +21,7 @@ from .steady import steady_state
 NOMINAL_VOLTAGE = 24.0
 MAX_SENSITIVITY = 2.0
 MOST_SAMPLES = 20_000  # of one step
+FEW_SAMPLES = 10  # of the fastest settling
 
 
 @frozen
@@ -83,10 +84,16 @@ class Asked:
         if self.load_torque:
             check_reachable(*limits, self.load_torque, "--load-torque")
         fastest = check_time(self.max_settling, fastest_settling(*limits), setpoint)
-        sample_time = self.sample_time
+        sample_time, better = self.sample_time, min(1e-3, _round_number(fastest / 40))
         if sample_time is None:
-            sample_time = min(1e-3, _round_number(fastest / 40))
+            sample_time = better
             notes.append(f"no sample time given: {sample_time:g} s")
+        elif sample_time > fastest / FEW_SAMPLES:
+            taken = f"{fastest / sample_time:.2g} samples of {sample_time:g} s"
+            notes.append(
+                f"the fastest settling, {fastest:.3g} s, takes {taken}:"
+                f" a sample time of {better:g} s would lose less"
+            )
         _check_sensor(motor, sample_time)
         return Specification(
             asked=self,

@@ -20,10 +20,9 @@ def drawn_motors(motor: Motor, uncertainty: Uncertainty, count: int, seed: int) 
     """`count` motors about `motor`, stacked; drawn from a normal distribution of the coordinates: logarithms, or
     the parameters themselves where an effect's table says linear."""
     rng = np.random.default_rng(seed)
-    names, covariance = uncertainty
-    deviations = _normal(rng, np.asarray(covariance, float), count)
+    deviations = _normal(rng, np.asarray(uncertainty.covariance, float), count)
     stacked = jax.tree.map(lambda leaf: jnp.full(count, leaf, float), motor)
-    moved = {name: deviations[:, k] for k, name in enumerate(names)}
+    moved = {name: deviations[:, k] for k, name in enumerate(uncertainty.names)}
     constants = {n: getattr(stacked, n) * np.exp(moved.get(n, 0.0)) for n in PARAMETERS}
     effects = []
     for effect in stacked.effects:

@@ -23,7 +23,7 @@ from .controllers import AbstractController
 from .descent import STARTS, tuned
 from .gains import GainSpace
 from .hardware import Hardware
-from .judge import Candidate, Robustness, judged, simulated, speeds
+from .judge import SMALL, Candidate, Robustness, judged, simulated, speeds
 from .law import Law
 from .loop import Response
 from .margins import Margins, margins
@@ -198,7 +198,8 @@ def tune(
         seed=seed,
         seconds={"total": time.perf_counter() - begin},
     )
-    return attrs.evolve(result, messages=(*specification.notes, *_verdicts(result)))
+    notes = (*specification.notes, *_undetermined(uncertainty), *_verdicts(result))
+    return attrs.evolve(result, messages=notes)
 
 
 def robustness(tuning: Tuning, spread: float, seed: int) -> Robustness | None:
@@ -269,6 +270,15 @@ def _rivals(task: Task, motor: Motor, kind: str, judges: Motor | None) -> Iterat
         yield judged("Ziegler-Nichols", task, motor, rule, judges)
 
 
+def _undetermined(uncertainty: Uncertainty | None) -> Iterator[str]:
+    """What of the motor is taken as it stands in the file."""
+    if uncertainty is not None and uncertainty.undetermined:
+        yield (
+            f"no recording determined {', '.join(uncertainty.undetermined)} of this motor: the values in the file are"
+            " taken as they are, and no spread covers them"
+        )
+
+
 def _verdicts(result: Tuning) -> list[str]:
     """What of the specification is not met, and what is to be minded."""
     messages = []
@@ -282,6 +292,13 @@ def _verdicts(result: Tuning) -> list[str]:
     if overshoot is not None and overshoot > result.asked.max_overshoot:
         messages.append(
             f"overshoot is {overshoot:.3g} %, above the {result.asked.max_overshoot:g} % asked for"
+        )
+    small, step = result.candidates[0].small["Overshoot"] or 0.0, SMALL * result.setpoint
+    allowed = 1.2 * max(result.asked.max_overshoot, overshoot or 0.0)
+    if small > allowed and small * abs(step) > 100 * (result.asked.speed_step or 0.0):
+        messages.append(
+            f"a step of {step:.3g} rad/s, which no limit slows down, overshoots by {small:.3g} %: tune for a smaller"
+            " set point if such steps matter"
         )
     peak = result.margins.sensitivity_peak
     if peak is not None and peak > 1.1 * MAX_SENSITIVITY:

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..control.controller_file import gains_of, law_content
-from ..control.judge import Candidate, Robustness
+from ..control.judge import SMALL, Candidate, Robustness
 from ..control.metrics import BAND
 from ..control.objective import LOWER
 from ..control.tuning import Tuning
@@ -50,6 +50,7 @@ def tuning_json(tuning: Tuning) -> dict[str, Any]:
         "robust": _robust_json(tuning.robust),
         "load": {"torque_Nm": tuning.load_torque, **tuning.load},
         "second_step": {"to_rad_s": LOWER * tuning.setpoint, **tuning.candidates[0].second},
+        "small_step": {"to_rad_s": SMALL * tuning.setpoint, **tuning.candidates[0].small},
         "margins": {
             name: getattr(tuning.margins, name)
             for name in (
