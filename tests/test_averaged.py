@@ -56,7 +56,10 @@ OVER = {
 }
 
 
-@pytest.mark.parametrize("kind", OVER)
+SLOW = pytest.param("counts of two samples", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("kind", [SLOW, *list(OVER)[1:]])
 def test_a_mean_is_taken_for_what_it_is(kind):
     found = identify(recorded(kind), tie=[("Kt", "Kb")])
     means = [m for m in found.messages if "is a mean over" in m]

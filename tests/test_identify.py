@@ -275,6 +275,7 @@ def test_a_simulation_without_noise_is_met_exactly(seed):
         assert exact.parameters[name].value == pytest.approx(getattr(PAPER, name), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_short_circuit_from_full_speed_tells_ratios_alone():
     """Nothing but the decay: of R, L and Kb, as of J, f and Kt, only how one is to the others."""
     rng, time = np.random.default_rng(4), 1e-3 * np.arange(SAMPLES)
@@ -289,6 +290,7 @@ def test_a_short_circuit_from_full_speed_tells_ratios_alone():
     assert float(m.Kt / m.J) == pytest.approx(PAPER.Kt / PAPER.J, rel=0.02)
 
 
+@pytest.mark.slow
 def test_without_voltage_a_tie_tells_nothing():
     """Kb has nothing to do with such runs, so that Kt = Kb leaves Kt as open as it was."""
     light = [attrs.evolve(run, voltage=None) for run in unloaded(3)]
@@ -910,7 +912,8 @@ def behind_a_gear(gap: float, load: float, twist: float = 0.0) -> tuple[Problem,
     return given.problem, Unknowns(jnp.asarray(coordinates), jnp.zeros((1, LOCAL)))
 
 
-@pytest.mark.parametrize("gap", [pytest.param(0.05, marks=pytest.mark.slow), 0.3])
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [0.05, 0.3])
 def test_what_belongs_to_a_run_is_never_fitted_for_the_worse(gap):
     """Nobody knows the load of a run behind a gear with play, where straight lines lead anywhere."""
     with jax.enable_x64(True):
