@@ -305,6 +305,7 @@ def test_summary_says_what_matters():
     assert "(f)" in sentences
     assert "drive is reproduced" in sentences
     assert "what is left is the measurement noise" in sentences
+    assert "pmdc diagnose" in sentences
     sentences = " ".join(summary(partial_identification()))
     assert "Kt, J and f could not be" in sentences
     assert "--tie Kt=Kb" in sentences

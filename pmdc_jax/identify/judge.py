@@ -52,7 +52,7 @@ def judge(given: Prepared, solved: Solved) -> Identification:
     fit = _fits(
         given.runs, given.roles, problem.tape, np.asarray(ended.seen), np.asarray(unknowns.local)
     )
-    noise = {name: white_noise(_left(fit, name)) for name in ("current", "speed")}
+    noise = {name: white_noise(_residuals(fit, name)) for name in ("current", "speed")}
     return Identification(
         motor=_plain(parameters(best.unknowns.coordinates)),
         parameters=_estimates(parameters, best, info, given, _intervals(problem, best, info)),
@@ -247,7 +247,7 @@ def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | 
     return float(100 * (1 - error / spread)) if spread > 0 else None
 
 
-def _left(fit: Mapping[str, RunFit], name: str) -> list[np.ndarray]:
+def _residuals(fit: Mapping[str, RunFit], name: str) -> list[np.ndarray]:
     """What the fit leaves of an output in every run that has it."""
     runs = [f for f in fit.values() if f.role == "train"]
     pairs = [(getattr(f, name), getattr(f, f"{name}_simulated")) for f in runs]
@@ -257,7 +257,7 @@ def _left(fit: Mapping[str, RunFit], name: str) -> list[np.ndarray]:
 def missed(fit: Mapping[str, RunFit]) -> Iterator[str]:
     """What to say of outputs of which far more is left than the noise of their runs."""
     for name in ("current", "speed"):
-        scaled = [e / white for e in _left(fit, name) if (white := white_noise([e]))]
+        scaled = [e / white for e in _residuals(fit, name) if (white := white_noise([e]))]
         times = np.sqrt(np.nanmean(np.square(np.concatenate(scaled)))) if scaled else 0.0
         if times > MISSED:
             yield (

@@ -15,6 +15,7 @@ STATUS_WORDS = {
     "known": "known",
     "not_identifiable": "not identifiable",
 }
+PRESUMED = "All errors presume that the motor has nothing that the model lacks: `pmdc diagnose` tests that."
 # a residual up to this multiple of the noise is called noise: RMS of few samples scatter as much
 NOISE_LEVEL = 1.25
 
@@ -26,7 +27,12 @@ def status_word(status: str) -> str:
 
 def summary(identification: Identification) -> list[str]:
     """The sentences at the top of the report, the most important first."""
-    return [_found(identification), _held_out(identification), *cautions(identification)]
+    sentences = [_found(identification), _held_out(identification), *cautions(identification)]
+    # where the fit misses much, a message has said so already
+    told = any("pmdc diagnose" in message for message in identification.messages)
+    if _with_status(identification, "identified") and not told:
+        sentences.append(PRESUMED)
+    return sentences
 
 
 def cautions(identification: Identification) -> list[str]:
