@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -89,11 +89,16 @@ def test_help_shows_an_example(capsys, command):
 def test_help_is_quick():
     code = "import sys; from pmdc_jax.cli import main; sys.exit(main(['--help']))"
 
+    def used() -> float:
+        children = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return children.ru_utime + children.ru_stime
+
     def once() -> float:
-        start = time.perf_counter()
+        """Of the processor: it does one thing at a time, and other work beside does not count."""
+        start = used()
         shown = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
         assert b"identify" in shown.stdout
-        return time.perf_counter() - start
+        return used() - start
 
     assert min(once() for _ in range(10)) < 0.4
 
