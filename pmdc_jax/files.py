@@ -40,7 +40,8 @@ def check_writable(option: str, path: Path) -> None:
         raise InputError(
             option, f"the folder {folder} does not exist", "Make it first, or choose another"
         )
-    if not (_takes_files(folder) if not path.exists() else os.access(path, os.W_OK)):
+    writable = os.access(path, os.W_OK) if path.exists() else _takes_files(folder)
+    if not writable:
         raise InputError(option, f"{path} cannot be written", "Choose another place")
 
 

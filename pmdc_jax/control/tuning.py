@@ -275,7 +275,7 @@ def _undetermined(uncertainty: Uncertainty | None) -> Iterator[str]:
     if uncertainty is not None and uncertainty.undetermined:
         yield (
             f"no recording determined {', '.join(uncertainty.undetermined)} of this motor: the values in the file are"
-            " taken as they are, and no spread covers them"
+            " taken as they are"
         )
 
 
