@@ -57,12 +57,8 @@ def record(time: np.ndarray, rng: np.random.Generator, noise: np.ndarray = NOISE
     return Recording("r", time, voltage, current, speed, load)
 
 
-SLOW = pytest.mark.slow
-
-
-@pytest.mark.parametrize(
-    "kind", ["walk", pytest.param("jitter", marks=SLOW), pytest.param("two rates", marks=SLOW)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["walk", "jitter", "two rates"])
 def test_motors_are_found_in_records_of_uneven_clocks(kind):
     rng = np.random.default_rng(21)
     run = record(stamps(kind, 2400, rng), rng)

@@ -66,12 +66,14 @@ def test_mass_with_coulomb_friction_is_the_published_one():
     assert emps.estimate_of(emps_of(COULOMB))["M"] == pytest.approx(95.109, rel=0.03)
 
 
+@pytest.mark.slow
 @needs_emps
 @free_run
 def test_viscous_friction_with_coulomb_friction_is_the_published_one():
     assert emps.estimate_of(emps_of(COULOMB))["Fv"] == pytest.approx(203.5, rel=0.03)
 
 
+@pytest.mark.slow
 @needs_emps
 def test_coulomb_intervals_hold_the_published_values():
     found = emps_of(COULOMB).parameters
@@ -80,6 +82,7 @@ def test_coulomb_intervals_hold_the_published_values():
         assert low <= emps.PUBLISHED[term] <= high
 
 
+@pytest.mark.slow
 @needs_emps
 def test_axis_says_nothing_of_the_winding():
     found = emps_of(COULOMB).parameters

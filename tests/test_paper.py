@@ -26,6 +26,7 @@ def test_printed_gains_do_what_python_control_says(kind):
     assert found.peak_voltage == pytest.approx(SETPOINT * voltage.outputs.max(), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_paper_is_written_with_its_impossibilities(tmp_path):
     result = paper(tmp_path)
     written = json.loads((tmp_path / "paper.json").read_text())
