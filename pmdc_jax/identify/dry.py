@@ -1,0 +1,154 @@
+"""Whether dry friction would explain what is left of a fit without any: most motors have some, and f makes up for it.
+
+A score test: what a constant torque against the simulated motion would change in the outputs is one more column of the
+regression that the fit ends with, in rows that are white once it has taken away what it can. No motor is fitted anew.
+
+**Source**: Rao, Proceedings of the Cambridge Philosophical Society 44 (1948), doi:10.1017/S0305004100023987.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import expm
+from scipy.signal import lfilter, ss2tf
+
+from ..motor import Motor
+from ..simulate import LOCAL, Tape
+from .colour import Series, Whitener, plain, whitener
+from .identification import Identification
+from .polish import Polished
+from .prepare import Prepared
+from .sharpen import residuals_of, series_of, training_runs
+
+# So many standard errors are no chance
+CLEARLY = 5.0
+# ... and of its own by which a parameter makes up for it
+MAKES_UP = 2.0
+# The effect that is it
+DRY = "coulomb_friction"
+# A direction with less than this share of the squares is none
+VISIBLE = 1e-9
+
+# Numerators and the common denominator
+LoadFilter = tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "3"]]
+
+
+class Missing(NamedTuple):
+    """What a fit says that it lacks."""
+
+    friction_Nm: float
+    errors: float  # by how many standard errors it is more than none
+    moved: Float[np.ndarray, " parameters"]  # how far the coordinates would move with it
+
+
+def missing_friction(given: Prepared, fit: Polished) -> Missing | None:
+    """The dry friction that a fit lacks by the runs it was fitted to; None if it has some, or lacks none clearly."""
+    problem, count = given.problem, len(given.problem.free)
+    if any(effect.holds == "speed" for effect in problem.parameters.effects):
+        return None
+    rows = _rows(given, fit)
+    residuals = [series._replace(values=series.values[..., -1]) for series in rows]
+    found = _regressed(rows, plain(residuals), count)
+    if found.score(count) <= CLEARLY:  # by errors that are too small, if the noise is coloured
+        return None
+    found = _regressed(rows, whitener(found.left), count)
+    score = found.score(count)
+    friction, moved = float(found.coefficients[count]), found.coefficients[:count]
+    return Missing(friction, score, moved) if score > CLEARLY else None
+
+
+def lacking_friction(missing: Missing | None, found: Identification) -> Iterator[str]:
+    """What to say of the friction that a fit lacks, if some parameter makes up for it by more than its own error."""
+    if missing is None or found.covariance is None:
+        return
+    errors = np.sqrt(np.diag(found.covariance))
+    moved = np.abs(missing.moved) / np.where(errors > 0, errors, np.inf)
+    most = int(np.argmax(moved))
+    if moved[most] > MAKES_UP:
+        yield (
+            f"dry friction of some {missing.friction_Nm:.2g} N m would explain part of what the fit leaves "
+            f"({missing.errors:.0f} standard errors), and for want of it {found.covariance_names[most]} is wrong "
+            f"by more than it says: add `--effect {DRY}`, or let `pmdc diagnose` find what is missing"
+        )
+
+
+def _rows(given: Prepared, fit: Polished) -> list[Series]:
+    """Of every training run: the derivatives by the motor's parameters, what dry friction of one newton metre would
+    change, the derivatives by what is the run's own, and last the residual; in A and rad/s."""
+    problem, tape = given.problem, given.problem.tape
+    motor, count = problem.parameters(fit.refined.unknowns.coordinates), len(problem.free)
+    of_grid = {tape.grid_of(run): run for run in training_runs(given)}
+    filters = {grid: _load_filter(motor, tape, run) for grid, run in of_grid.items()}
+    J = np.asarray(fit.evaluation.jacobian) * fit.noise[:, None, None]
+    rows = []
+    for run, residual in zip(training_runs(given), residuals_of(given, fit), strict=True):
+        speed = np.asarray(fit.evaluation.seen)[tape.blocks_of(run), 1].ravel()
+        _, outputs = residual.kind
+        friction = _response(filters[tape.grid_of(run)], np.sign(speed))[:, list(outputs)]
+        derivatives = series_of(tape, run, J).values
+        columns = (derivatives[..., :count], friction, derivatives[..., count:], residual.values)
+        sized = [c if c.ndim == 3 else c[..., None] for c in columns]
+        rows.append(residual._replace(values=np.concatenate(sized, -1)))
+    return rows
+
+
+def _load_filter(motor: Motor, tape: Tape, run: int) -> LoadFilter:
+    """The linear motor from a load that is held from sample to sample to current and speed."""
+    A, B = map(np.asarray, motor.state_space(tape.drive_of(run)))
+    whole = expm(tape.sample_time_of(run) * np.block([[A, B[:, 1:]], [np.zeros((1, 3))]]))
+    numerators, denominator = ss2tf(whole[:2, :2], whole[:2, 2:], np.eye(2), np.zeros((2, 1)))
+    return numerators, np.asarray(denominator)
+
+
+def _response(
+    of_load: LoadFilter, load: Float[np.ndarray, " samples"]
+) -> Float[np.ndarray, "samples 2"]:
+    numerators, denominator = of_load
+    return np.stack([lfilter(numerator, denominator, load) for numerator in numerators], 1)
+
+
+class _Regression(NamedTuple):
+    """Least squares of the residuals on the columns that all runs have in common and each run's own."""
+
+    coefficients: Float[np.ndarray, " shared"]
+    errors: Float[np.ndarray, " shared"]
+    left: list[Series]
+
+    def score(self, k: int) -> float:
+        """By how many standard errors a coefficient is above zero; zero where no row shows it."""
+        return float(self.coefficients[k] / self.errors[k]) if self.errors[k] > 0 else 0.0
+
+
+def _regressed(rows: Sequence[Series], white: Whitener, count: int) -> _Regression:
+    shared = [*range(count + 1), -1]  # the motor's, that of friction, and the residual
+    own = slice(count + 1, count + 1 + LOCAL)
+    total, of_own = np.zeros((len(shared), len(shared))), []
+    for run, series in enumerate(rows):
+        made = white(run, series)
+        kept, alone = made[:, shared], made[:, own]
+        solved = _inverse(alone.T @ alone) @ alone.T @ kept
+        kept = kept - alone @ solved
+        total += kept.T @ kept
+        of_own.append(solved)
+    inverse = _inverse(total[:-1, :-1])
+    coefficients = inverse @ total[:-1, -1]
+    left = [
+        series._replace(
+            values=series.values[..., -1]
+            - series.values[..., shared[:-1]] @ coefficients
+            - series.values[..., own] @ (solved[:, -1] - solved[:, :-1] @ coefficients)
+        )
+        for series, solved in zip(rows, of_own, strict=True)
+    ]
+    return _Regression(coefficients, np.sqrt(np.maximum(np.diag(inverse), 0.0)), left)
+
+
+def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """The inverse on what the rows can see of it."""
+    lengths = np.sqrt(np.diag(matrix))
+    units = np.outer(*2 * [np.where(lengths > 0, lengths, 1.0)])
+    return np.linalg.pinv(matrix / units, VISIBLE, hermitian=True) / units
