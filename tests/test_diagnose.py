@@ -450,7 +450,7 @@ def runs() -> list[Recording]:
 # one effect that acts through a parameter, one with a state of its own, one of a sensor, one of the angle, where runs
 # begin anywhere in the turn
 SMOOTH = {
-    "torque_constant_saturation": {"per_A2": 1e-9},
+    "torque_constant_saturation": {"per_A2": 1e-9, "emf_share": 0.0},
     "resistance_heating": {"rise_per_W": 1e-8, "time_constant_s": 0.2},
     "speed_sensor_delay": {"delay_s": 2.5e-3},
     "cogging_torque": {"amplitude_Nm": 1e-6, "phase_rad": 0.3, "periods": 3.0},

@@ -96,6 +96,12 @@ def rippled(x, v, load, values):
     return [electrical(x[0], emf * x[1], v), mechanical(x[0], x[1], load, Kt=Kt), x[1]]
 
 
+def saturated(x, v, load, values):
+    flux = 1 / (1 + values["per_A2"] * x[0] ** 2)
+    emf = 1 - values["emf_share"] * (1 - flux)
+    return [electrical(x[0], emf * x[1], v), mechanical(x[0], x[1], load, Kt=PAPER["Kt"] * flux)]
+
+
 def two_inertias(x, v, load, values, torque):
     i, w, load_speed, _ = x
     share = values["load_share"]
@@ -207,12 +213,9 @@ CASES = {
         start=lambda w, load, p: [0.0],
     ),
     "torque_constant_saturation": Case(
-        {"per_A2": 3e-4},
+        {"per_A2": 3e-4, "emf_share": 0.4},
         "per_A2",
-        rates=lambda x, v, load, p: [
-            electrical(x[0], x[1], v),
-            mechanical(x[0], x[1], load, Kt=PAPER["Kt"] / (1 + p["per_A2"] * x[0] ** 2)),
-        ],
+        rates=saturated,
         dissipates=False,
     ),
     "inductance_saturation": Case(

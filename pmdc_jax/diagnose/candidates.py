@@ -293,7 +293,9 @@ TABLE: Mapping[str, Callable[[str, Scales], list[Candidate]]] = {
     "resistance_heating": _amplitude(
         "rise_per_W", lambda s: 1 / (s.voltage * s.current), time_constant_s=_thermal
     ),
-    "torque_constant_saturation": _amplitude("per_A2", lambda s: 1 / s.current**2),
+    "torque_constant_saturation": _amplitude(
+        "per_A2", lambda s: 1 / s.current**2, emf_share=lambda s: (0.0, 1.0)
+    ),
     "inductance_saturation": _amplitude("per_A2", lambda s: 1 / s.current**2),
     # a voltage within it that is noise, or a small signal, has a sign which the motor does not feel
     "input_dead_zone": _either(

@@ -15,28 +15,33 @@ if TYPE_CHECKING:
 class TorqueConstantSaturation(AbstractEffect):
     """Saturated torque: Kt / (1 + c i^2) in place of Kt.
 
-    In the torque alone. Armature reaction weakens the flux under load, and with it the back-EMF too; but that
-    change, R i + Kb(i) w, cannot be told from a resistance that grows with speed, so Kb keeps its value at no load.
+    Armature reaction weakens the flux under load, and with it the back-EMF as far as the brushes see it.
 
-    **Fields**: `per_A2`, c in 1/A^2, > 0: at a current of 1 / sqrt(c) the torque per ampere is halved.
+    **Fields**: `per_A2`, c in 1/A^2, > 0: at a current of 1 / sqrt(c) the torque per ampere is halved; `emf_share`, e,
+    the share of that by which the back-EMF falls, between 0 and 1.
     **Excitation needed**: high and low torque at known load, or accelerations with high and with low current.
     **Source**: Fitzgerald, Kingsley, Umans, "Electric Machinery", 6th edition, section 7.3 (armature reaction).
     """
 
     name: ClassVar = "torque_constant_saturation"
     label: ClassVar = "Saturation of the torque constant"
-    formula: ClassVar = "T_m = Kt i / (1 + c i^2)"
+    formula: ClassVar = "T_m = g Kt i, e = (1 - e_s (1 - g)) Kb w, g = 1 / (1 + c i^2)"
     equation: ClassVar = "mechanical"
     needs_current: ClassVar = True
     variable: ClassVar = "current"
-    ranges: ClassVar = {"per_A2": ParameterRange("1/A^2", 1e-10, 1e4)}
+    ranges: ClassVar = {
+        "per_A2": ParameterRange("1/A^2", 1e-10, 1e4),
+        # estimates scatter about its ends
+        "emf_share": ParameterRange("", -0.5, 1.5, "linear"),
+    }
 
     per_A2: Scalars
+    emf_share: Scalars
 
     def parameters(self, motor: Motor, state: State) -> Motor:
-        return eqx.tree_at(
-            lambda m: m.Kt, motor, motor.Kt * (1 / (1 + self.per_A2 * state.current**2))
-        )
+        flux = 1 / (1 + self.per_A2 * state.current**2)
+        constants = motor.Kt * flux, motor.Kb * (1 - self.emf_share * (1 - flux))
+        return eqx.tree_at(lambda m: (m.Kt, m.Kb), motor, constants)
 
 
 class InductanceSaturation(AbstractEffect):
