@@ -29,7 +29,7 @@ from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
 from pmdc_jax.diagnose.rounding import READINGS, readings
 from pmdc_jax.diagnose.screen import Screen, Signal, common_to_waves, log_chance
 from pmdc_jax.diagnose.seen import Seen
-from pmdc_jax.diagnose.shortlist import effect_of, shortlist
+from pmdc_jax.diagnose.shortlist import effect_of, promising, shortlist
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.colour import Series, whitener
 from pmdc_jax.identify.identification import Estimate, Identification
@@ -117,6 +117,29 @@ def test_what_was_left_for_a_better_model_is_not_come_back_to():
     namer = Undecided()
     assert namer.name().chosen is namer.other
     assert namer.trials == 3
+
+
+def test_what_only_mends_a_formula_does_not_hide_what_plain_squares_find():
+    """A filter may swallow most of an effect: what it leaves then looks like the formula of another one."""
+    namer = Undecided()
+    namer._by_plain_squares = lambda current, found: namer.other
+    namer._is_settled = lambda current, found, better: better is namer.other
+    namer._in_other_form = lambda *models: []
+    assert namer._step(namer.base, namer._see(namer.base)) is namer.other
+
+
+@pytest.mark.parametrize(
+    ("gains", "least", "listed"),
+    [
+        # a fit far from the truth foretells badly: less than half as much is tried, too
+        ({"stribeck_friction": 87.0, "quadratic_drag": 37.0, "cogging_torque": 2.0}, 18.0, 2),
+        ({"stribeck_friction": 87.0, "quadratic_drag": 37.0}, 40.0, 1),
+        ({"coulomb_friction": 87.0, "torque_ripple": 60.0}, 90.0, 0),
+    ],
+)
+def test_what_promises_little_by_plain_squares_is_not_tried(gains, least, listed):
+    found = promising(promises_of(gains, unexplained=0.0).of_candidates, set(), least)
+    assert [effect_of(signal) for signal in found] == list(gains)[:listed]
 
 
 @pytest.mark.parametrize(("count", "left", "asked"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])

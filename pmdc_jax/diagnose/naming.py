@@ -41,6 +41,8 @@ MOST = 3
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
 # A filter that swallows an effect shows no larger share of it, over what the model explains
 SWALLOWED = 1e-2
+# What is to take away most of a misfit foretells this share of it, at least
+FORETOLD = 0.05
 # A fuller form of an effect is ruled out if it leaves so many squares more: two standard errors
 RULED_OUT = 4.0
 # The simplest effect by which a rotor sticks
@@ -85,26 +87,29 @@ class Namer:
         current, found = self.base, self._see(self.base)
         self.passed.add(current)
         while better := self._step(current, found):
-            again = self._see(better)
-            if not self._is_settled(current, found, better):
-                # a simple form may be but a step to the one that is there
-                tried = self._in_other_form(
-                    better, again, set(better.effects) - set(current.effects)
-                )
-                better = self._better(better, again, tried)
-                if better is None or not self._is_settled(current, found, better):
-                    break
             current, found = better, self._see(better)
             self.passed.add(current)
         return self._naming(self._better(current, found, self._tied(current, found)) or current)
 
     def _step(self, current: Model, found: Seen) -> Model | None:
-        """A better model than the current one, with one effect more or another one, if there is one."""
+        """A better model than the current one, with one effect more or another one, that settles something, if there is
+        one."""
         ways = [self._by_evidence, self._settling, self._by_plain_squares]
         if found.unexplained < SWALLOWED:
             ways = [self._by_plain_squares, self._by_evidence, self._settling]
         ways.append(self._in_exchange)
-        return next(filter(None, (way(current, found) for way in ways)), None)
+        models = (self._settled(current, found, way(current, found)) for way in ways)
+        return next(filter(None, models), None)
+
+    def _settled(self, current: Model, found: Seen, better: Model | None) -> Model | None:
+        """A better model if it is more than a way to mend a formula, or else in another form that is."""
+        if better is None or self._is_settled(current, found, better):
+            return better
+        # a simple form may be but a step to the one that is there
+        added = set(better.effects) - set(current.effects)
+        again = self._see(better)
+        best = self._better(better, again, self._in_other_form(better, again, added))
+        return best if best and self._is_settled(current, found, best) else None
 
     def _by_evidence(self, current: Model, found: Seen) -> Model | None:
         """The best of the models that the evidence asks to be tried."""
@@ -166,7 +171,8 @@ class Namer:
         if full or found.left >= ALARM or far < current.given.problem.outputs:
             return None
         pointed = found.screen._replace(evidence=found.screen.unfiltered)
-        most = promising(found.plainly(), set(current.effects))
+        least = FORETOLD * found.screen.unfiltered.regress().squares
+        most = promising(found.plainly(), set(current.effects), least)
         tried = [self.refits.with_signal(current, s, pointed) for s in most]
         better = [m for m in tried if m is not None and m.polished.refined.fitness < far]
         return self._better(current, found, better)

@@ -48,14 +48,15 @@ def shortlist(current: Model, found: Seen) -> list[Signal]:
     return [s for s in ranked if s.gain >= (1 - TIED) * least]
 
 
-def promising(signals: Sequence[Signal], here: set[str]) -> list[Signal]:
-    """Of each of the few effects that gain most, but for those that are `here`, the shape that does."""
+def promising(signals: Sequence[Signal], here: set[str], least: float) -> list[Signal]:
+    """Of each of the few effects that gain most, but for those that are `here`, the shape that does, if it gains at
+    `least` so much: by far less than the best, too, for a fit far from the truth foretells badly what each would do."""
     best: dict[str, Signal] = {}
     for s in sorted(signals, key=lambda s: -s.gain):
         if effect_of(s) not in here:
             best.setdefault(effect_of(s), s)
     ranked = list(best.values())[:SHORTLIST]
-    return [s for s in ranked if s.gain > COMPARABLE * ranked[0].gain]
+    return [s for s in ranked if s.gain > max(MUCH_OF_IT * ranked[0].gain, least)]
 
 
 def clear(found: Seen) -> list[Signal]:

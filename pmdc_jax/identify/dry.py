@@ -61,7 +61,7 @@ def missing_friction(given: Prepared, fit: Polished) -> Missing | None:
     return Missing(friction, score, moved) if score > CLEARLY else None
 
 
-def lacking_friction(missing: Missing | None, found: Identification) -> Iterator[str]:
+def of_friction(missing: Missing | None, found: Identification) -> Iterator[str]:
     """What to say of the friction that a fit lacks, if some parameter makes up for it by more than its own error."""
     if missing is None or found.covariance is None:
         return

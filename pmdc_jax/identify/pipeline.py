@@ -12,7 +12,7 @@ from ..compiled import make_room
 from ..precision import double_precision
 from ..recording import Runs
 from .colour import whitener
-from .dry import lacking_friction, missing_friction
+from .dry import missing_friction, of_friction
 from .identification import Identification
 from .judge import judge, missed
 from .parameters import effects_named
@@ -59,11 +59,10 @@ def identify(
     given, solved = solve(given, search, seed, progress)
     report("judging the uncertainty", solved.polished.refined.fitness)
     plainly = solved.polished
-    lacking = missing_friction(given, plainly)
+    friction = missing_friction(given, plainly)
     white = whitener(residuals_of(given, plainly))
     given, polished = last_fit(given, plainly, plainly, white)
     found = judge(given, solved._replace(polished=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
-    friction = lacking_friction(lacking, found)
-    messages = (*found.messages, *friction, *missed(found.fit))
+    messages = (*found.messages, *of_friction(friction, found), *missed(found.fit))
     return attrs.evolve(found, seconds=seconds, messages=messages)
