@@ -29,7 +29,7 @@ TIDYINGS = 3
 MISSED = 2.0
 # Of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
-# A parameter is alone in an unseen direction of unit length if it has so much of it
+# A parameter is unseen alone if so much of it is hidden
 ALONE = 0.99
 # ... and large enough to show if it changes the outputs by this share of what the strongest one does
 TO_SHOW = 0.3
@@ -78,7 +78,9 @@ def _intervals(
 
     def interval(k: int) -> tuple[float, float]:
         spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.reach[k])
-        if not problem.parameters.logarithmic[k] or spread < QUADRATIC:
+        # no refit follows an unseen direction as far as the truth may lie along it
+        hidden = info.blind[k] > info.covariance[k, k] / 2
+        if not problem.parameters.logarithmic[k] or spread < QUADRATIC or hidden:
             return coordinates[k] - reach * spread, coordinates[k] + reach * spread
         return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
 
@@ -100,8 +102,7 @@ def _let_go(problem: Problem, polished: Polished) -> Polished:
 
 def _vanished(parameters: Parameters, info: Information) -> list[int]:
     """Positive parameters that alone change nothing, as where one is next to nothing."""
-    alone = [int(np.argmax(np.abs(d))) for d in info.unseen if np.max(np.abs(d)) > ALONE]
-    return [k for k in alone if parameters.logarithmic[k]]
+    return [int(k) for k in np.flatnonzero(info.hidden > ALONE) if parameters.logarithmic[k]]
 
 
 def _lifted(problem: Problem, polished: Polished, k: int) -> Polished | None:
@@ -197,8 +198,7 @@ def _estimates(
 def _status(k: int, best: Refined, info: Information) -> Status:
     if k in best.at_bound:
         return "at_bound"
-    unseen = any(abs(direction[k]) > SHARE for direction in info.unseen)
-    if unseen or np.sqrt(info.covariance[k, k]) > FLAT:
+    if info.hidden[k] > SHARE or np.sqrt(info.covariance[k, k]) > FLAT:
         return "not_identifiable"
     return "identified"
 

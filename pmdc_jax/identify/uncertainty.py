@@ -36,7 +36,13 @@ class Information(NamedTuple):
     covariance: Float[np.ndarray, "parameters parameters"]
     inflation: Float[np.ndarray, " parameters"]  # of the variance, over that for white residuals
     reach: Float[np.ndarray, " parameters"]  # of a 95 % interval, in standard errors
+    blind: Float[np.ndarray, " parameters"]  # of the variance, what unseen directions leave open
     unseen: tuple[np.ndarray, ...]  # unit vectors, logarithms of parameters
+
+    @property
+    def hidden(self) -> Float[np.ndarray, " parameters"]:
+        """How much of each coordinate's unit vector lies within the unseen directions, 0 to 1."""
+        return np.sqrt(sum((np.square(d) for d in self.unseen), np.zeros(len(self.blind))))
 
 
 class Part(NamedTuple):
@@ -96,7 +102,7 @@ def information(residuals, jacobian, run, free: np.ndarray, runs: int) -> Inform
     variance = np.maximum(np.maximum(np.diag(spread), white), by_parts)
     stretch = np.sqrt(_over(variance, np.diag(spread)))
     covariance = spread * stretch[:, None] * stretch
-    return Information(covariance + blind, _over(variance, white), reach, unseen)
+    return Information(covariance + blind, _over(variance, white), reach, np.diag(blind), unseen)
 
 
 def _over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
