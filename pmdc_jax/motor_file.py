@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import json
-import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from .effects import EFFECTS, AbstractEffect
 from .errors import InputError
 from .files import write_text
+from .json_file import finite_number, read_object
 from .motor import PARAMETERS, Motor
 
 if TYPE_CHECKING:
     from .identify.identification import Identification
 
 FORMAT = "pmdc motor 1"
+MEND = "Write one with pmdc identify --save"
 UNDETERMINED = ("not_identifiable", "at_bound")
 
 
@@ -71,18 +73,22 @@ def load_uncertainty(path: str | Path) -> Uncertainty | None:
     try:
         names = tuple(given["names"])
         matrix = np.array(given["matrix"], float).reshape(len(names), len(names))
-    except (KeyError, TypeError, ValueError):
-        matrix, names = np.full((1, 1), np.nan), ()
-    known = {*PARAMETERS, *(f"{e}.{f}" for e, kind in EFFECTS.items() for f in kind.ranges)}
-    if not np.isfinite(matrix).all() or not known.issuperset(names):
-        raise InputError(
-            where,
-            '"covariance" is not a matrix with its names',
-            "Write it with pmdc identify --save",
-        )
+        if not _is_covariance(names, matrix):
+            raise ValueError
+    except (KeyError, TypeError, ValueError, OverflowError):
+        what = '"covariance" is not a matrix with its names'
+        raise InputError(where, what, MEND) from None
     statuses = content.get("status", {})
     undetermined = (name for name, status in statuses.items() if status in UNDETERMINED)
     return Uncertainty(names, matrix, tuple(undetermined))
+
+
+def _is_covariance(names: Sequence[str], matrix: np.ndarray) -> bool:
+    """Whether it may be one, of parameters that there are."""
+    known = {*PARAMETERS, *(f"{e}.{f}" for e, kind in EFFECTS.items() for f in kind.ranges)}
+    once = known.issuperset(names) and len(set(names)) == len(names)
+    alike = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=1e-6)
+    return bool(once and alike and np.all(np.diag(matrix) >= 0))
 
 
 def load_motor(path: str | Path) -> Motor:
@@ -96,28 +102,11 @@ def load_motor(path: str | Path) -> Motor:
 
 
 def _content(path: str | Path) -> dict[str, Any]:
-    where = str(path)
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(
-            where, "there is no such file", "Write one with pmdc identify --save"
-        ) from None
-    except OSError as error:
-        raise InputError(
-            where, f"cannot be read ({error.strerror})", "Check path and permissions"
-        ) from None
-    except ValueError as error:
-        raise InputError(
-            where, f"is not JSON ({error})", "Write one with pmdc identify --save"
-        ) from None
-    if not isinstance(content, dict) or not isinstance(content.get("parameters"), dict):
-        raise InputError(where, 'has no "parameters"', "Write one with pmdc identify --save")
-    if content.get("format", FORMAT) != FORMAT:
-        what = f'"format" is {content["format"]!r}, not {FORMAT!r}'
-        raise InputError(where, what, "Update pmdc_jax, or write the file with this version")
+    where, content = str(path), read_object(path, FORMAT, MEND)
+    if not isinstance(content.get("parameters"), dict):
+        raise InputError(where, 'has no "parameters"', MEND)
     if not isinstance(content.get("status", {}), dict):
-        raise InputError(where, '"status" is not an object', "Write one with pmdc identify --save")
+        raise InputError(where, '"status" is not an object', MEND)
     return content
 
 
@@ -152,22 +141,10 @@ def _numbers(where: str, given: object, wanted, of: str) -> dict[str, np.ndarray
     for name in wanted:
         if name not in given:
             raise InputError(where, f"{of}: {name} is missing", "Give a number in SI")
-        value = given[name]
-        if not _is_finite_number(value):
-            shown = repr(value) if len(repr(value)) < 40 else "beyond what a double holds"
-            raise InputError(where, f"{of}: {name} is {shown}, not a number", "Give a number in SI")
+        value = finite_number(where, f"{of}: {name}", given[name], "Give a number in SI")
         if name in PARAMETERS and not (value > 0 or (name == "f" and value == 0)):
             raise InputError(where, f"{of}: {name} is {value}, not positive", "Give a value in SI")
         if name not in PARAMETERS and wanted[name].scale == "log" and value < 0:
             raise InputError(where, f"{of}: {name} is {value}, below 0", "Give a value in SI")
-        numbers[name] = np.asarray(float(value))
+        numbers[name] = np.asarray(value)
     return numbers
-
-
-def _is_finite_number(value: object) -> TypeGuard[float]:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # JSON holds whole numbers of any length
-        return False

@@ -119,6 +119,9 @@ BAD = {
     "negative limit": (("limits", "current_A"), -1.0, "current_A"),
     "delay of two": (("delay_samples",), 2, "delay"),
     "no model": (("model",), None, "ii"),
+    "type a list": (("type",), [], "type"),
+    "gain of four hundred digits": (("gains", "integral"), 10**400, "integral"),
+    "of a later version": (("format",), "pmdc controller 2", "format"),
 }
 
 

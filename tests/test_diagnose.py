@@ -14,7 +14,7 @@ from scipy import stats
 from benchmarks import virtual_bench as vb
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import naming
-from pmdc_jax.diagnose.candidates import FULLER, TABLE, Scales
+from pmdc_jax.diagnose.candidates import FULLER, STARTS, TABLE, Scales
 from pmdc_jax.diagnose.compare import Fitted
 from pmdc_jax.diagnose.evidence import Block, products
 from pmdc_jax.diagnose.experiment import difference_between
@@ -79,7 +79,14 @@ def test_every_effect_has_a_row():
 @pytest.mark.parametrize("name", EFFECTS)
 def test_candidates_are_within_the_ranges(name):
     """Each shape is an effect that can be built, and of which a positive coefficient makes a legal one."""
-    for candidate in TABLE[name](name, SCALES):
+    candidates = TABLE[name](name, SCALES)
+    starts = STARTS[name](SCALES) if name in STARTS else []
+    assert candidates or starts
+    for values in starts:
+        assert values.keys() == EFFECTS[name].ranges.keys()
+        for field, r in EFFECTS[name].ranges.items():
+            assert r.lower < values[field] < r.upper
+    for candidate in candidates:
         assert candidate.effect == name
         for values in candidate.columns:
             EFFECTS[name](**{field: np.asarray(x) for field, x in values.items()})

@@ -11,6 +11,7 @@ from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, load_motor, save_motor
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.motor import PARAMETERS, Motor
+from pmdc_jax.motor_file import load_uncertainty
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 GOOD = {
@@ -82,9 +83,9 @@ BAD = {
     "not JSON": ("{'parameters': 1}", "JSON"),
     "cut off": (json.dumps(GOOD)[:50], "JSON"),
     "not text": (b"\xff\xfe\x00\x80", "JSON"),
-    "a list": ("[1, 2]", "parameters"),
-    "a number": ("3", "parameters"),
-    "null": ("null", "parameters"),
+    "a list": ("[1, 2]", "object"),
+    "a number": ("3", "object"),
+    "null": ("null", "object"),
     "no parameters": ("{}", "parameters"),
     "parameters in a list": (changed("parameters", to=[1, 2, 3]), "parameters"),
     **{f"lacks {name}": (lacking(name), name) for name in PARAMETERS},
@@ -140,3 +141,36 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
     for path in (tmp_path / "nowhere.json", tmp_path):
         with pytest.raises(InputError, match=path.name):
             load_motor(path)
+
+
+ONE = {"names": ["R", "Kb"], "matrix": [[1e-4, 0.0], [0.0, 1e-4]]}
+NO_COVARIANCE = {
+    "a text": "small",
+    "no names": {"matrix": ONE["matrix"]},
+    "names of lists": ONE | {"names": [["R"], ["Kb"]]},
+    "twice the same name": ONE | {"names": ["R", "R"]},
+    "unknown name": ONE | {"names": ["R", "magic"]},
+    "another size": ONE | {"matrix": [[1e-4]]},
+    "a text within": ONE | {"matrix": [[1e-4, 0.0], [0.0, "x"]]},
+    "not a number": ONE | {"matrix": [[1e-4, 0.0], [0.0, float("nan")]]},
+    "beyond a double": ONE | {"matrix": [[1e-4, 0.0], [0.0, 10**400]]},
+    "negative variance": ONE | {"matrix": [[1e-4, 0.0], [0.0, -1e-4]]},
+    "not symmetric": ONE | {"matrix": [[1e-4, 1e-5], [0.0, 1e-4]]},
+}
+
+
+def test_a_covariance_is_read(tmp_path):
+    path = tmp_path / "motor.json"
+    path.write_text(json.dumps(GOOD | {"covariance": ONE, "status": {"L": "not_identifiable"}}))
+    found = load_uncertainty(path)
+    assert (found.names, found.undetermined) == (("R", "Kb"), ("L",))
+    assert found.covariance.tolist() == ONE["matrix"]
+
+
+@pytest.mark.parametrize("given", NO_COVARIANCE.values(), ids=NO_COVARIANCE.keys())
+def test_a_bad_covariance_is_refused(tmp_path, given):
+    path = tmp_path / "motor.json"
+    path.write_text(json.dumps(GOOD | {"covariance": given}))
+    with pytest.raises(InputError, match="covariance") as refusal:
+        load_uncertainty(path)
+    assert str(path) in str(refusal.value)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
+from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
 from ..files import write_text
+from ..json_file import finite_number, read_object
 from .controllers import CONTROLLERS, AbstractController, Number
 from .hardware import Hardware
 from .law import Law, Model
@@ -52,14 +53,8 @@ def load_controller(path: str | Path) -> Law:
 
     **Raises**: `InputError` where the file is missing, is not JSON, or lacks or misspells something.
     """
-    where = str(path)
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(where, f"cannot be read ({error.strerror})", MEND) from None
-    except ValueError as error:
-        raise InputError(where, f"is not JSON ({error})", MEND) from None
-    if not isinstance(content, dict) or content.get("type") not in CONTROLLERS:
+    where, content = str(path), read_object(path, FORMAT, MEND)
+    if str(content.get("type")) not in CONTROLLERS:
         raise InputError(where, "is not a controller: its type is unknown", MEND)
     limits = content.get("limits")
     limits = limits if isinstance(limits, dict) else {}
@@ -81,22 +76,16 @@ def load_controller(path: str | Path) -> Law:
     )
 
 
-def _numbers(where: str, given: Any, names) -> dict[str, float]:
+def _numbers(where: str, given: Any, names: Iterable[str]) -> dict[str, float]:
     given = given if isinstance(given, dict) else {}
-    return {name: _number(where, name, given.get(name)) for name in names}
-
-
-def _number(where: str, name: str, value: Any) -> float:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (number and math.isfinite(value)):
-        raise InputError(where, f"{name} is {value!r}, not a number", MEND)
-    return float(value)
+    return {name: finite_number(where, name, given.get(name), MEND) for name in names}
 
 
 def _positive(where: str, name: str, value: Any) -> float:
-    if _number(where, name, value) <= 0:
+    number = finite_number(where, name, value, MEND)
+    if number <= 0:
         raise InputError(where, f"{name} is {value!r}, not positive", MEND)
-    return float(value)
+    return number
 
 
 def _optional(where: str, name: str, value: Any) -> float | None:

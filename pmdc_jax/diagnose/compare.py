@@ -26,7 +26,6 @@ class Fitted(NamedTuple):
     model: Model
     squares: float
     criterion: float  # squares and the price of every parameter; less is better
-    white: Whitener
 
 
 class Comparison:
@@ -34,7 +33,7 @@ class Comparison:
 
     def __init__(self):
         self._filters: dict[Model, Whitener] = {}
-        self._fitted: dict[tuple[Model, int], Fitted] = {}
+        self._fitted: dict[tuple[Model, Whitener], Fitted] = {}
 
     def ranked(self, models: Sequence[Model], white: Whitener) -> list[Fitted]:
         """By the squares of what each leaves when fitted to residuals that a filter makes white, the best first.
@@ -46,20 +45,20 @@ class Comparison:
         fitted = [
             self.left(m, white)
             if m.polished.refined.fitness < FAR * least
-            else Fitted(m, np.inf, np.inf, white)
+            else Fitted(m, np.inf, np.inf)
             for m in models
         ]
         return sorted(fitted, key=lambda f: f.criterion)
 
     def left(self, model: Model, white: Whitener) -> Fitted:
         """A model fitted to what a filter makes white of what it leaves."""
-        key = model, id(white)
+        key = model, white
         if key not in self._fitted:
             given, polished = sharpened(model.given, model.polished, white, WORTH)
             squares = squares_of(given, polished)
             samples = np.count_nonzero(given.problem.tape.weight)
             price = len(given.problem.parameters.names) * np.log(samples)
-            self._fitted[key] = Fitted(model, squares, squares + price, white)
+            self._fitted[key] = Fitted(model, squares, squares + price)
         return self._fitted[key]
 
     def white(self, model: Model) -> Whitener:

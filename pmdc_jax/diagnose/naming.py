@@ -281,9 +281,9 @@ class Namer:
 
     def _rivals(self, chosen: Model, found: Seen) -> list[Model]:
         """Other sets that explain the runs as well, the best first."""
-        models = [m for m in self.refits.models.values() if m.is_possible or m is chosen]
+        models = [chosen, *(m for m in self.refits.models.values() if m.is_possible)]
         ranked = self.comparison.ranked(models, found.screen.white)
-        least = next(f.criterion for f in ranked if f.model.effects == chosen.effects)
+        least = next(f.criterion for f in ranked if f.model is chosen)
         margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.left < ALARM else 0.0)
         near = [f.model for f in ranked if f.criterion < least + margin]
         rivals = [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from attrs import frozen
 from jaxtyping import Bool, Float
 
 from .whitening import band, remembered
@@ -36,7 +37,8 @@ class Series(NamedTuple):
     kind: tuple[float, tuple[int, ...]]  # sample time and outputs: runs of a kind share a filter
 
 
-class Whitener(NamedTuple):
+@frozen(eq=False)  # one is the same as itself alone
+class Whitener:
     """For every run a filter, shared by runs of a kind, and the matrix that gives what is left unit variance."""
 
     filters: list[Float[np.ndarray, "order outputs outputs"]]

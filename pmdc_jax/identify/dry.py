@@ -65,7 +65,9 @@ def of_friction(missing: Missing | None, found: Identification) -> Iterator[str]
     """What to say of the friction that a fit lacks, if some parameter makes up for it by more than its own error."""
     if missing is None or found.covariance is None:
         return
-    errors = np.sqrt(np.diag(found.covariance))
+    errors = np.sqrt(np.diag(found.covariance))[
+        : len(missing.moved)
+    ]  # of the sought, not of the tied
     moved = np.abs(missing.moved) / np.where(errors > 0, errors, np.inf)
     most = int(np.argmax(moved))
     if moved[most] > MAKES_UP:

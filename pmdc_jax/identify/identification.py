@@ -88,7 +88,8 @@ class Identification:
     seconds: Mapping[str, float]
     search: Search
     findings: tuple[Finding, ...]
-    # of log-parameters, in the order of `covariance_names`; zero rows for parameters that are fixed
+    # of the coordinates (logarithms of positive parameters, others as they are), in the order of `covariance_names`;
+    # zero rows for parameters that are fixed
     covariance: np.ndarray = field(repr=False)
     covariance_names: tuple[str, ...] = ()
     messages: tuple[str, ...] = ()

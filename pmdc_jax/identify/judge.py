@@ -42,9 +42,9 @@ def judge(given: Prepared, solved: Solved) -> Identification:
     parameters = problem.parameters
     info = information_of(problem, polished)
     chosen = _tidy(problem, polished, info)
-    for k in _vanished(parameters, info):
-        if (lifted := _lifted(problem, chosen, k)) is not None:
-            info = information_of(problem, lifted)
+    lifted = [_lifted(problem, chosen, k) for k in _vanished(parameters, info)]
+    alike = [information_of(problem, fit) for fit in lifted if fit is not None]
+    info = max(info, *alike, key=lambda i: i.hidden.sum()) if alike else info
     best = chosen.refined
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
@@ -52,6 +52,7 @@ def judge(given: Prepared, solved: Solved) -> Identification:
     fit = _fits(
         given.runs, given.roles, problem.tape, np.asarray(ended.seen), np.asarray(unknowns.local)
     )
+    names, covariance = parameters.with_tied(info.covariance)
     noise = {name: white_noise(_residuals(fit, name)) for name in ("current", "speed")}
     return Identification(
         motor=_plain(parameters(best.unknowns.coordinates)),
@@ -64,8 +65,8 @@ def judge(given: Prepared, solved: Solved) -> Identification:
         seconds=solved.seconds,
         search=solved.search,
         findings=given.findings,
-        covariance=info.covariance,
-        covariance_names=parameters.names,
+        covariance=covariance,
+        covariance_names=names,
         messages=_messages(given, solved, chosen is not polished),
     )
 

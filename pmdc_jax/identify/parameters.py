@@ -87,6 +87,14 @@ class Parameters(eqx.Module):
         k = self.names.index(source)
         return float(np.exp(coordinates[k]) if self.logarithmic[k] else coordinates[k])
 
+    def with_tied(
+        self, covariance: Float[np.ndarray, "n n"]
+    ) -> tuple[tuple[str, ...], Float[np.ndarray, "m m"]]:
+        """Names and covariance of the sought coordinates and of those that are tied to one of them."""
+        tied = {target: source for target, source in self.ties if source in self.names}
+        rows = [self.names.index(tied.get(name, name)) for name in (*self.names, *tied)]
+        return (*self.names, *tied), covariance[np.ix_(rows, rows)]
+
 
 def unit_of(name: str) -> str:
     """Unit of a parameter of the motor or of an effect."""

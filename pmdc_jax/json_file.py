@@ -1,0 +1,46 @@
+"""JSON files that people may have edited: what cannot be right is refused in one message."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from .errors import InputError
+
+
+def read_object(path: str | Path, form: str, mend: str) -> dict[str, Any]:
+    """The object that a file holds.
+
+    **Arguments**: `form`, what its "format" must be if it has one; `mend`, how to get a good file.
+
+    **Raises**: `InputError` where the file is missing, cannot be read, is no JSON object, or of another format.
+    """
+    where = str(path)
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(where, "there is no such file", mend) from None
+    except OSError as error:
+        what = f"cannot be read ({error.strerror})"
+        raise InputError(where, what, "Check path and permissions") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(where, f"is not JSON ({error})", mend) from None
+    if not isinstance(content, dict):
+        raise InputError(where, "is not a JSON object", mend)
+    if content.get("format", form) != form:
+        what = f'"format" is {content["format"]!r}, not {form!r}'
+        raise InputError(where, what, "Update pmdc_jax, or write the file with this version")
+    return content
+
+
+def finite_number(where: str, name: str, value: object, mend: str) -> float:
+    """A number of a file; raises `InputError` for anything else, and for one that no double holds."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            if math.isfinite(value):
+                return float(value)
+        except OverflowError:  # JSON holds whole numbers of any length
+            raise InputError(where, f"{name} is beyond what a double holds", mend) from None
+    raise InputError(where, f"{name} is {value!r}, not a number", mend)
