@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from .errors import InputError
+from .progress import ReportProgress
 
 if TYPE_CHECKING:
     from .control.tuning import Tuning
     from .diagnose.diagnosis import Diagnosis
-    from .report.terminal import ReportProgress
 
 SAMPLE = Path(__file__).parent / "sample"
 TRAINING = ("staircase", "prbs", "triangle", "loaded")

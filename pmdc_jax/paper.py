@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .progress import ReportProgress
+
 if TYPE_CHECKING:
-    from .report.terminal import ReportProgress
     from .wheelchair import Paper
 
 

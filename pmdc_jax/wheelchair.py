@@ -12,11 +12,11 @@ import numpy as np
 from attrs import field, frozen
 
 from .motor import PARAMETERS, Motor
+from .progress import ReportProgress, silent
 
 if TYPE_CHECKING:
     from .control.loop import Response
     from .control.tuning import Tuning
-    from .report.terminal import ReportProgress
 
 TABLE_1 = {"R": 0.157378, "L": 0.0003137, "Kb": 0.0492, "Kt": 0.0501, "J": 0.000466, "f": 0.0002546}
 PRINTED = Motor(**{name: np.asarray(TABLE_1[name]) for name in PARAMETERS}, effects=())
@@ -95,15 +95,12 @@ def done_again(progress: ReportProgress | None = None) -> Paper:
     from .control.requirements import reach
     from .control.tuning import tune
 
-    def say(doing: str, fraction: float) -> None:
-        if progress:
-            progress(doing, fraction=fraction)
-
-    say("recovering Table 1", 0.0)
+    report = progress or silent
+    report("recovering Table 1", fraction=0.0)
     recovered = (by_the_papers_ga(), by_ours())
     tunings = {}
     for k, kind in enumerate(TABLE_2):
-        say(f"tuning {kind}", 0.4 + 0.15 * k)
+        report(f"tuning {kind}", fraction=0.4 + 0.15 * k)
         tunings[kind] = tune(
             PRINTED,
             kind,
@@ -116,7 +113,7 @@ def done_again(progress: ReportProgress | None = None) -> Paper:
         volts: fastest_settling(PRINTED, SETPOINT, volts) or float("nan")
         for volts in (24.0, 25.0, 26.0, 28.0, 30.0, 36.0, 48.0)
     }
-    say("simulating Figs 7 and 8", 0.9)
+    report("simulating Figs 7 and 8", fraction=0.9)
     steps = {kind: both_steps(tuning) for kind, tuning in tunings.items()}
     gains = {kind: row.gains for kind, row in TABLE_2.items() if row.gains}
     as_printed = {kind: simulated_as_printed(*found) for kind, found in gains.items()}

@@ -19,6 +19,7 @@ BELOW = {
     "files": {"errors"},
     "compiled": {"compilation_cache", "files"},
     "precision": set(),
+    "progress": set(),
     "threads": set(),
     "units": {"errors"},
     "columns": {"errors", "units"},
@@ -50,6 +51,7 @@ BELOW = {
         "motor",
         "motor_file",
         "precision",
+        "progress",
         "simulate",
     },
     "identify": {
@@ -60,6 +62,7 @@ BELOW = {
         "errors",
         "motor",
         "precision",
+        "progress",
         "recording",
         "simulate",
         "unmeasured",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
 
 import attrs
 import equinox as eqx
@@ -17,6 +16,7 @@ from ..compiled import make_room
 from ..motor import Motor
 from ..motor_file import Uncertainty
 from ..precision import double_precision
+from ..progress import ReportProgress, silent
 from ..simulate.solver import steps_within
 from .classical import ziegler_nichols
 from .controllers import AbstractController
@@ -30,9 +30,6 @@ from .margins import Margins, margins
 from .objective import PARTS, Task
 from .specification import MAX_SENSITIVITY, Asked, Specification
 from .spread import drawn_motors, even_spread
-
-if TYPE_CHECKING:
-    from ..report.terminal import ReportProgress
 
 # Motors that take part in the tuning, and that judge it afterwards.
 TUNED_ON, JUDGED_ON = 32, 256
@@ -176,13 +173,12 @@ def tune(
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
     specification = asked.completed(motor)
     motors, judges = _motors(motor, uncertainty, spread, seed)
-    if progress:
-        progress("tuning from many starts")
+    report = progress or silent
+    report("tuning from many starts")
     white = np.random.default_rng(seed).standard_normal(PARTS * specification.samples)
     task = _task(specification, motor, white)
     law = Law.of(_tuned(specification, task, motors, white, seed, starts), task.hardware, motor)
-    if progress:
-        progress("judging the loop", fraction=0.8)
+    report("judging the loop", fraction=0.8)
     result = Tuning(
         law=law,
         motor=motor,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import attrs
 import numpy as np
@@ -18,6 +17,7 @@ from ..identify.noise import FLOOR
 from ..identify.prepare import prepare
 from ..identify.solve import Solved, solve
 from ..precision import double_precision
+from ..progress import ReportProgress, silent
 from ..recording import Runs
 from .diagnosis import (
     Detectable,
@@ -36,9 +36,6 @@ from .model import model_of
 from .naming import Namer, Naming
 from .screen import Screen, log_chance
 from .seen import ALARM
-
-if TYPE_CHECKING:
-    from ..report.terminal import ReportProgress
 
 # A hat of a curve whose misfit is so many standard errors is part of a region
 CLEAR = 4.0
@@ -70,7 +67,7 @@ def diagnose(
     **Raises**: `InputError` on data or arguments that cannot give an answer.
     """
     began = time.perf_counter()
-    report = progress or (lambda *args, **kwargs: None)
+    report = progress or silent
     make_room()
     report("checking the recordings")
     given = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)

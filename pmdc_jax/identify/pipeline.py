@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import attrs
 
 from ..compiled import make_room
 from ..precision import double_precision
+from ..progress import ReportProgress, silent
 from ..recording import Runs
 from .colour import whitener
 from .dry import missing_friction, of_friction
@@ -19,9 +19,6 @@ from .parameters import effects_named
 from .prepare import prepare
 from .sharpen import last_fit, residuals_of
 from .solve import solve
-
-if TYPE_CHECKING:
-    from ..report.terminal import ReportProgress
 
 
 @double_precision
@@ -50,7 +47,7 @@ def identify(
     **Raises**: `InputError` on data or arguments that cannot give an answer.
     """
     began = time.perf_counter()
-    report = progress or (lambda *args, **kwargs: None)
+    report = progress or silent
     make_room()
     report("checking the recordings")
     given = prepare(

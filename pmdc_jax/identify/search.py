@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,11 +14,9 @@ from jaxtyping import Array
 
 from ..compiled import quickly_compiled
 from ..errors import InputError
+from ..progress import ReportProgress
 from ..simulate import Tape, squared_errors
 from .parameters import Parameters
-
-if TYPE_CHECKING:
-    from ..report.terminal import ReportProgress
 
 
 class Method(NamedTuple):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..progress import ReportProgress, silent
 from ..simulate import Tape
 from ..threads import beside, side_by_side_until
 from .averaged import without_averaging
@@ -28,9 +29,6 @@ from .steps import with_steps
 from .timing import how_unlikely, likelier_timings, with_timing
 from .turning import turned
 from .unfelt import without_unfelt
-
-if TYPE_CHECKING:
-    from ..report.terminal import ReportProgress
 
 STARTS = 4
 # Two refinements found the same optimum if their fitness agrees to this share.
@@ -98,7 +96,7 @@ def searched(
     **Returns**: the problem, its rotor turned as the fit says where a torque depends on the angle, and the fit.
     """
     began = time.perf_counter()
-    report = progress or (lambda *args, **kwargs: None)
+    report = progress or silent
     problem = given.problem
     searching = Tape.from_recordings(given.training, straight=given.straight)
     noise, sought = np.asarray(problem.noise), _where_effects_show(given)

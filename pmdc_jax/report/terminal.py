@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 from attrs import evolve
 from rich.console import Console, Group, RenderableType
@@ -13,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..identify.identification import Identification
+from ..progress import ReportProgress
 from ..recording import Finding
 from .notation import enumerate_words, percent, significant, write_estimate
 from .summary import runs_in_order, status_word, summary
@@ -20,14 +20,6 @@ from .summary import runs_in_order, status_word, summary
 STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
 SEVERITY_STYLES = {"error": "red", "warning": "yellow"}
 PIPE_WIDTH = 100  # rich would fold tables at 80 columns where there is no terminal
-
-
-class ReportProgress(Protocol):
-    """What long work calls now and then: what it does, how good it is, how far it got (0 to 1)."""
-
-    def __call__(
-        self, doing: str, fitness: float | None = None, fraction: float | None = None
-    ) -> None: ...
 
 
 def print_identification(identification: Identification) -> None:
