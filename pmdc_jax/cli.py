@@ -219,31 +219,29 @@ def tune(
     from .files import check_outputs
 
     check_outputs({"--save": save, "--json": json, "--report": report}, [motor])
-    from .control.tuning import tune
+    from .control.specification import LoopRequirements
+    from .control.tuning import design
     from .motor_file import load_motor, load_uncertainty
     from .report.terminal import print_messages, print_tables, progress
 
     subject, uncertainty = load_motor(motor), load_uncertainty(motor)
+    requirements = LoopRequirements(
+        controller=controller,
+        setpoint=setpoint,
+        voltage_limit=voltage_limit,
+        current_limit=current_limit,
+        sample_time=sample_time,
+        max_overshoot=max_overshoot,
+        max_settling=max_settling,
+        load_torque=load_torque,
+        delay=delay,
+        speed_step=speed_step,
+        speed_noise=speed_noise,
+        measures_current=current_sensor,
+        spread=None if spread is None else spread / 100,
+    )
     with progress() as on_progress:
-        tuning = tune(
-            subject,
-            controller,
-            setpoint=setpoint,
-            voltage_limit=voltage_limit,
-            current_limit=current_limit,
-            sample_time=sample_time,
-            max_overshoot=max_overshoot,
-            max_settling=max_settling,
-            load_torque=load_torque,
-            delay=delay,
-            speed_step=speed_step,
-            speed_noise=speed_noise,
-            measures_current=current_sensor,
-            uncertainty=uncertainty,
-            spread=None if spread is None else spread / 100,
-            seed=seed,
-            progress=on_progress,
-        )
+        tuning = design(subject, requirements, uncertainty, seed=seed, progress=on_progress)
     from .report.tuning import tuning_json, tuning_tables, write_tuning_report
 
     print_messages(tuning.messages)

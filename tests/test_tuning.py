@@ -10,11 +10,11 @@ from functools import cache
 import jax
 import numpy as np
 import pytest
-from attrs import evolve, fields
+from attrs import evolve
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, cli, load_controller, load_uncertainty, save_motor, tune
-from pmdc_jax.control.specification import Asked
+from pmdc_jax.control.specification import LoopRequirements
 from pmdc_jax.control.tuning import Tuning
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.report.tuning import summary, tuning_json, write_tuning_report
@@ -104,11 +104,11 @@ def test_a_loop_that_misses_is_said_to_miss():
 
 @pytest.mark.parametrize(("sample_time", "noted"), [(1e-3, False), (0.02, True)])
 def test_samples_too_far_apart_are_noted(sample_time, noted):
-    left_open = dict.fromkeys(f.name for f in fields(Asked))
-    given = {"controller": "pi", "setpoint": 481.0, "voltage_limit": 30.0, "delay": 1}
-    numbers = {"sample_time": sample_time, "max_overshoot": 1.0, "speed_noise": 0.0}
+    requirements = LoopRequirements(
+        "pi", setpoint=481.0, voltage_limit=30.0, sample_time=sample_time
+    )
     with jax.enable_x64(True):
-        notes = Asked(**left_open | given | numbers).completed(MOTOR).notes
+        notes = requirements.completed(MOTOR).notes
     assert any("takes 2.2 samples of 0.02 s" in note for note in notes) == noted
 
 
@@ -168,23 +168,25 @@ def test_the_command_refuses_in_one_line(motor_file, capsys):
 
 @pytest.mark.slow
 def test_the_command_writes_what_it_is_asked_for(motor_file, capsys, monkeypatch):
-    asked = {}
+    given = {}
 
-    def fake(motor, controller, **options):
-        asked.update(options, controller=controller, R=float(motor.R))
+    def fake(motor, requirements, uncertainty, **options):
+        given.update(motor=motor, requirements=requirements, uncertainty=uncertainty, **options)
         return example()
 
-    monkeypatch.setattr(importlib.import_module("pmdc_jax.control.tuning"), "tune", fake)
+    monkeypatch.setattr(importlib.import_module("pmdc_jax.control.tuning"), "design", fake)
     arguments = (
         "tune motor.json --controller pid --setpoint 481 --voltage-limit 30 --current-limit 60"
         " --sample-time 1e-3 --max-overshoot 0.5 --max-settling 0.2 --load-torque 0.3 --spread 10"
         " --no-current-sensor --save controller.json --json out.json --report report.html --seed 3"
     )
     assert cli.main(arguments.split()) == 0
-    assert asked["R"] == PAPER["R"]
-    assert asked["spread"] == pytest.approx(0.1)
-    assert not asked["measures_current"]
-    assert (asked["load_torque"], asked["max_settling"], asked["seed"]) == (0.3, 0.2, 3)
+    assert PAPER["R"] == given["motor"].R
+    assert (given["uncertainty"], given["seed"]) == (None, 3)
+    requirements = given["requirements"]
+    assert requirements.spread == pytest.approx(0.1)
+    assert not requirements.measures_current
+    assert (requirements.load_torque, requirements.max_settling) == (0.3, 0.2)
     out, _ = capsys.readouterr()
     assert "PID controller" in out
     assert "fastest possible" in out
@@ -198,7 +200,7 @@ def test_the_command_writes_what_it_is_asked_for(motor_file, capsys, monkeypatch
 @pytest.mark.slow
 def test_json_alone_goes_to_standard_output(motor_file, capsys, monkeypatch):
     tuning = importlib.import_module("pmdc_jax.control.tuning")
-    monkeypatch.setattr(tuning, "tune", lambda *_, **__: example())
+    monkeypatch.setattr(tuning, "design", lambda *_, **__: example())
     assert cli.main(["tune", "motor.json", "--controller", "pid", "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out) == tuning_json(example())
 

@@ -18,33 +18,37 @@ from .loop import REMEMBERED
 from .requirements import check_reachable, check_time, reach, spare_torque
 from .steady import steady_state
 
-NOMINAL_VOLTAGE = 24.0
-MAX_SENSITIVITY = 2.0
-MOST_SAMPLES = 20_000  # of one step
-FEW_SAMPLES = 10  # of the fastest settling
+NOMINAL_VOLTAGE = 24.0  # V, where neither limit nor set point is given
+VOLTAGE_RESERVE = 1.25  # voltage limit by default, over the voltage that holds the set point
+SETPOINT_SHARE = 0.8  # set point by default, over the speed that the voltage limit reaches
+MAX_SENSITIVITY = 2.0  # of the loop by default, over any frequency
+LONGEST_SAMPLE_TIME = 1e-3  # s, of those chosen by default
+SAMPLES_PER_SETTLING = 40  # samples by default in the fastest settling, at least
+FEW_SAMPLES = 10  # samples in the fastest settling; with fewer the loop loses much
+MOST_SAMPLES = 20_000  # samples of one step
 
 
 @frozen
-class Asked:
-    """What a user says, None for what is left open. The fields are the arguments of `tune` of the same names.
+class LoopRequirements:
+    """What a user asks of a loop, None for what is left open. The fields are the arguments of `tune` of the same names.
 
     **Raises**: `InputError` for what cannot be meant, naming the option.
     """
 
-    controller: str
-    setpoint: float | None
-    voltage_limit: float | None
-    current_limit: float | None
-    sample_time: float | None
-    max_overshoot: float
-    max_settling: float | None
-    load_torque: float | None
-    delay: int
-    speed_step: float | None
-    speed_noise: float
-    measures_current: bool
-    spread: float | None
-    max_sensitivity: float | None
+    controller: str = "pid"
+    setpoint: float | None = None
+    voltage_limit: float | None = None
+    current_limit: float | None = None
+    sample_time: float | None = None
+    max_overshoot: float = 1.0
+    max_settling: float | None = None
+    load_torque: float | None = None
+    delay: int = 1
+    speed_step: float | None = None
+    speed_noise: float = 0.0
+    measures_current: bool = True
+    spread: float | None = None
+    max_sensitivity: float | None = MAX_SENSITIVITY
 
     def __attrs_post_init__(self) -> None:
         if self.controller not in CONTROLLERS:
@@ -67,44 +71,56 @@ class Asked:
 
         **Raises**: `InputError` where no controller can meet it, with the limit.
         """
-        notes = []
-        volts, setpoint = self.voltage_limit, self.setpoint
-        if volts is None:
-            volts = NOMINAL_VOLTAGE
-            if setpoint is not None:
-                volts = _three_digits(1.25 * abs(float(steady_state(motor, setpoint)[1])))
-            notes.append(f"no voltage limit given: {volts:g} V")
-        if setpoint is None:
-            setpoint = _three_digits(0.8 * reach(motor, volts))
-            notes.append(
-                f"no set point given: {setpoint:g} rad/s, 80 % of what the voltage reaches"
-            )
-        limits = motor, setpoint, volts, self.current_limit
+        setpoint, voltage_limit, chosen_limits = self._operating_point(motor)
+        limits = motor, setpoint, voltage_limit, self.current_limit
         check_reachable(*limits, 0.0)
         if self.load_torque:
             check_reachable(*limits, self.load_torque, "--load-torque")
         fastest = check_time(self.max_settling, fastest_settling(*limits), setpoint)
-        sample_time, better = self.sample_time, min(1e-3, _round_number(fastest / 40))
-        if sample_time is None:
-            sample_time = better
-            notes.append(f"no sample time given: {sample_time:g} s")
-        elif sample_time > fastest / FEW_SAMPLES:
-            taken = f"{fastest / sample_time:.2g} samples of {sample_time:g} s"
-            notes.append(
-                f"the fastest settling, {fastest:.3g} s, takes {taken}:"
-                f" a sample time of {better:g} s would lose less"
-            )
+        sample_time, chosen_sampling = self._sampling(fastest)
         _check_sensor(motor, sample_time)
         return Specification(
             asked=self,
             setpoint=setpoint,
-            voltage_limit=volts,
+            voltage_limit=voltage_limit,
             sample_time=sample_time,
             load_torque=spare_torque(*limits) if self.load_torque is None else self.load_torque,
             fastest=fastest,
             samples=_samples(motor, fastest, sample_time, self.delay),
-            notes=tuple(notes),
+            notes=(*chosen_limits, *chosen_sampling),
         )
+
+    def _operating_point(self, motor: Motor) -> tuple[float, float, list[str]]:
+        """Set point (rad/s) and voltage limit (V), and which of them were chosen here, in words."""
+        notes = []
+        voltage_limit, setpoint = self.voltage_limit, self.setpoint
+        if voltage_limit is None:
+            voltage_limit = NOMINAL_VOLTAGE
+            if setpoint is not None:
+                held_by = abs(float(steady_state(motor, setpoint)[1]))
+                voltage_limit = _three_digits(VOLTAGE_RESERVE * held_by)
+            notes.append(f"no voltage limit given: {voltage_limit:g} V")
+        if setpoint is None:
+            setpoint = _three_digits(SETPOINT_SHARE * reach(motor, voltage_limit))
+            notes.append(
+                f"no set point given: {setpoint:g} rad/s, 80 % of what the voltage reaches"
+            )
+        return setpoint, voltage_limit, notes
+
+    def _sampling(self, fastest: float) -> tuple[float, list[str]]:
+        """Sample time (s) for a loop that settles at best within `fastest` (s), and a remark where it was left open or
+        is long."""
+        suitable = min(LONGEST_SAMPLE_TIME, _round_number(fastest / SAMPLES_PER_SETTLING))
+        if self.sample_time is None:
+            return suitable, [f"no sample time given: {suitable:g} s"]
+        if self.sample_time <= fastest / FEW_SAMPLES:
+            return self.sample_time, []
+        taken = f"{fastest / self.sample_time:.2g} samples of {self.sample_time:g} s"
+        remark = (
+            f"the fastest settling, {fastest:.3g} s, takes {taken}:"
+            f" a sample time of {suitable:g} s would lose less"
+        )
+        return self.sample_time, [remark]
 
 
 @frozen
@@ -115,7 +131,7 @@ class Specification:
     settling time within the limits, s; `samples` of each part of the task; `notes`, what was chosen, in words.
     """
 
-    asked: Asked
+    asked: LoopRequirements
     setpoint: float
     voltage_limit: float
     sample_time: float

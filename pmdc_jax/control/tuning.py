@@ -28,13 +28,19 @@ from .law import Law
 from .loop import Response
 from .margins import Margins, margins
 from .objective import PARTS, Task
-from .specification import MAX_SENSITIVITY, Asked, Specification
+from .specification import MAX_SENSITIVITY, LoopRequirements, Specification
 from .spread import drawn_motors, even_spread
 
-# Motors that take part in the tuning, and that judge it afterwards.
-TUNED_ON, JUDGED_ON = 32, 256
+TUNED_ON = 32  # drawn motors that take part in the tuning
+JUDGED_ON = 256  # others, that judge it afterwards
 # Noise of the speed that a loop is tuned with at least, over the set point: gains that never saw any would shake.
 TUNING_NOISE = 2e-4
+# Overshoot allowed at least in the cost, %: its excess is weighed over what is allowed.
+LEAST_OVERSHOOT = 0.01
+# What is told of: the overshoot of a small step, over what the whole step may overshoot or does; and a peak of the
+# sensitivity, over the default limit.
+NOTABLE_OVERSHOOT = 1.2
+NOTABLE_SENSITIVITY = 1.1
 
 
 @frozen
@@ -44,13 +50,13 @@ class Tuning:
     law: Law
     motor: Motor
     task: Task
-    asked: Asked
+    asked: LoopRequirements
     margins: Margins
     candidates: tuple[Candidate, ...]  # ours first
     response: Response = field(repr=False, converter=lambda r: Response(*map(np.asarray, r)))
     bundle: np.ndarray | None = field(repr=False)  # (motors, samples) rad/s, of the drawn motors
     seed: int
-    seconds: Mapping[str, float]
+    seconds: Mapping[str, float] = field(factory=dict)
     messages: tuple[str, ...] = ()
 
     @property
@@ -112,7 +118,6 @@ class Tuning:
         return self.asked.max_settling is None or settling <= self.asked.max_settling
 
 
-@double_precision
 def tune(
     motor: Motor,
     controller: str = "pid",
@@ -152,9 +157,7 @@ def tune(
 
     **Raises**: `InputError` for a specification that no controller can meet, with the limit.
     """
-    begin = time.perf_counter()
-    make_room()
-    asked = Asked(
+    requirements = LoopRequirements(
         controller=controller,
         setpoint=setpoint,
         voltage_limit=voltage_limit,
@@ -170,32 +173,39 @@ def tune(
         spread=spread,
         max_sensitivity=max_sensitivity,
     )
-    motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
-    specification = asked.completed(motor)
-    motors, judges = _motors(motor, uncertainty, spread, seed)
+    return design(motor, requirements, uncertainty, starts, seed, progress)
+
+
+@double_precision
+def design(
+    motor: Motor,
+    requirements: LoopRequirements,
+    uncertainty: Uncertainty | None = None,
+    starts: int = STARTS,
+    seed: int = 0,
+    progress: ReportProgress | None = None,
+) -> Tuning:
+    """`tune` for requirements that stand together; the other arguments are those of `tune`.
+
+    **Raises**: `InputError` for requirements that no controller can meet, with the limit.
+    """
+    begin = time.perf_counter()
+    make_room()
     report = progress or silent
+    motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
+    specification = requirements.completed(motor)
+    motors, judges = _motors(motor, uncertainty, requirements.spread, seed)
     report("tuning from many starts")
-    white = np.random.default_rng(seed).standard_normal(PARTS * specification.samples)
-    task = _task(specification, motor, white)
-    law = Law.of(_tuned(specification, task, motors, white, seed, starts), task.hardware, motor)
+    unit_noise = np.random.default_rng(seed).standard_normal(PARTS * specification.samples)
+    task = _task(specification, motor, unit_noise)
+    controller = _tuned(specification, task, motors, unit_noise, seed, starts)
     report("judging the loop", fraction=0.8)
-    result = Tuning(
-        law=law,
-        motor=motor,
-        task=task,
-        asked=asked,
-        margins=margins(motor, law),
-        candidates=(
-            judged("tuned", task, motor, law.controller, judges),
-            *_rivals(task, motor, controller, judges),
-        ),
-        response=simulated(task, motor, law),
-        bundle=None if judges is None else np.asarray(speeds(task, judges, law)),
-        seed=seed,
+    result = _judged(specification, task, motor, controller, judges, seed)
+    return attrs.evolve(
+        result,
+        messages=(*specification.notes, *_undetermined(uncertainty), *_verdicts(result)),
         seconds={"total": time.perf_counter() - begin},
     )
-    notes = (*specification.notes, *_undetermined(uncertainty), *_verdicts(result))
-    return attrs.evolve(result, messages=notes)
 
 
 def robustness(tuning: Tuning, spread: float, seed: int) -> Robustness | None:
@@ -205,7 +215,7 @@ def robustness(tuning: Tuning, spread: float, seed: int) -> Robustness | None:
         return judged("tuned", tuning.task, tuning.motor, tuning.controller, judges).robust
 
 
-def _task(specification: Specification, motor: Motor, white: np.ndarray) -> Task:
+def _task(specification: Specification, motor: Motor, unit_noise: np.ndarray) -> Task:
     """What is simulated and judged; its noise has the size of the sensor's."""
     asked = specification.asked
     stall = float(specification.voltage_limit / motor.R)
@@ -215,11 +225,11 @@ def _task(specification: Specification, motor: Motor, white: np.ndarray) -> Task
         setpoint=jnp.asarray(specification.setpoint),
         load=jnp.asarray(specification.load_torque),
         limit=jnp.asarray(specification.fastest),
-        max_overshoot=jnp.asarray(max(asked.max_overshoot, 0.01)),
+        max_overshoot=jnp.asarray(max(asked.max_overshoot, LEAST_OVERSHOOT)),
         max_sensitivity=None
         if asked.max_sensitivity is None
         else jnp.asarray(asked.max_sensitivity),
-        noise=jnp.asarray(asked.speed_noise * white),
+        noise=jnp.asarray(asked.speed_noise * unit_noise),
         step_samples=specification.samples,
         substeps=int(steps_within(motor, specification.sample_time, jnp.asarray(most))),
     )
@@ -229,7 +239,7 @@ def _tuned(
     specification: Specification,
     task: Task,
     motors: Motor,
-    white: np.ndarray,
+    unit_noise: np.ndarray,
     seed: int,
     starts: int,
 ) -> AbstractController:
@@ -239,10 +249,37 @@ def _tuned(
     period, kind = task.hardware.sample_time, specification.asked.controller
     space = GainSpace(kind, stiffness, task.limit, period, nominal, task.setpoint)
     least = TUNING_NOISE * abs(specification.setpoint)
-    shaken = jnp.asarray(max(specification.asked.speed_noise, least) * white)
+    shaken = jnp.asarray(max(specification.asked.speed_noise, least) * unit_noise)
     noisy = eqx.tree_at(lambda t: t.noise, task, shaken)
     coordinates, _ = tuned(noisy, space, motors, seed, starts)
     return space.controller(jnp.asarray(coordinates[0]))
+
+
+def _judged(
+    specification: Specification,
+    task: Task,
+    motor: Motor,
+    controller: AbstractController,
+    judges: Motor | None,
+    seed: int,
+) -> Tuning:
+    """The tuned controller and what the textbook would have chosen, by exact metrics."""
+    law = Law.of(controller, task.hardware, motor)
+    asked = specification.asked
+    return Tuning(
+        law=law,
+        motor=motor,
+        task=task,
+        asked=asked,
+        margins=margins(motor, law),
+        candidates=(
+            judged("tuned", task, motor, controller, judges),
+            *_rivals(task, motor, asked.controller, judges),
+        ),
+        response=simulated(task, motor, law),
+        bundle=None if judges is None else np.asarray(speeds(task, judges, law)),
+        seed=seed,
+    )
 
 
 def _motors(
@@ -275,28 +312,38 @@ def _undetermined(uncertainty: Uncertainty | None) -> Iterator[str]:
         )
 
 
-def _verdicts(result: Tuning) -> list[str]:
+def _verdicts(result: Tuning) -> Iterator[str]:
     """What of the specification is not met, and what is to be minded."""
-    messages = []
-    overshoot, settling = result.metrics["Overshoot"], result.metrics["SettlingTime"]
-    if settling is None:
-        messages.append("the loop does not settle: try another controller or a shorter sample time")
-    elif result.asked.max_settling is not None and settling > result.asked.max_settling:
-        messages.append(
-            f"settling takes {settling:.4g} s, longer than the {result.asked.max_settling:g} s asked for"
-        )
-    if overshoot is not None and overshoot > result.asked.max_overshoot:
-        messages.append(
-            f"overshoot is {overshoot:.3g} %, above the {result.asked.max_overshoot:g} % asked for"
-        )
-    small, step = result.candidates[0].small["Overshoot"] or 0.0, SMALL * result.setpoint
-    allowed = 1.2 * max(result.asked.max_overshoot, overshoot or 0.0)
-    if small > allowed and small * abs(step) > 100 * (result.asked.speed_step or 0.0):
-        messages.append(
-            f"a step of {step:.3g} rad/s, which no limit slows down, overshoots by {small:.3g} %: tune for a smaller"
-            " set point if such steps matter"
-        )
+    yield from _unmet(result)
+    yield from _small_step_remark(result)
     peak = result.margins.sensitivity_peak
-    if peak is not None and peak > 1.1 * MAX_SENSITIVITY:
-        messages.append(f"the loop has thin margins: its sensitivity reaches {peak:.2f}")
-    return messages
+    if peak is not None and peak > NOTABLE_SENSITIVITY * MAX_SENSITIVITY:
+        yield f"the loop has thin margins: its sensitivity reaches {peak:.2f}"
+
+
+def _unmet(result: Tuning) -> Iterator[str]:
+    """Where settling or overshoot miss what was asked for."""
+    overshoot, settling = result.metrics["Overshoot"], result.metrics["SettlingTime"]
+    max_settling, max_overshoot = result.asked.max_settling, result.asked.max_overshoot
+    if settling is None:
+        yield "the loop does not settle: try another controller or a shorter sample time"
+    elif max_settling is not None and settling > max_settling:
+        yield f"settling takes {settling:.4g} s, longer than the {max_settling:g} s asked for"
+    if overshoot is not None and overshoot > max_overshoot:
+        yield f"overshoot is {overshoot:.3g} %, above the {max_overshoot:g} % asked for"
+
+
+def _small_step_remark(result: Tuning) -> Iterator[str]:
+    """Whether a small step overshoots notably more than the step to the set point, and by more than the sensor's
+    quantum alone explains."""
+    overshoot = result.candidates[0].small["Overshoot"] or 0.0
+    step = SMALL * result.setpoint
+    allowed = NOTABLE_OVERSHOOT * max(
+        result.asked.max_overshoot, result.metrics["Overshoot"] or 0.0
+    )
+    quantum = result.asked.speed_step or 0.0
+    if overshoot > allowed and overshoot / 100 * abs(step) > quantum:
+        yield (
+            f"a step of {step:.3g} rad/s, which no limit slows down, overshoots by {overshoot:.3g} %: tune for a"
+            " smaller set point if such steps matter"
+        )
