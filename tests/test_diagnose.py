@@ -20,7 +20,7 @@ from pmdc_jax.diagnose.evidence import Block, products
 from pmdc_jax.diagnose.experiment import difference_between
 from pmdc_jax.diagnose.kinship import are_rivals, is_within
 from pmdc_jax.diagnose.library import Library
-from pmdc_jax.diagnose.model import Fit, Model, model_of
+from pmdc_jax.diagnose.model import Model, RunSeries, model_of
 from pmdc_jax.diagnose.naming import Namer, Naming
 from pmdc_jax.diagnose.periodic import common_line, spectrum
 from pmdc_jax.diagnose.pipeline import may_be_none
@@ -31,12 +31,12 @@ from pmdc_jax.diagnose.screen import Screen, Signal, common_to_waves, log_chance
 from pmdc_jax.diagnose.seen import Seen
 from pmdc_jax.diagnose.shortlist import effect_of, promising, shortlist
 from pmdc_jax.effects import EFFECTS
-from pmdc_jax.identify.colour import Series, whitener
 from pmdc_jax.identify.identification import Estimate, Identification
+from pmdc_jax.identify.noise_model import Series, whitener
 from pmdc_jax.identify.polish import polish
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Unknowns
-from pmdc_jax.identify.refine import Refined
+from pmdc_jax.identify.refine import Optimum
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.simulate import LOCAL, Tape, free_run
 
@@ -317,7 +317,7 @@ def test_what_a_coarse_reading_leaves_is_evidence_for_nothing():
             Series(x, known, kind)
             for x in (speed[..., None], np.ones((len(speed), 1, 1)), np.round(speed) - speed, speed)
         )
-        errors = readings(Fit(shared, own, residual, simulated), seed)
+        errors = readings(RunSeries(shared, own, residual, simulated), seed)
         parts = (
             shared.values,
             (speed * np.abs(speed))[..., None],
@@ -350,10 +350,10 @@ def test_only_steps_that_nothing_blurs_are_coarse(read, coarse):
         Series(0.5 * x, known, (1e-3, (0,)))
         for x in (read(exact, np.random.default_rng(0)) - exact, exact)
     )
-    errors = readings(Fit(simulated, simulated, left, simulated), 0)
+    errors = readings(RunSeries(simulated, simulated, left, simulated), 0)
     assert bool(errors.any()) is coarse
     assert np.abs(errors).max() <= 0.25 + 1e-12
-    assert np.array_equal(errors, readings(Fit(simulated, simulated, left, simulated), 0))
+    assert np.array_equal(errors, readings(RunSeries(simulated, simulated, left, simulated), 0))
 
 
 # ---------------------------------------------------------------------------------- the noise
@@ -570,7 +570,7 @@ def test_sizes_in_amperes_are_not_tried_where_no_current_was_measured(x64):
     given = prepare([Recording("silent", time, voltage, speed=speed)], [], unloaded=True)
     coordinates = jnp.log(jnp.asarray([PAPER[n] for n in PARAMETERS]))
     start = Unknowns(coordinates, jnp.zeros((1, LOCAL)))
-    base = model_of((), given, polish(given.problem, Refined(start, np.inf, (), False), steps=0))
+    base = model_of((), given, polish(given.problem, Optimum(start, np.inf, (), False), steps=0))
     tried = {candidate.effect for candidate in Library(base).candidates}
     assert {"coulomb_friction", "speed_sensor_delay"} <= tried
     assert not any(EFFECTS[name].needs_current for name in tried)

@@ -24,19 +24,19 @@ from pmdc_jax.control.spread import drawn_motors
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.binary_ga import BinaryGA
 from pmdc_jax.identify.bounds import effect_bounds
-from pmdc_jax.identify.colour import whitener
+from pmdc_jax.identify.generalised_least_squares import last_fit, residuals_of
 from pmdc_jax.identify.identification import Identification
-from pmdc_jax.identify.judge import judge
 from pmdc_jax.identify.noise import is_coarse, quantum, resolution, white_noise
+from pmdc_jax.identify.noise_model import whitener
 from pmdc_jax.identify.parameters import Parameters
-from pmdc_jax.identify.polish import fit_own, polish
+from pmdc_jax.identify.polish import fit_run_unknowns, polish
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Problem, Unknowns, evaluate
-from pmdc_jax.identify.refine import Refined, refine
+from pmdc_jax.identify.refine import Optimum, refine
+from pmdc_jax.identify.results import results_of
+from pmdc_jax.identify.rotor_angle import with_rotor_angle
 from pmdc_jax.identify.search import METHODS, Found, search
-from pmdc_jax.identify.sharpen import last_fit, residuals_of
 from pmdc_jax.identify.solve import _distinct, solve
-from pmdc_jax.identify.turning import turned
 from pmdc_jax.identify.uncertainty import information, long_run_variance
 from pmdc_jax.identify.whitening import Whitening
 from pmdc_jax.motor import PARAMETERS
@@ -171,15 +171,15 @@ def test_hold_outs_do_not_touch_the_fit(runs):
 def test_a_bound_along_an_unseen_direction_is_none(x64):
     """A search ends anywhere along it, and so where Kt meets its bound: J and f are no surer for that."""
     given, solved = solve(prepare(unloaded(5), [], unloaded=True), "cma_es", seed=0)
-    names, best = given.problem.parameters.names, solved.polished.refined
+    names, best = given.problem.parameters.names, solved.fit.optimum
     at = np.array(best.unknowns.coordinates)
     down = given.problem.parameters.lower[names.index("Kt")] - at[names.index("Kt")]
     at[[names.index(name) for name in ("Kt", "J", "f")]] += down
-    held = Refined(best.unknowns._replace(coordinates=jnp.asarray(at)), best.fitness, (3,), True)
+    held = Optimum(best.unknowns._replace(coordinates=jnp.asarray(at)), best.fitness, (3,), True)
     assert names[3] == "Kt"
     polished = polish(given.problem, held)
-    assert polished.refined.at_bound == (3,)
-    found = judge(given, solved._replace(polished=polished))
+    assert polished.at_bound == (3,)
+    found = results_of(given, solved._replace(fit=polished))
     assert {found.parameters[n].status for n in ("Kt", "J", "f")} == {"not_identifiable"}
     assert found.parameters["Kt"].value == pytest.approx(found.parameters["Kb"].value, rel=1e-6)
 
@@ -486,16 +486,16 @@ def test_torque_noise_is_filtered_out():
     runs = light_and_loaded(3, noise=noise)
     with jax.enable_x64(True):
         given, solved = solve(prepare(runs, []), "cma_es", 0)
-        sharper, last = _last_fit(given, solved.polished)
-        plain = judge(given, solved).parameters
-        sharp = judge(sharper, solved._replace(polished=last)).parameters
-    assert last.refined.converged
+        sharper, last = _last_fit(given, solved.fit)
+        plain = results_of(given, solved).parameters
+        sharp = results_of(sharper, solved._replace(fit=last)).parameters
+    assert last.optimum.converged
     assert sharp["R"].stderr < 0.5 * plain["R"].stderr
     for name in PARAMETERS:
         assert sharp[name].stderr < 1.2 * plain[name].stderr, name
         assert abs(sharp[name].value - getattr(PAPER, name)) < 4 * sharp[name].stderr, name
     # and no state that a run begins with has run away
-    initial = np.asarray(last.refined.unknowns.local)[:, :2]
+    initial = np.asarray(last.unknowns.local)[:, :2]
     measured = [(run.current[0], run.speed[0]) for run in runs]
     np.testing.assert_allclose(initial, measured, atol=5 * NOISE.speed_rad_s)
 
@@ -503,7 +503,7 @@ def test_torque_noise_is_filtered_out():
 def test_white_noise_asks_for_no_filter(runs):
     with jax.enable_x64(True):
         given, solved = solve(prepare(runs, []), "cma_es", 0)
-        assert _last_fit(given, solved.polished)[1] is solved.polished
+        assert _last_fit(given, solved.fit)[1] is solved.fit
 
 
 def test_one_start_has_a_middling_inductance():
@@ -528,7 +528,7 @@ def problem_of(runs: list[Recording], bounds=None) -> Problem:
         jax.tree.map(jnp.asarray, Tape.from_recordings(runs)),
         jnp.array([NOISE.current_A, NOISE.speed_rad_s]),
         free=jnp.ones(6, bool),
-        counts=jnp.ones(2, bool),
+        fitted_runs=jnp.ones(2, bool),
     )
 
 
@@ -545,7 +545,7 @@ def test_a_bound_in_the_way_is_reported(x64, runs):
     problem = problem_of(runs, limits)
     start = start_at(problem)
     inside = start.coordinates.at[0].set(np.log(0.05)).at[4].set(np.log(2e-3))
-    end = polish(problem, refine(problem, start._replace(coordinates=inside))).refined
+    end = polish(problem, refine(problem, start._replace(coordinates=inside))).optimum
     assert end.at_bound == (0, 4)
     values = np.exp(np.asarray(end.unknowns.coordinates))
     np.testing.assert_allclose(values[[0, 4]], [0.14, 6e-4], rtol=1e-12)
@@ -558,7 +558,7 @@ def test_a_bound_that_only_was_in_the_way_lets_go(x64, runs):
     start = start_at(problem)
     held = start._replace(coordinates=start.coordinates.at[0].set(np.log(0.1)))
     end = refine(problem, held)
-    polished = polish(problem, end._replace(at_bound=(0,))).refined
+    polished = polish(problem, end._replace(at_bound=(0,))).optimum
     assert polished.at_bound == ()
     assert polished.converged
     assert np.exp(polished.unknowns.coordinates[0]) == pytest.approx(PAPER.R, rel=1e-2)
@@ -572,7 +572,7 @@ def test_converged_means_that_nothing_near_is_better(x64, runs):
     """By trial: a twentieth of a standard error along any parameter, either way, gains nothing."""
     problem = problem_of(runs)
     polished = polish(problem, refine(problem, start_at(problem, 1.5)))
-    best, evaluation = polished.refined, polished.evaluation
+    best, evaluation = polished.optimum, polished.evaluation
     assert best.converged
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(polished.noise))
     info = information(
@@ -589,7 +589,7 @@ def test_known_loads_stay_known(x64, runs):
     """No residual depends on the offset of a known load: not even rounding errors may move it."""
     problem = problem_of(runs)
     end = refine(problem, start_at(problem, 1.5))
-    polished = polish(problem, end).refined
+    polished = polish(problem, end).optimum
     for unknowns in (end.unknowns, polished.unknowns):
         np.testing.assert_array_equal(np.asarray(unknowns.local)[:, 2:], 0.0)
 
@@ -597,10 +597,10 @@ def test_known_loads_stay_known(x64, runs):
 def test_friction_that_had_all_but_vanished_is_found_again(x64, runs):
     """Its logarithm would have to fall by a thousandfold of what a straight line says, and then rise."""
     problem = problem_of(runs)
-    there = polish(problem, refine(problem, start_at(problem))).refined
+    there = polish(problem, refine(problem, start_at(problem))).optimum
     start = start_at(problem)
     lost = start._replace(coordinates=start.coordinates.at[5].add(np.log(0.011)))
-    again = polish(problem, there._replace(unknowns=lost)).refined
+    again = polish(problem, there._replace(unknowns=lost)).optimum
     assert again.converged
     assert again.fitness == pytest.approx(there.fitness, rel=1e-6)
 
@@ -626,8 +626,8 @@ def test_the_rotor_turns_by_its_own_speed_and_not_by_that_of_a_slow_sensor(x64):
     coordinates = [np.log(values[n]) if log else values[n] for n, log in logs]
     local = np.array([[truth["current_A"][0], speed[0], 0.0, 0.0, 0.0]])
     unknowns = Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
-    fit = polish(given.problem, Refined(unknowns, np.inf, (), False), steps=0)
-    turn = np.asarray(turned(given.problem, fit).tape.turn).reshape(-1)
+    fit = polish(given.problem, Optimum(unknowns, np.inf, (), False), steps=0)
+    turn = np.asarray(with_rotor_angle(given.problem, fit).tape.turn).reshape(-1)
     angle = cumulative_simpson(speed, x=time, initial=0.0)
     by = np.concatenate([[0.0], np.cumsum(turn)])[: len(angle)]
     assert np.max(np.abs(by - angle)) < 0.01
@@ -639,8 +639,8 @@ def test_a_refinement_that_is_cut_short_does_not_claim_convergence(x64, runs):
     problem = problem_of(runs)
     there = refine(problem, start_at(problem))
     far = there._replace(unknowns=start_at(problem, 1.3))
-    assert not polish(problem, far, steps=1).refined.converged
-    assert polish(problem, there, steps=12).refined.converged
+    assert not polish(problem, far, steps=1).optimum.converged
+    assert polish(problem, there, steps=12).optimum.converged
 
 
 def test_a_failed_simulation_is_no_optimum(x64, runs):
@@ -649,7 +649,7 @@ def test_a_failed_simulation_is_no_optimum(x64, runs):
     start = start_at(problem)
     wild = start._replace(coordinates=start.coordinates.at[5].set(np.log(1e299)))
     end = refine(problem, wild)
-    polished = polish(problem, end).refined
+    polished = polish(problem, end).optimum
     assert not polished.converged or polished.fitness < 3
 
 
@@ -667,7 +667,7 @@ def test_standard_errors_are_the_size_of_the_errors(x64, noise):
         problem = problem_of(light_and_loaded(100 + seed, noise=noise))
         end = refine(problem, start_at(problem))
         polished = polish(problem, end)
-        evaluation, unknowns = polished.evaluation, polished.refined.unknowns
+        evaluation, unknowns = polished.evaluation, polished.unknowns
         info = information(
             evaluation.residuals, evaluation.jacobian, problem.tape.run, np.ones(6, bool), 2
         )
@@ -809,7 +809,7 @@ def test_few_moments_that_decide_widen_the_interval():
         run = np.zeros(blocks, int)
         info = information(residuals, jacobian, run, np.ones(1, bool), 1)
         error, spread = abs(estimate), np.sqrt(info.covariance[0, 0])
-        covered.append(error < info.reach[0] * spread)
+        covered.append(error < info.interval_factor[0] * spread)
         plain.append(error < 1.96 / np.sqrt((jacobian[..., 0] ** 2).sum()))
     assert np.mean(plain) < 0.3 and np.mean(covered) > 0.85, (np.mean(plain), np.mean(covered))
 
@@ -829,9 +829,9 @@ def test_white_noise_leaves_intervals_as_they_are():
             np.ones(2, bool),
             2,
         )
-        reaches.append(info.reach)
+        reaches.append(info.interval_factor)
         inflations.append(info.inflation)
-        covered.append(np.abs(estimate) < info.reach * np.sqrt(np.diag(info.covariance)))
+        covered.append(np.abs(estimate) < info.interval_factor * np.sqrt(np.diag(info.covariance)))
     assert np.mean(np.array(reaches) > 2) < 0.1
     assert 1.0 <= np.median(inflations) < 1.1
     assert 0.93 < np.mean(covered) < 0.98
@@ -930,7 +930,7 @@ def test_what_belongs_to_a_run_is_never_fitted_for_the_worse(gap):
             float(jnp.square(evaluation.residuals).sum())
             for evaluation in (
                 evaluate(problem, begun),
-                *(fit_own(problem, begun, passes)[1] for passes in (1, 4)),
+                *(fit_run_unknowns(problem, begun, passes)[1] for passes in (1, 4)),
             )
         ]
     assert squares == sorted(squares, reverse=True)
@@ -944,7 +944,7 @@ def test_a_run_may_begin_anywhere_in_the_play(twist):
         truth = begun._replace(local=begun.local.at[0, 4].set(twist))
         fitted, right = (
             float(jnp.square(evaluate(problem, own).residuals).sum())
-            for own in (fit_own(problem, begun, 8)[0], truth)
+            for own in (fit_run_unknowns(problem, begun, 8)[0], truth)
         )
     assert fitted < 1.01 * right
 
@@ -968,7 +968,7 @@ def test_a_hold_out_may_begin_at_any_angle(turned_by):
         coordinates = [np.log(truth[name]) if log else truth[name] for name, log in named]
         begun = Unknowns(jnp.asarray(coordinates), jnp.zeros((2, LOCAL)))
         right = begun._replace(local=begun.local.at[1, 3].set(angle))
-        ended = fit_own(problem, begun)[1]
+        ended = fit_run_unknowns(problem, begun)[1]
         fitted, least = (
             float(jnp.square(evaluation.residuals).sum())
             for evaluation in (ended, evaluate(problem, right))

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..identify.colour import Whitener, whitener
-from ..identify.sharpen import residuals_of, sharpened, squares_of
+from ..identify.generalised_least_squares import residuals_of, sharpened, squares_of
+from ..identify.noise_model import Whitener, whitener
 from .kinship import is_within
 from .model import Model
 
@@ -41,11 +41,9 @@ class Comparison:
         One that leaves far more than another of what is measured is out of the question: filters pass none of what
         changes slowly.
         """
-        least = min(m.polished.refined.fitness for m in models)
+        least = min(m.fit.fitness for m in models)
         fitted = [
-            self.left(m, white)
-            if m.polished.refined.fitness < FAR * least
-            else Fitted(m, np.inf, np.inf)
+            self.left(m, white) if m.fit.fitness < FAR * least else Fitted(m, np.inf, np.inf)
             for m in models
         ]
         return sorted(fitted, key=lambda f: f.criterion)
@@ -54,7 +52,7 @@ class Comparison:
         """A model fitted to what a filter makes white of what it leaves."""
         key = model, white
         if key not in self._fitted:
-            given, polished = sharpened(model.given, model.polished, white, WORTH)
+            given, polished = sharpened(model.given, model.fit, white, WORTH)
             squares = squares_of(given, polished)
             samples = np.count_nonzero(given.problem.tape.weight)
             price = len(given.problem.parameters.names) * np.log(samples)
@@ -64,7 +62,7 @@ class Comparison:
     def white(self, model: Model) -> Whitener:
         """The filter that makes white what a model leaves."""
         if model not in self._filters:
-            self._filters[model] = whitener(residuals_of(model.given, model.polished))
+            self._filters[model] = whitener(residuals_of(model.given, model.fit))
         return self._filters[model]
 
 

@@ -61,7 +61,7 @@ def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExpe
         return None
     rival = naming.rivals[0]
     motors = [jax.tree.map(np.asarray, m.motor) for m in (naming.chosen, rival)]
-    noise = np.asarray(naming.chosen.polished.noise)
+    noise = np.asarray(naming.chosen.fit.noise)
     time = STEP * np.arange(int(DURATION / STEP))
     ranked = sorted(
         (

@@ -82,7 +82,7 @@ class Library:
         self.bare = jax.tree.map(jnp.asarray, base.motor)
         self.scales = _scales(base)
         tape = base.given.problem.tape
-        measured = bool(np.any(np.asarray(tape.weight)[base.given.problem.counted, 0]))
+        measured = bool(np.any(np.asarray(tape.weight)[base.given.problem.fitted_blocks, 0]))
         known = measured or bool(np.any(np.asarray(tape.drive.current) > 0))
         self.candidates = [
             c for c in candidates(self.scales) if known or not EFFECTS[c.effect].needs_current
@@ -90,7 +90,7 @@ class Library:
         # errors that last look like a voltage that changes in time
         self.coarse = any(is_coarse(speed) for speed in _counted(base.given.training))
         # ... and of noise that the motor did not feel something is left
-        self.wavers = bool(base.given.unfelt)
+        self.wavers = bool(base.given.input_noise)
         # by unit: what may be but a trace of what a sensor does
         self.traces = _traces(base)
         self._simulated: dict[int, np.ndarray] = {}
@@ -123,10 +123,10 @@ class Library:
         key = id(candidate)
         if key not in self._simulated:
             values = {field: jnp.asarray(x) for field, x in candidate.columns[0].items()}
-            local = self._base.polished.refined.unknowns.local
+            local = self._base.fit.unknowns.local
             motor = self.bare.with_effects([EFFECTS[candidate.effect](**values)])
             seen = free_run(motor, tape, local[:, :2], local[:, 2])
-            change = np.asarray(seen) - np.asarray(self._base.polished.evaluation.seen)
+            change = np.asarray(seen) - np.asarray(self._base.fit.evaluation.seen)
             self._simulated[key] = change.transpose(2, 1, 0)
         return self._simulated[key]
 
@@ -137,7 +137,7 @@ def _traces(base: Model) -> dict[str, float]:
     training = base.given.training
     currents = [run.current for run in training if run.current is not None]
     rounded = max((quantum(np.diff(current)) / 2 for current in currents), default=0.0)
-    unfelt = max(base.given.unfelt.values(), default=0.0)
+    unfelt = max(base.given.input_noise.values(), default=0.0)
     volts = [run.voltage for run in training if run.voltage is not None]
     return {"V": max(unfelt, _rounded_to(np.concatenate(volts or [np.zeros(1)]))), "A": rounded}
 
@@ -250,8 +250,8 @@ def _hats(x: np.ndarray, knots: np.ndarray, times: np.ndarray | None = None) -> 
 
 def _scales(base: Model) -> Scales:
     tape, motor = base.given.problem.tape, base.motor
-    seen, weight = np.asarray(base.polished.evaluation.seen), np.asarray(tape.weight)
-    counted = base.given.problem.counted
+    seen, weight = np.asarray(base.fit.evaluation.seen), np.asarray(tape.weight)
+    counted = base.given.problem.fitted_blocks
     there = weight[counted].any(1)
     current, speed = (
         float(np.quantile(np.abs(seen[counted][:, c][there]), 0.95)) + 1e-9 for c in range(2)

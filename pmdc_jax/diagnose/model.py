@@ -9,19 +9,19 @@ import attrs
 import numpy as np
 
 from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction
-from ..identify.colour import Series, Whitener
-from ..identify.polish import Polished, polish, taken_over
-from ..identify.prepare import Prepared
-from ..identify.refine import Refined
-from ..identify.sharpen import (
+from ..identify.generalised_least_squares import (
     last_fit,
     residuals_of,
     series_of,
     training_runs,
     whitened,
 )
+from ..identify.noise_model import Series, Whitener
+from ..identify.polish import Fit, polish, reweighted
+from ..identify.prepare import Prepared
+from ..identify.refine import Optimum
+from ..identify.rotor_angle import of_rotor, with_rotor_angle
 from ..identify.solve import settle
-from ..identify.turning import of_rotor, turned
 from ..motor import Motor
 from .response import Path, path_of
 
@@ -32,17 +32,17 @@ class Model:
 
     effects: tuple[str, ...]
     given: Prepared
-    polished: Polished
+    fit: Fit
 
     @property
     def motor(self) -> Motor:
         """The fitted motor."""
-        return self.given.problem.parameters(self.polished.refined.unknowns.coordinates)
+        return self.given.problem.parameters(self.fit.coordinates)
 
     @property
     def is_possible(self) -> bool:
         """Whether it can be simulated, and nature allows what its effects were fitted to be."""
-        simulated = np.isfinite(self.polished.refined.fitness)
+        simulated = np.isfinite(self.fit.fitness)
         return bool(simulated) and all(effect.is_possible() for effect in self.motor.effects)
 
     @property
@@ -70,15 +70,15 @@ class Model:
         """The free run along which it was fitted, of the rotor itself."""
         held = "speed" in {EFFECTS[name].holds for name in self.effects}
         problem = self.given.problem
-        begun = self.polished.refined.unknowns.local[:, 3]
-        return path_of(of_rotor(problem, self.polished), problem.tape, begun, held)
+        begun = self.fit.unknowns.local[:, 3]
+        return path_of(of_rotor(problem, self.fit), problem.tape, begun, held)
 
     @property
     def misses(self) -> float:
         """By which share of an output it misses what was measured, of the output that it misses more."""
         sizes = self.given.problem.sizes
         there = sizes > 0
-        return float(np.max(self.polished.noise[there] / sizes[there], initial=0.0))
+        return float(np.max(self.fit.noise[there] / sizes[there], initial=0.0))
 
     @property
     def training(self) -> list[int]:
@@ -86,31 +86,31 @@ class Model:
         return training_runs(self.given)
 
 
-def settled(effects: tuple[str, ...], given: Prepared, start: Refined, white: Whitener) -> Model:
+def settled(effects: tuple[str, ...], given: Prepared, start: Optimum, white: Whitener) -> Model:
     """A model fitted from a start to residuals that a filter makes white."""
     given, ended = settle(whitened(given, white), start)
     given = given._replace(problem=replace(given.problem, whitening=None))
     # no step: what it leaves as it is
-    plain = polish(given.problem, ended.refined, steps=0)
-    refined = ended.refined._replace(fitness=plain.refined.fitness)
-    return model_of(effects, given, plain._replace(refined=refined))
+    plain = polish(given.problem, ended.optimum, steps=0)
+    optimum = ended.optimum._replace(fitness=plain.fitness)
+    return model_of(effects, given, plain._replace(optimum=optimum))
 
 
-def model_of(effects: tuple[str, ...], given: Prepared, polished: Polished) -> Model:
+def model_of(effects: tuple[str, ...], given: Prepared, polished: Fit) -> Model:
     """A fitted model, its rotor turned as the fit says."""
     if not given.problem.angular:  # or else it was fitted so
-        given = given._replace(problem=turned(given.problem, polished))
+        given = given._replace(problem=with_rotor_angle(given.problem, polished))
     return Model(effects, given, polished)
 
 
-def ended(model: Model, white: Whitener) -> tuple[Prepared, Polished]:
+def ended(model: Model, white: Whitener) -> tuple[Prepared, Fit]:
     """The last fit of a model."""
-    known = taken_over(model.given.problem, model.polished)
-    plainly = settle(model.given, model.polished.refined, known)
-    return last_fit(*plainly, model.polished, white)
+    known = reweighted(model.given.problem, model.fit)
+    plainly = settle(model.given, model.fit.optimum, known)
+    return last_fit(*plainly, model.fit, white)
 
 
-class Fit(NamedTuple):
+class RunSeries(NamedTuple):
     """Of one training run, in A and rad/s: what is simulated, what is measured less that, and the derivatives of the
     former by the motor's parameters and by what belongs to the run alone."""
 
@@ -120,14 +120,14 @@ class Fit(NamedTuple):
     simulated: Series
 
 
-def rows_of(model: Model) -> list[Fit]:
+def rows_of(model: Model) -> list[RunSeries]:
     """The fit of every training run, in the order of time."""
-    evaluation, tape = model.polished.evaluation, model.given.problem.tape
-    J = np.asarray(evaluation.jacobian) * model.polished.noise[:, None, None]
+    evaluation, tape = model.fit.evaluation, model.given.problem.tape
+    J = np.asarray(evaluation.jacobian) * model.fit.noise[:, None, None]
     count = model.given.problem.free.shape[0]
-    residuals = residuals_of(model.given, model.polished)
+    residuals = residuals_of(model.given, model.fit)
     return [
-        Fit(
+        RunSeries(
             series_of(tape, run, J[..., :count]),
             series_of(tape, run, J[..., count:]),
             residual,

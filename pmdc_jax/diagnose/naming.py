@@ -9,8 +9,8 @@ import numpy as np
 from scipy import stats
 
 from ..effects import EFFECTS
-from ..identify.colour import Whitener
-from ..identify.polish import Polished
+from ..identify.noise_model import Whitener
+from ..identify.polish import Fit
 from ..identify.prepare import Prepared
 from ..identify.solve import Solved
 from .candidates import FULLER
@@ -64,7 +64,7 @@ class Naming(NamedTuple):
     # share of what the chosen one leaves that no curve takes away, as root mean square
     noise: float
     without: dict[str, float]  # by effect of the chosen: chance of the data without it
-    ended: tuple[Prepared, Polished]  # the last fit of the chosen one
+    ended: tuple[Prepared, Fit]  # the last fit of the chosen one
     line: Line | None  # a steady oscillation that the chosen one does not have
 
 
@@ -166,7 +166,7 @@ class Namer:
     def _by_plain_squares(self, current: Model, found: Seen) -> Model | None:
         """The current model with one of the effects that take away most of what is left, no filter between, if that
         leaves far less: a filter takes for noise what lasts as long as a short run."""
-        far = current.polished.refined.fitness / FAR
+        far = current.fit.fitness / FAR
         full = len(current.effects) == MOST
         if full or found.left >= ALARM or far < current.given.problem.outputs:
             return None
@@ -174,7 +174,7 @@ class Namer:
         least = FORETOLD * found.screen.unfiltered.regress().squares
         most = promising(found.plainly(), set(current.effects), least)
         tried = [self.refits.with_signal(current, s, pointed) for s in most]
-        better = [m for m in tried if m is not None and m.polished.refined.fitness < far]
+        better = [m for m in tried if m is not None and m.fit.fitness < far]
         return self._better(current, found, better)
 
     def _in_exchange(self, current: Model, found: Seen) -> Model | None:
@@ -246,14 +246,14 @@ class Namer:
     def _sought(self, current: Model, found: Seen) -> list[Model | None]:
         """The motor with dry friction, searched for anew, if that may explain a misfit of which no first-order response
         is clear, and leaves far less: a motor whose rotor sticks for long is far from one that is thought to creep."""
-        far = current.polished.refined.fitness / FAR
+        far = current.fit.fitness / FAR
         by_gain = sorted(found.of_candidates, key=lambda s: -s.gain)
         best = list(dict.fromkeys(effect_of(s) for s in by_gain))[:SHORTLIST]
         sticks = any(EFFECTS[effect].holds == "speed" for effect in best)
         if not sticks or far < current.given.problem.outputs:  # not even a perfect fit would
             return []
         model = self.refits.sought(current, DRY)
-        return [model] if model.polished.refined.fitness < far else []
+        return [model] if model.fit.fitness < far else []
 
     def _in_other_form(self, model: Model, found: Seen, added: set[str]) -> list[Model | None]:
         """The model with what was added to it in a richer or a harder form."""
@@ -315,7 +315,7 @@ class Namer:
         if model.effects:
             base, mine = (self.comparison.left(m, found.white) for m in (self.base, model))
             explained = base.squares - mine.squares
-        removed = self.base.polished.refined.fitness - model.polished.refined.fitness
+        removed = self.base.fit.fitness - model.fit.fitness
         return Seen(found, of_candidates, of_curves, left, explained, removed)
 
     def _best(self, tried: Sequence[Model], white: Whitener) -> Model:

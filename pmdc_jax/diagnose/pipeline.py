@@ -12,9 +12,9 @@ from scipy import stats
 from ..compiled import make_room
 from ..effects import EFFECTS
 from ..identify.identification import Identification, Role, RunFit
-from ..identify.judge import judge
 from ..identify.noise import FLOOR
 from ..identify.prepare import prepare
+from ..identify.results import results_of
 from ..identify.solve import Solved, solve
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
@@ -73,12 +73,12 @@ def diagnose(
     given = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
     given, solved = solve(given, search, seed, progress)
     identified = time.perf_counter()
-    report("gathering evidence", solved.polished.refined.fitness)
-    namer = Namer(model_of((), given, solved.polished), solved, report)
+    report("gathering evidence", solved.fit.fitness)
+    namer = Namer(model_of((), given, solved.fit), solved, report)
     naming = namer.name()
     named = time.perf_counter()
-    report("judging the uncertainty", naming.chosen.polished.refined.fitness)
-    base = judge(given, solved)
+    report("judging the uncertainty", naming.chosen.fit.fitness)
+    base = results_of(given, solved)
     final = _judged(naming, solved)
     while (idle := _idle(naming, final, namer.library)) is not None:
         naming = namer.without(naming, idle)
@@ -113,7 +113,7 @@ def diagnose(
 
 def _judged(naming: Naming, solved: Solved) -> Identification:
     ended, polished = naming.ended
-    return judge(ended, solved._replace(polished=polished))
+    return results_of(ended, solved._replace(fit=polished))
 
 
 def _idle(naming: Naming, final: Identification, library: Library) -> str | None:

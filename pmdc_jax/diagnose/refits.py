@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import EFFECTS
-from ..identify.colour import Whitener, whitener
+from ..identify.generalised_least_squares import residuals_of, whitened
 from ..identify.identifiability import moved_by
-from ..identify.polish import polish, stood
+from ..identify.noise_model import Whitener, whitener
+from ..identify.polish import best_backlash_start, polish
 from ..identify.prepare import Prepared
 from ..identify.problem import Unknowns
-from ..identify.refine import Refined
-from ..identify.sharpen import residuals_of, whitened
+from ..identify.refine import Optimum
 from ..identify.solve import POOR, Solved, searched
 from ..identify.uncertainty import FLAT, information_of
 from ..threads import side_by_side, side_by_side_until
@@ -38,7 +38,7 @@ AGREED = 1.05
 # How finely a phase is looked for that all runs have in common
 PHASES = 120
 
-Start = tuple[Prepared, Refined]
+Start = tuple[Prepared, Optimum]
 
 
 class Refits:
@@ -118,7 +118,7 @@ class Refits:
             given = current.given.with_effects([EFFECTS[e] for e in effects])
             method, seed = self.solved.search.method, self.solved.seed
             given, found = searched(given, method, seed, searches=1)
-            return model_of(effects, given, found.polished)
+            return model_of(effects, given, found.fit)
 
         model = self._once(effects, current, search)
         assert model is not None
@@ -158,7 +158,7 @@ class Refits:
         key = frozenset(rest)
         if (key, model) not in self.begun_from:
             self.begun_from.add((key, model))
-            here = polish(given.problem, begun, steps=0).refined.fitness
+            here = polish(given.problem, begun, steps=0).fitness
             if here < (1 - BETTER) * _fitness(smaller):
                 return self._better_from(key, model, refit)
         return smaller
@@ -190,14 +190,14 @@ class Refits:
         """The best refit of several, begun one after another until one is as good as the noise or found twice."""
         given = starts[0][0]
 
-        def enough(ends: list[Refined]) -> bool:
+        def enough(ends: list[Optimum]) -> bool:
             least, *others = sorted(end.fitness for end in ends)
             good = least < POOR * given.problem.outputs
             return bool(good or (others and others[0] < AGREED * least))
 
         ends = side_by_side_until(_roughly, starts, enough)
         best = min(ends, key=lambda end: end.fitness)
-        unknowns = stood(given.problem, best.unknowns, starts[0][1].unknowns.local)
+        unknowns = best_backlash_start(given.problem, best.unknowns, starts[0][1].unknowns.local)
         begun = best._replace(unknowns=unknowns)
         if effects[-1] in AROUND:
             return _best_around(effects, given, begun)
@@ -219,9 +219,9 @@ class Refits:
         if self._keeps(model, current, signal, white):
             return model
         plain = polish(given.problem, begun)
-        if plain.refined.fitness < KEPT * _fitness(model):
+        if plain.fitness < KEPT * _fitness(model):
             return model_of(effects, given, plain)
-        plainly = settled(effects, given, plain.refined, white)
+        plainly = settled(effects, given, plain.optimum, white)
         left = self.comparison.left
         return min((model, plainly), key=lambda m: left(m, white).squares)
 
@@ -260,7 +260,7 @@ class Refits:
         """Where to begin refitting the current model with other effects: their `values`, and how far by the
         evidence the motor's parameters have `moved` and each run begins turned."""
         given = current.given.with_effects([EFFECTS[e] for e in effects])
-        parameters, unknowns = given.problem.parameters, current.polished.refined.unknowns
+        parameters, unknowns = given.problem.parameters, current.fit.unknowns
         names = current.given.problem.parameters.names
         # a parameter that no run sees may seem to move by any factor
         near = np.clip(moved, -1.0, 1.0)
@@ -279,34 +279,34 @@ class Refits:
         local = np.array(unknowns.local)
         local[:, 3] += angles
         start = Unknowns(jnp.asarray(inside), jnp.asarray(local))
-        return given, Refined(start, np.inf, (), False)
+        return given, Optimum(start, np.inf, (), False)
 
     def _lost(self, model: Model, name: str) -> bool:
         """Whether an effect's parameter has gone where no run sees it, so that nothing leads it back."""
         column = model.given.problem.parameters.names.index(name)
-        seen = np.asarray(model.polished.evaluation.jacobian)[
-            model.given.problem.counted, ..., column
+        seen = np.asarray(model.fit.evaluation.jacobian)[
+            model.given.problem.fitted_blocks, ..., column
         ]
         return float(np.square(seen).sum()) < 1 / FLAT**2
 
 
 def _fitness(model: Model) -> float:
-    return model.polished.refined.fitness
+    return model.fit.fitness
 
 
-def _roughly(start: Start) -> Refined:
+def _roughly(start: Start) -> Optimum:
     """A few steps of a refit; infinitely bad where it cannot be simulated."""
     given, begun = start
-    end = polish(given.problem, begun, ROUGHLY).refined
+    end = polish(given.problem, begun, ROUGHLY).optimum
     return end if np.isfinite(end.fitness) else end._replace(fitness=np.inf)
 
 
-def _best_around(effects: tuple[str, ...], given: Prepared, begun: Refined) -> Model:
+def _best_around(effects: tuple[str, ...], given: Prepared, begun: Optimum) -> Model:
     """The best refit from a start and from around where that ends, where the last effect has many optima, by the filter
     of what the start leaves."""
     white = whitener(residuals_of(given, polish(given.problem, begun, steps=0)))
     model, sharp = settled(effects, given, begun, white), whitened(given, white)
-    here = polish(sharp.problem, model.polished.refined, steps=0).refined
+    here = polish(sharp.problem, model.fit.optimum, steps=0).optimum
     effect, names = effects[-1], sharp.problem.parameters.names
     columns = {field: names.index(f"{effect}.{field}") for field in EFFECTS[effect].ranges}
     coordinates = np.asarray(here.unknowns.coordinates)
@@ -315,7 +315,7 @@ def _best_around(effects: tuple[str, ...], given: Prepared, begun: Refined) -> M
         elsewhere = coordinates.copy()
         elsewhere[[columns[field] for field in values]] = np.log(list(values.values()))
         unknowns = here.unknowns._replace(coordinates=jnp.asarray(elsewhere))
-        starts.append((sharp, Refined(unknowns, np.inf, (), False)))
+        starts.append((sharp, Optimum(unknowns, np.inf, (), False)))
     best = min(side_by_side(_roughly, starts), key=lambda end: end.fitness)
     return settled(effects, given, best, white) if best.fitness < here.fitness else model
 
@@ -355,5 +355,5 @@ def common_phase(
 def _unseen(model: Model) -> set[str]:
     """The parameters that have a part in what the runs do not determine."""
     problem = model.given.problem
-    unseen = information_of(problem, model.polished).unseen
+    unseen = information_of(problem, model.fit).unseen
     return {name for d in unseen for name in moved_by(d, problem.parameters)}

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..identify.noise import quantum
-from .model import Fit
+from .model import RunSeries
 
 # Readings that are tried
 READINGS = 8
@@ -16,7 +16,7 @@ READINGS = 8
 BLURRED, RESTLESS = 0.6, 1.5
 
 
-def readings(fit: Fit, run: int) -> Float[np.ndarray, "samples outputs readings"]:
+def readings(fit: RunSeries, run: int) -> Float[np.ndarray, "samples outputs readings"]:
     """Errors of converters as coarse as a run's that read what is simulated, their steps at any height; none of
     outputs whose errors blur the steps. The same for the same `run`, its number.
 

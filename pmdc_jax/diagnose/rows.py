@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 
 from ..compiled import compiled
-from ..identify.colour import Series, Whitener
-from ..identify.sharpen import series_of
+from ..identify.generalised_least_squares import series_of
+from ..identify.noise_model import Series, Whitener
 from ..motor import Motor
 from ..simulate import Tape
 from .library import TOGETHER, Change
-from .model import Fit, Model, rows_of
+from .model import Model, RunSeries, rows_of
 from .response import Path, respond
 from .rounding import readings
 
@@ -30,7 +30,7 @@ STRETCH = 2048
 class Rows(NamedTuple):
     """Of one training run its fit, what every candidate and curve changes, and what rounding may leave; A and rad/s."""
 
-    fit: Fit
+    fit: RunSeries
     columns: Float[np.ndarray, "samples outputs columns"]
     rounding: Float[np.ndarray, "samples outputs readings"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special, stats
 
 from ..effects import EFFECTS
-from ..identify.colour import Series, Whitener, plain, whitener
+from ..identify.noise_model import Series, Whitener, plain, whitener
 from ..simulate import LOCAL
 from .candidates import Candidate
 from .evidence import Block, Evidence, blocks_of, products

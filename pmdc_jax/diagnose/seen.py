@@ -108,7 +108,7 @@ class Seen(NamedTuple):
         unfiltered = self.screen.unfiltered
         rest = unfiltered.regress([self.clearest.block]).squares
         share = 1 - rest / unfiltered.regress().squares
-        return float(share * model.polished.refined.fitness / self.removed)
+        return float(share * model.fit.fitness / self.removed)
 
     def _is_more_of(self, model: Model) -> bool:
         """Whether the clearest signal is that of an effect which the model has."""

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from .colour import Series, whitener
-from .polish import Polished
+from .generalised_least_squares import series_of, training_runs
+from .noise_model import Series, whitener
+from .polish import Fit
 from .prepare import Prepared
-from .sharpen import series_of, training_runs
 
 Samples = Float[np.ndarray, " samples"]
 
@@ -18,8 +18,8 @@ Samples = Float[np.ndarray, " samples"]
 LIKELIER = 30.0
 
 
-def unlikely(
-    given: Prepared, fit: Polished, sensed: Callable[[Samples], Samples] = lambda speed: speed
+def negative_log_likelihood(
+    given: Prepared, fit: Fit, sensed: Callable[[Samples], Samples] = lambda speed: speed
 ) -> float:
     """Minus the logarithm of the likelihood of the training runs as recorded, but for a constant.
 

@@ -11,13 +11,13 @@ from ..compiled import make_room
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..recording import Runs
-from .colour import whitener
-from .dry import missing_friction, of_friction
+from .friction_test import missing_friction, of_friction
+from .generalised_least_squares import last_fit, residuals_of
 from .identification import Identification
-from .judge import judge, missed
+from .noise_model import whitener
 from .parameters import effects_named
 from .prepare import prepare
-from .sharpen import last_fit, residuals_of
+from .results import missed, results_of
 from .solve import solve
 
 
@@ -54,12 +54,12 @@ def identify(
         recordings, holdout, tie=tie, known=known, unloaded=unloaded, effects=effects_named(effects)
     )
     given, solved = solve(given, search, seed, progress)
-    report("judging the uncertainty", solved.polished.refined.fitness)
-    plainly = solved.polished
+    report("judging the uncertainty", solved.fit.fitness)
+    plainly = solved.fit
     friction = missing_friction(given, plainly)
     white = whitener(residuals_of(given, plainly))
     given, polished = last_fit(given, plainly, plainly, white)
-    found = judge(given, solved._replace(polished=polished))
+    found = results_of(given, solved._replace(fit=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
     messages = (*found.messages, *of_friction(friction, found), *missed(found.fit))
     return attrs.evolve(found, seconds=seconds, messages=messages)

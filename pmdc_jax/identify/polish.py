@@ -23,7 +23,7 @@ from .problem import (
     unflatten,
     weighed,
 )
-from .refine import Refined
+from .refine import Optimum
 
 # Steps after which a fall of the cost by no more than so much ends the polish: dry elements leave kinks where a
 # straight line foretells more than there is to gain
@@ -35,7 +35,7 @@ WORTH = 1e-3
 # ... and that a step may foretell where none is found that lowers it, at the kinks of dry elements: of 0.3 errors
 AT_KINK = 0.1
 # By which shares of the play of its teeth a run is tried to begin twisted, from where its load presses them to
-STANDS = np.linspace(-1.0, 1.0, 9)
+BACKLASH_STARTS = np.linspace(-1.0, 1.0, 9)
 # At how many angles of the period of a torque a rotor is tried to begin, and at most
 ANGLES, MOST_ANGLES = 8, 32
 # Curvature added to every coordinate in a step, as if each were known to within a factor of e beforehand:
@@ -43,21 +43,41 @@ ANGLES, MOST_ANGLES = 8, 32
 RIDGE = 1.0
 
 
-class Polished(NamedTuple):
-    """The end of the line: where, what is simulated there, and the noise as the residuals show it."""
+class Fit(NamedTuple):
+    """A motor fitted to the runs: where that ended, what is simulated there, and the noise as the residuals show it."""
 
-    refined: Refined
+    optimum: Optimum
     evaluation: Evaluation
-    noise: np.ndarray
+    noise: Float[np.ndarray, "2"]  # standard deviations of current A and speed rad/s
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """Where it ended."""
+        return self.optimum.unknowns
+
+    @property
+    def coordinates(self) -> Float[Array, " parameters"]:
+        """The search coordinates where it ended."""
+        return self.optimum.unknowns.coordinates
+
+    @property
+    def fitness(self) -> float:
+        """What it leaves, in noise variances; infinite where nothing can be simulated."""
+        return self.optimum.fitness
+
+    @property
+    def at_bound(self) -> tuple[int, ...]:
+        """The coordinates that are held at a bound."""
+        return self.optimum.at_bound
 
 
 def polish(
     problem: Problem,
-    end: Refined,
+    end: Optimum,
     steps: int = POLISH,
     worth: float = WORTH,
     known: Evaluation | None = None,
-) -> Polished:
+) -> Fit:
     """Gauss-Newton to the bottom, while each output is weighed by what its own residuals turn out to be.
 
     The claim of convergence is the gradient's: no step within the bounds would lower the sum of squares by
@@ -80,23 +100,25 @@ def polish(
             best, share = reached, 1.0
             start = np.asarray(best.unknowns.coordinates)
             held = {k for k in held if (best.matrix[k, -1] > 0) == (start[k] <= low[k])}
-            step, gain = gauss_newton(best.matrix, held, len(low))
+            step, gain = gauss_newton_step(best.matrix, held, len(low))
             if converged := gain <= worth * _variance(problem, best):
                 break
         else:
             break
-        moved = np.asarray(flatten(best.unknowns)) + _straight(problem.parameters, share * step)
+        moved = np.asarray(flatten(best.unknowns)) + _damped_log_step(
+            problem.parameters, share * step
+        )
         inside = np.clip(moved[: len(low)], low, high)
         held |= set(np.flatnonzero(inside != moved[: len(low)]).tolist())
         moved[: len(low)] = inside
         reached = _weighed(problem, unflatten(problem, jnp.asarray(moved)))
         costs.append(min(reached.cost, best.cost))
     converged = converged or gain <= AT_KINK * _variance(problem, best)
-    refined = Refined(best.unknowns, best.fitness, tuple(sorted(held)), bool(converged))
-    return Polished(refined, best.evaluation, best.noise)
+    optimum = Optimum(best.unknowns, best.fitness, tuple(sorted(held)), bool(converged))
+    return Fit(optimum, best.evaluation, best.noise)
 
 
-def _straight(parameters: Parameters, step: np.ndarray) -> np.ndarray:
+def _damped_log_step(parameters: Parameters, step: np.ndarray) -> np.ndarray:
     """A step along which a positive parameter rises on a straight line, and not as an exponential: what is nearly zero,
     as friction that something else hid, would rise to infinity."""
     rises = np.zeros(len(step), bool)
@@ -124,7 +146,7 @@ def _variance(problem: Problem, best: _Weighed) -> float:
     return mean if problem.whitening is not None else max(mean, 1.0)
 
 
-def taken_over(problem: Problem, fit: Polished) -> Evaluation:
+def reweighted(problem: Problem, fit: Fit) -> Evaluation:
     """The evaluation at a fit to plain residuals, as a problem with another noise weighs it."""
     return weighed(problem, _scaled(fit.evaluation, fit.noise / np.asarray(problem.noise)))
 
@@ -132,10 +154,10 @@ def taken_over(problem: Problem, fit: Polished) -> Evaluation:
 def _weighed(problem: Problem, unknowns: Unknowns, known: Evaluation | None = None) -> _Weighed:
     evaluation = evaluate(problem, unknowns) if known is None else known
     with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
-        squares = np.square(np.asarray(evaluation.residuals)[problem.counted]).sum((0, 2))
+        squares = np.square(np.asarray(evaluation.residuals)[problem.fitted_blocks]).sum((0, 2))
         noise, stretch = _own_noise(problem, squares)
     scaled = _scaled(evaluation, stretch)
-    matrix = np.array(normal_matrix(scaled, problem.tape, problem.counts))
+    matrix = np.array(normal_matrix(scaled, problem.tape, problem.fitted_runs))
     if problem.whitening is not None:
         cost = float(np.log(np.maximum(squares.sum(), 1e-300)))
     else:
@@ -147,7 +169,9 @@ def _weighed(problem: Problem, unknowns: Unknowns, known: Evaluation | None = No
     )
 
 
-def stood(problem: Problem, unknowns: Unknowns, begun: Float[Array, "runs 5"]) -> Unknowns:
+def best_backlash_start(
+    problem: Problem, unknowns: Unknowns, begun: Float[Array, "runs 5"]
+) -> Unknowns:
     """Every run's own unknowns as they are, or as they had `begun` with the teeth of its gear elsewhere in their play,
     whichever fits best.
 
@@ -156,11 +180,11 @@ def stood(problem: Problem, unknowns: Unknowns, begun: Float[Array, "runs 5"]) -
     """
     motor = problem.parameters(unknowns.coordinates)
     play = sum(float(effect.play()) for effect in motor.effects)
-    trials = [begun.at[:, 4].set(share * play) for share in STANDS] if play else []
+    trials = [begun.at[:, 4].set(share * play) for share in BACKLASH_STARTS] if play else []
     return _whichever_fits(problem, unknowns, trials)
 
 
-def faced(problem: Problem, unknowns: Unknowns) -> Unknowns:
+def best_initial_angle(problem: Problem, unknowns: Unknowns) -> Unknowns:
     """The own unknowns of runs that do not count as they are, or with the rotor at another angle as they began,
     whichever fits best; of several waves, first within the longest period, then by whole periods of each.
 
@@ -168,7 +192,7 @@ def faced(problem: Problem, unknowns: Unknowns) -> Unknowns:
     """
     waves = [e.recurrence() for e in problem.parameters(unknowns.coordinates).effects]
     periods = [float(wave["angle"]) for wave in waves if "angle" in wave]
-    turnable = np.asarray(problem.turnable & ~jnp.asarray(problem.counts))
+    turnable = np.asarray(problem.turnable & ~jnp.asarray(problem.fitted_runs))
     if not periods or not turnable.any():
         return unknowns
     count = min(round(ANGLES * max(periods) / min(periods)), MOST_ANGLES)
@@ -203,7 +227,9 @@ def _squares_of_runs(problem: Problem, evaluation: Evaluation) -> Float[np.ndarr
     return np.bincount(np.asarray(problem.tape.run), sound, problem.tape.runs)
 
 
-def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unknowns, Evaluation]:
+def fit_run_unknowns(
+    problem: Problem, unknowns: Unknowns, passes: int = 4
+) -> tuple[Unknowns, Evaluation]:
     """Fit only what belongs to each run: its initial state, and its load where nobody knows it.
 
     A step that makes a run worse, as where teeth of a gear meet at another time, is taken shorter for that run.
@@ -212,11 +238,11 @@ def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unkn
     run = np.asarray(problem.tape.run)
     everyone, share = jnp.ones(problem.tape.runs, bool), np.ones(problem.tape.runs)
 
-    unknowns = faced(still, stood(still, unknowns, unknowns.local))
+    unknowns = best_initial_angle(still, best_backlash_start(still, unknowns, unknowns.local))
     best = evaluate(still, unknowns)
     for _ in range(passes):
         matrix = np.asarray(normal_matrix(best, still.tape, everyone))
-        flat, gain = gauss_newton(matrix, set(), 0)
+        flat, gain = gauss_newton_step(matrix, set(), 0)
         if gain < WORTH * matrix[-1, -1] / problem.most_samples:
             break
         step = unflatten(problem, jnp.asarray(flat)).local
@@ -227,21 +253,23 @@ def fit_own(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unkn
         share = np.where(better, 1.0, share / 4)
         local = jnp.where(better[:, None], trial.local, unknowns.local)
         unknowns = unknowns._replace(local=local)
-        best = _taken(jnp.asarray(better[run]), reached, best)
+        best = _select_blocks(jnp.asarray(better[run]), reached, best)
     return unknowns, best
 
 
-def with_own(problem: Problem, fit: Polished) -> Polished:
+def with_holdout_unknowns(problem: Problem, fit: Fit) -> Fit:
     """A fit in which runs that do not count have found what belongs to each of them, too, where nobody knows a load."""
-    if not np.any(~np.asarray(problem.counts) & np.asarray(problem.tape.load_unknown)):
+    if not np.any(~np.asarray(problem.fitted_runs) & np.asarray(problem.tape.load_unknown)):
         return fit
-    unknowns, evaluation = fit_own(problem, fit.refined.unknowns)
-    counts = jnp.asarray(problem.counts)
-    local = jnp.where(counts[:, None], fit.refined.unknowns.local, unknowns.local)
-    refined = fit.refined._replace(unknowns=unknowns._replace(local=local))
+    unknowns, evaluation = fit_run_unknowns(problem, fit.unknowns)
+    counts = jnp.asarray(problem.fitted_runs)
+    local = jnp.where(counts[:, None], fit.unknowns.local, unknowns.local)
+    optimum = fit.optimum._replace(unknowns=unknowns._replace(local=local))
     scaled = _scaled(evaluation, np.asarray(problem.noise) / fit.noise)
-    return Polished(
-        refined, _taken(jnp.asarray(problem.counted), fit.evaluation, scaled), fit.noise
+    return Fit(
+        optimum,
+        _select_blocks(jnp.asarray(problem.fitted_blocks), fit.evaluation, scaled),
+        fit.noise,
     )
 
 
@@ -253,12 +281,14 @@ def _scaled(evaluation: Evaluation, stretch: Float[np.ndarray, "2"]) -> Evaluati
     )
 
 
-def _taken(blocks: Bool[Array, " blocks"], one: Evaluation, other: Evaluation) -> Evaluation:
+def _select_blocks(
+    blocks: Bool[Array, " blocks"], one: Evaluation, other: Evaluation
+) -> Evaluation:
     """One evaluation in some blocks, another one in the others."""
     return jax.tree.map(jax.vmap(jnp.where), *(Evaluation(*3 * [blocks]), one, other))
 
 
-def gauss_newton(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.ndarray, float]:
+def gauss_newton_step(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.ndarray, float]:
     """The step that lowers the sum of squares most, and by how much.
 
     **Arguments**: `matrix`, as from `normal_matrix`; `held`, which of the `count` coordinates stay.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..check import check
 from ..clock import evenly_stamped
@@ -24,6 +26,10 @@ from .noise import white_noise
 from .parameters import Parameters, check_names
 from .problem import Problem
 
+if TYPE_CHECKING:
+    from .corrections.input_timing import Timing
+    from .corrections.speed_averaging import Averaging
+
 
 class Prepared(NamedTuple):
     """Checked recordings, training runs first, and the least-squares problem they make."""
@@ -35,16 +41,27 @@ class Prepared(NamedTuple):
     known: Mapping[str, float]
     ties: tuple[tuple[str, str], ...]
     problem: Problem
-    # by run: standard deviation of what was taken out of the record of its drive, for the motor did not feel it
-    unfelt: Mapping[str, float] = MappingProxyType({})
     # which runs have a speed by a spline through their angles
     differentiated: tuple[bool, ...] = ()
-    # over which samples the speeds were means, and are undone; empty, if they were none
-    averaged: str = ""
-    # when the voltages act, if not from their sample to the next
-    timing: str = ""
-    # whether they go straight from sample to sample
-    straight: bool = False
+    # what was corrected of the records; see `corrections`
+    # ... by run: standard deviation of what was taken out of the record of its drive, for the motor did not feel it
+    input_noise: Mapping[str, float] = MappingProxyType({})
+    # ... what the speeds were means of
+    averaging: Averaging | None = None
+    # ... when the voltages act, if not from their sample to the next
+    timing: Timing | None = None
+    # ... whether steps of the voltages were placed between samples
+    stepped: bool = False
+
+    @property
+    def straight(self) -> bool:
+        """Whether the voltages go straight from sample to sample."""
+        return self.timing is not None and self.timing.straight
+
+    def with_tape(self, **fields: Array | None) -> Prepared:
+        """The same runs with other samples on the tape."""
+        tape = replace(self.problem.tape, **fields)
+        return self._replace(problem=replace(self.problem, tape=tape))
 
     @property
     def training(self) -> list[Recording]:
@@ -68,8 +85,8 @@ class Prepared(NamedTuple):
             self.problem.tape,
             self.problem.noise,
             free=jnp.ones(len(parameters.names), bool),
-            counts=self.problem.counts,
-            unknown=self.problem.unknown,
+            fitted_runs=self.problem.fitted_runs,
+            nuisance=self.problem.nuisance,
         )
         return self._replace(problem=problem)
 
@@ -102,7 +119,7 @@ def prepare(
         tape,
         jnp.asarray(noise),
         free=jnp.ones(len(parameters.names), bool),
-        counts=jnp.arange(tape.runs) < len(recordings),
+        fitted_runs=jnp.arange(tape.runs) < len(recordings),
     )
     roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
     return Prepared(

@@ -40,25 +40,25 @@ class Problem(eqx.Module):
     tape: Tape
     noise: Float[Array, "2"]  # standard deviations of current A and speed rad/s
     free: Bool[Array, " parameters"]
-    counts: Bool[Array, " runs"]
+    fitted_runs: Bool[Array, " runs"]
     whitening: Whitening | None = None  # in place of the noise, where residuals are correlated
     # what else may have moved the outputs of each run, A and rad/s: of it residuals tell nothing
-    unknown: Float[Array, "blocks 2 samples unknowns"] | None = None
+    nuisance: Float[Array, "blocks 2 samples nuisances"] | None = None
 
     @property
     def outputs(self) -> int:
         """How many outputs the runs that count have measured."""
-        return int(np.count_nonzero(np.asarray(self.tape.weight)[self.counted].any((0, 2))))
+        return int(np.count_nonzero(np.asarray(self.tape.weight)[self.fitted_blocks].any((0, 2))))
 
     @property
-    def counted(self) -> Bool[np.ndarray, " blocks"]:
+    def fitted_blocks(self) -> Bool[np.ndarray, " blocks"]:
         """Which blocks are of runs that count."""
-        return np.asarray(self.counts)[np.asarray(self.tape.run)]
+        return np.asarray(self.fitted_runs)[np.asarray(self.tape.run)]
 
     @property
     def samples(self) -> Float[np.ndarray, "2"]:
         """How many samples of each output count."""
-        return np.asarray(self.tape.weight)[self.counted].sum((0, 2))
+        return np.asarray(self.tape.weight)[self.fitted_blocks].sum((0, 2))
 
     @property
     def most_samples(self) -> float:
@@ -68,7 +68,7 @@ class Problem(eqx.Module):
     @property
     def sizes(self) -> Float[np.ndarray, "2"]:
         """Root mean square of each output as measured in the runs that count; zero where it was not."""
-        squares = np.square(np.asarray(self.tape.measured)[self.counted]).sum((0, 2))
+        squares = np.square(np.asarray(self.tape.measured)[self.fitted_blocks]).sum((0, 2))
         return np.sqrt(squares / np.maximum(self.samples, 1.0))
 
     @property
@@ -99,7 +99,7 @@ class Problem(eqx.Module):
         load = jnp.asarray(tape.load_unknown)
         twist = self.winds & drive.free
         own = jnp.stack([drive.voltage, drive.free, load, angle, twist], 1)
-        return jnp.concatenate([self.free[None, :] & self.counts[:, None], own], 1)
+        return jnp.concatenate([self.free[None, :] & self.fitted_runs[:, None], own], 1)
 
 
 class Evaluation(NamedTuple):
@@ -118,9 +118,9 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     # Levenberg-Marquardt traces under an empty mesh; under no mesh at all everything would be traced once more
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
         # whitened apart, for the simulation takes long to compile
-        bare = replace(problem, whitening=None, unknown=None)
+        bare = replace(problem, whitening=None, nuisance=None)
         simulated = (_evaluate if bare.parameters.effects else _evaluate_linear)(bare, unknowns)
-        return weighed(problem, _less_unknown(problem, simulated))
+        return weighed(problem, _less_nuisance(problem, simulated))
 
 
 def weighed(problem: Problem, plain: Evaluation) -> Evaluation:
@@ -140,26 +140,28 @@ def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
 _evaluate, _evaluate_linear = compiled(_evaluated), quickly_compiled(_evaluated)
 
 
-def _less_unknown(problem: Problem, plain: Evaluation) -> Evaluation:
+def _less_nuisance(problem: Problem, plain: Evaluation) -> Evaluation:
     """A free run with residuals and derivatives that are orthogonal to what else may have moved its outputs."""
-    return plain if problem.unknown is None else _orthogonal(problem, plain)
+    return plain if problem.nuisance is None else _orthogonal(problem, plain)
 
 
 @compiled
 def _orthogonal(problem: Problem, plain: Evaluation) -> Evaluation:
     tape = problem.tape
-    assert problem.unknown is not None
-    unknown = problem.unknown * (tape.weight / problem.noise[:, None])[..., None]
-    both = jnp.concatenate([unknown, plain.jacobian, plain.residuals[..., None]], -1)
-    products = jax.ops.segment_sum(jnp.einsum("bcsi,bcsj->bij", unknown, both), tape.run, tape.runs)
-    count = unknown.shape[-1]
+    assert problem.nuisance is not None
+    nuisance = problem.nuisance * (tape.weight / problem.noise[:, None])[..., None]
+    both = jnp.concatenate([nuisance, plain.jacobian, plain.residuals[..., None]], -1)
+    products = jax.ops.segment_sum(
+        jnp.einsum("bcsi,bcsj->bij", nuisance, both), tape.run, tape.runs
+    )
+    count = nuisance.shape[-1]
     gram, along = products[..., :count], products[..., count:]
     # runs with fewer unknowns have columns of zeros
     gram = (
         gram + jnp.eye(count) * jnp.where(jnp.diagonal(gram, axis1=1, axis2=2) > 0, 0, 1)[:, None]
     )
     share = jnp.linalg.solve(gram, along)
-    left = both[..., count:] - jnp.einsum("bcsi,bij->bcsj", unknown, share[tape.run])
+    left = both[..., count:] - jnp.einsum("bcsi,bij->bcsj", nuisance, share[tape.run])
     return Evaluation(plain.seen, left[..., -1], left[..., :-1])
 
 
@@ -173,13 +175,13 @@ def _whitened(problem: Problem, plain: Evaluation) -> Evaluation:
 
 @compiled
 def normal_matrix(
-    evaluation: Evaluation, tape: Tape, counts: Bool[Array, " runs"] | np.ndarray
+    evaluation: Evaluation, tape: Tape, fitted_runs: Bool[Array, " runs"] | np.ndarray
 ) -> Float[Array, "unknowns unknowns"]:
     """[J r]' [J r] over all unknowns: coordinates, then the locals run by run, then the residual."""
     _, r, jacobian = evaluation
     both = jnp.concatenate([jacobian, r[..., None]], -1)
     of_block = jnp.einsum("bcsi,bcsj->bij", both, both)
-    of_run = jax.ops.segment_sum(of_block, tape.run, tape.runs) * counts[:, None, None]
+    of_run = jax.ops.segment_sum(of_block, tape.run, tape.runs) * fitted_runs[:, None, None]
     index = _columns(jacobian.shape[-1] - LOCAL, tape.runs)
     size = index.max() + 1
     return jnp.zeros((size, size)).at[index[:, :, None], index[:, None, :]].add(of_run)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from .polish import gauss_newton
+from .polish import gauss_newton_step
 from .problem import Problem, Unknowns, evaluate, normal_matrix
 
 # A coordinate (natural logarithm) surer than this is as good as quadratic: its profile is not drawn.
@@ -53,8 +53,10 @@ def _refitted(
     unknowns = start._replace(coordinates=start.coordinates.at[index].set(value))
     count, squares = len(start.coordinates), np.inf
     for _ in range(REFITS):
-        matrix = np.array(normal_matrix(evaluate(problem, unknowns), problem.tape, problem.counts))
-        step, gain = gauss_newton(matrix, {index}, count)
+        matrix = np.array(
+            normal_matrix(evaluate(problem, unknowns), problem.tape, problem.fitted_runs)
+        )
+        step, gain = gauss_newton_step(matrix, {index}, count)
         squares = matrix[-1, -1] - gain
         moved = np.asarray(unknowns.coordinates) + step[:count]
         inside = np.clip(moved, problem.parameters.lower, problem.parameters.upper)

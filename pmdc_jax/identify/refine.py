@@ -17,7 +17,7 @@ from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflat
 STEPS = 60
 
 
-class Refined(NamedTuple):
+class Optimum(NamedTuple):
     """Where a refinement ended."""
 
     unknowns: Unknowns
@@ -47,7 +47,7 @@ def _factor(flat: Float[Array, " columns"], args) -> Float[Array, "columns+1 col
     # optimistix promotes strictly; with the usual promotion what was traced before is found again
     with jax.numpy_dtype_promotion("standard"):
         evaluation = evaluate(problem, _unscaled(problem, flat, begun, scale))
-        matrix = normal_matrix(evaluation, problem.tape, problem.counts)
+        matrix = normal_matrix(evaluation, problem.tape, problem.fitted_runs)
     stretch = jnp.append(scale, 1.0)
     matrix = matrix * stretch[:, None] * stretch / size
     # a failed simulation must look bad, not equal to nothing
@@ -77,14 +77,14 @@ def _levenberg_marquardt(problem: Problem, start: Unknowns, scale, size, toleran
     return ended, 2 * solution.state.f_info.as_min() * size
 
 
-def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-3) -> Refined:
+def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-3) -> Optimum:
     """Levenberg-Marquardt from a start, within the bounds.
 
     optimistix has no bounds, so they are an active set: a coordinate that ends beyond its bound is held there
     and the others are refined again.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
-    matrix = np.asarray(normal_matrix(evaluate(problem, start), problem.tape, problem.counts))
+    matrix = np.asarray(normal_matrix(evaluate(problem, start), problem.tape, problem.fitted_runs))
     size = max(matrix[-1, -1], 1e-30)
     # each run's own unknowns are measured in what changes the residual as much as e-fold in a parameter might
     lengths = np.sqrt(np.diag(matrix)[:-1] / size)
@@ -104,7 +104,7 @@ def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-3) -> Refine
         unknowns = unknowns._replace(coordinates=jnp.asarray(coordinates))
         if not beyond:
             break
-    return Refined(unknowns, float(squares) / problem.most_samples, tuple(sorted(held)), False)
+    return Optimum(unknowns, float(squares) / problem.most_samples, tuple(sorted(held)), False)
 
 
 def _without(free, held) -> Bool[Array, " parameters"]:

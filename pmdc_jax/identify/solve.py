@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -13,22 +13,26 @@ import numpy as np
 from ..progress import ReportProgress, silent
 from ..simulate import Tape
 from ..threads import beside, side_by_side_until
-from .averaged import without_averaging
 from .bounds import effect_bounds
+from .corrections.input_noise import without_input_noise
+from .corrections.input_timing import (
+    likelier_timings,
+    negative_log_likelihood_as_recorded,
+    with_timing,
+)
+from .corrections.speed_averaging import without_averaging
+from .corrections.spline_error import without_spline_error
+from .corrections.step_times import with_step_times
+from .corrections.uneven_sampling import on_clock
 from .identification import Search
-from .kinks import without_kinks
 from .parameters import Parameters
-from .polish import IDLE, Polished, polish, with_own
+from .polish import IDLE, Fit, polish, with_holdout_unknowns
 from .prepare import Prepared
 from .problem import Evaluation, Problem, Unknowns
-from .refine import Refined, refine
-from .resampling import on_clock
+from .refine import Optimum, refine
+from .rotor_angle import with_rotor_angle
 from .search import Found
 from .search import search as global_search
-from .steps import with_steps
-from .timing import how_unlikely, likelier_timings, with_timing
-from .turning import turned
-from .unfelt import without_unfelt
 
 STARTS = 4
 # Two refinements found the same optimum if their fitness agrees to this share.
@@ -36,7 +40,7 @@ SAME = 1e-4
 # A fit worse than this many times the noise asks for another search, up to so many.
 POOR = 1.5
 SEARCHES = 5
-TURNINGS = 3
+ANGLE_ITERATIONS = 3
 # Starts nearer to each other than this, in natural logarithms, are one.
 DISTINCT = 0.3
 
@@ -44,7 +48,7 @@ DISTINCT = 0.3
 class Solved(NamedTuple):
     """The best fit that a search and its refinements found, and how it was found."""
 
-    polished: Polished
+    fit: Fit
     search: Search
     seed: int
     interrupted: bool
@@ -59,29 +63,34 @@ def solve(
     **Returns**: the problem as `searched` leaves it, and then whatever takes out such a thing, and the fit.
     """
     recorded = given
-    given, solved = _mended(*searched(given, search, seed, progress))
-    timings = likelier_timings(given, solved.polished)
+    given, solved = _corrected(*searched(given, search, seed, progress))
+    timings = likelier_timings(given, solved.fit)
     acting = [with_timing(recorded, timing) for timing in timings]
-    otherwise = [_mended(*searched(taken, search, seed, progress)) for taken in acting]
-    found = [_stepped(*taken) for taken in [(given, solved), *otherwise]]
+    otherwise = [_corrected(*searched(taken, search, seed, progress)) for taken in acting]
+    found = []
+    for runs, ended in [(given, solved), *otherwise]:
+        runs, fit = with_step_times(runs, ended.fit)
+        found.append((runs, ended._replace(fit=fit)))
     if not otherwise:
         return found[0]
-    return min(found, key=lambda ended: how_unlikely(ended[0], ended[1].polished))
+    return min(found, key=lambda ended: negative_log_likelihood_as_recorded(ended[0], ended[1].fit))
 
 
-def _stepped(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
-    """The runs with steps of their voltages where they came, and the fit to them."""
-    given, polished = with_steps(given, solved.polished)
-    return given, solved._replace(polished=polished)
+# Of every set of runs, in this order: what is uneven hides all else, and a mean is told by a noise that is the sensor's
+CORRECTIONS: tuple[Callable[[Prepared, Fit], tuple[Prepared, Fit]], ...] = (
+    on_clock,
+    without_input_noise,
+    without_averaging,
+    without_spline_error,
+)
 
 
-def _mended(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
+def _corrected(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
     """The runs less what their sensors put into them, and the fit to them."""
-    given, polished = on_clock(given, with_own(given.problem, solved.polished))
-    given, polished = without_unfelt(given, polished)
-    given, polished = without_averaging(given, polished)
-    given, polished = without_kinks(given, polished)
-    return given, solved._replace(polished=polished)
+    fit = with_holdout_unknowns(given.problem, solved.fit)
+    for correct in CORRECTIONS:
+        given, fit = correct(given, fit)
+    return given, solved._replace(fit=fit)
 
 
 def searched(
@@ -130,15 +139,13 @@ def _where_effects_show(given: Prepared) -> Parameters:
     return given.parameters(effects, effect_bounds(effects, given.training))
 
 
-def settle(
-    given: Prepared, end: Refined, known: Evaluation | None = None
-) -> tuple[Prepared, Polished]:
+def settle(given: Prepared, end: Optimum, known: Evaluation | None = None) -> tuple[Prepared, Fit]:
     """Polish; again, as long as it helps, where a torque depends on how the better motor turns."""
     polished = polish(given.problem, end, known=known)
-    for _ in range(TURNINGS if given.problem.angular else 0):
-        again = given._replace(problem=turned(given.problem, polished))
-        better = polish(again.problem, polished.refined)
-        if not better.refined.fitness < (1 - IDLE) * polished.refined.fitness:
+    for _ in range(ANGLE_ITERATIONS if given.problem.angular else 0):
+        again = given._replace(problem=with_rotor_angle(given.problem, polished))
+        better = polish(again.problem, polished.optimum)
+        if not better.fitness < (1 - IDLE) * polished.fitness:
             break
         given, polished = again, better
     return given, polished
@@ -167,21 +174,21 @@ def _distinct(found: Found, parameters: Parameters) -> list[np.ndarray]:
     return kept
 
 
-def _refine_all(problem: Problem, found: Found) -> list[Refined]:
+def _refine_all(problem: Problem, found: Found) -> list[Optimum]:
     """Refine the best distinct candidates of a search, one a core at a time, until they agree; the best first."""
     starts = [_start(problem.tape, candidate) for candidate in _distinct(found, problem.parameters)]
 
-    def agreed(ends: list[Refined]) -> bool:
+    def agreed(ends: list[Optimum]) -> bool:
         return _agreed(sorted(ends, key=_fitness), problem.outputs)
 
     return sorted(side_by_side_until(lambda s: refine(problem, s), starts, agreed), key=_fitness)
 
 
-def _fitness(end: Refined) -> float:
+def _fitness(end: Optimum) -> float:
     return end.fitness
 
 
-def _agreed(ends: Sequence[Refined], outputs: int) -> bool:
+def _agreed(ends: Sequence[Optimum], outputs: int) -> bool:
     """Whether several starts ended in the best optimum, and it is as good as the noise or was found often.
 
     A misfit may be the model's, or an optimum of the search's own making: only another search can tell.
@@ -190,12 +197,12 @@ def _agreed(ends: Sequence[Refined], outputs: int) -> bool:
     return _times_found(ends) >= needed
 
 
-def _times_found(ends: Sequence[Refined]) -> int:
+def _times_found(ends: Sequence[Optimum]) -> int:
     fitness = np.array([end.fitness for end in ends])
     return int(np.sum(fitness <= fitness[0] * (1 + SAME) + 1e-12))
 
 
-def _search_record(method: str, found: Found, ends: Sequence[Refined]) -> Search:
+def _search_record(method: str, found: Found, ends: Sequence[Optimum]) -> Search:
     return Search(
         method=method,
         evaluations=found.evaluations,

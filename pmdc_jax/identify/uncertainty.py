@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.special import chdtri, stdtrit
 
 from ..simulate import LOCAL
-from .polish import Polished
+from .polish import Fit
 from .problem import Problem
 
 REACH = NormalDist().inv_cdf(0.975)  # of a 95 % interval, in standard errors
@@ -35,14 +35,18 @@ class Information(NamedTuple):
 
     covariance: Float[np.ndarray, "parameters parameters"]
     inflation: Float[np.ndarray, " parameters"]  # of the variance, over that for white residuals
-    reach: Float[np.ndarray, " parameters"]  # of a 95 % interval, in standard errors
-    blind: Float[np.ndarray, " parameters"]  # of the variance, what unseen directions leave open
+    interval_factor: Float[np.ndarray, " parameters"]  # of a 95 % interval, in standard errors
+    unseen_variance: Float[
+        np.ndarray, " parameters"
+    ]  # of the variance, what unseen directions leave open
     unseen: tuple[np.ndarray, ...]  # unit vectors, logarithms of parameters
 
     @property
-    def hidden(self) -> Float[np.ndarray, " parameters"]:
+    def unseen_share(self) -> Float[np.ndarray, " parameters"]:
         """How much of each coordinate's unit vector lies within the unseen directions, 0 to 1."""
-        return np.sqrt(sum((np.square(d) for d in self.unseen), np.zeros(len(self.blind))))
+        return np.sqrt(
+            sum((np.square(d) for d in self.unseen), np.zeros(len(self.unseen_variance)))
+        )
 
 
 class Part(NamedTuple):
@@ -52,11 +56,11 @@ class Part(NamedTuple):
     score: Float[np.ndarray, " parameters"]
 
 
-def information_of(problem: Problem, polished: Polished) -> Information:
+def information_of(problem: Problem, polished: Fit) -> Information:
     """What the runs that count tell about the coordinates that a fit left free; see `information`."""
-    found, held = polished.evaluation, polished.refined.at_bound
+    found, held = polished.evaluation, polished.at_bound
     free = np.array([k not in held for k in range(len(problem.parameters.names))])
-    runs = int(np.sum(problem.counts))
+    runs = int(np.sum(problem.fitted_runs))
     return information(found.residuals, found.jacobian, problem.tape.run, free, runs)
 
 
@@ -94,18 +98,20 @@ def information(residuals, jacobian, run, free: np.ndarray, runs: int) -> Inform
             J = J.reshape(-1, count)
             parts.append(Part(J.T @ J, score.sum(0)))
     hessian = np.sum([part.hessian for part in parts], 0)
-    unseen, root, blind = _split(hessian, free)
+    unseen, root, left_open = _split(hessian, free)
     inverse = root @ root.T
     spread = np.asarray(sum(long_run_variance(score @ inverse) for score in scores))
     white = np.diag(inverse)
     by_parts, reach = _by_parts(parts, root)
     variance = np.maximum(np.maximum(np.diag(spread), white), by_parts)
-    stretch = np.sqrt(_over(variance, np.diag(spread)))
+    stretch = np.sqrt(_ratio_or_one(variance, np.diag(spread)))
     covariance = spread * stretch[:, None] * stretch
-    return Information(covariance + blind, _over(variance, white), reach, np.diag(blind), unseen)
+    return Information(
+        covariance + left_open, _ratio_or_one(variance, white), reach, np.diag(left_open), unseen
+    )
 
 
-def _over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _ratio_or_one(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(b > 0, a / np.where(b > 0, b, 1.0), 1.0)
 
 
@@ -123,9 +129,9 @@ def _by_parts(
         shares.append(np.square(along) @ known)
     n, moved, shares = len(parts), np.square(moved), np.array(shares)
     variance, white = moved.sum(0) * (n - 1) / n, np.square(root).sum(1)
-    deciding = _over(shares.sum(0) ** 2, np.square(shares).sum(0))
+    deciding = _ratio_or_one(shares.sum(0) ** 2, np.square(shares).sum(0))
     clear = variance > white * chdtri(deciding, BY_CHANCE) / deciding
-    freedom = np.maximum(_over(moved.sum(0) ** 2, np.square(moved).sum(0)), 2.0)
+    freedom = np.maximum(_ratio_or_one(moved.sum(0) ** 2, np.square(moved).sum(0)), 2.0)
     return np.where(clear, variance, 0.0), np.where(clear, stdtrit(freedom, 0.975), REACH)
 
 

@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from ..simulate import Tape
-from .colour import Series, Whitener
 from .noise import FLOOR
-from .polish import WORTH, Polished, polish, taken_over
+from .noise_model import Series, Whitener
+from .polish import WORTH, Fit, polish, reweighted
 from .prepare import Prepared
 from .whitening import Whitening
 
@@ -26,40 +26,38 @@ STEPS = 8
 NEAR = 1.1
 
 
-def last_fit(
-    given: Prepared, plainly: Polished, near: Polished, white: Whitener
-) -> tuple[Prepared, Polished]:
+def last_fit(given: Prepared, plainly: Fit, near: Fit, white: Whitener) -> tuple[Prepared, Fit]:
     """The fit to residuals that a filter makes white, found from a fit `near` it, if plain least squares asks for it.
 
     Not where it is far from reproducing the runs as they are, as where the motor has an effect that the model lacks
     or a formula is not quite nature's: the filter then takes what is missing for noise.
     """
-    if white.is_plain or _is_exact(given, plainly):
+    if white.is_white or _is_exact(given, plainly):
         return given, plainly
     sharp = sharpened(given, near, white)
-    as_it_is = polish(given.problem, sharp[1].refined, steps=0).refined.fitness
-    return sharp if as_it_is < NEAR * plainly.refined.fitness else (given, plainly)
+    as_it_is = polish(given.problem, sharp[1].optimum, steps=0).fitness
+    return sharp if as_it_is < NEAR * plainly.fitness else (given, plainly)
 
 
-def _is_exact(given: Prepared, fit: Polished) -> bool:
+def _is_exact(given: Prepared, fit: Fit) -> bool:
     """Whether nothing is left but rounding errors, as of a simulation without noise."""
     there = given.problem.samples > 0
     return bool(np.all(fit.noise[there] < 2 * FLOOR * given.problem.sizes[there]))
 
 
 def sharpened(
-    given: Prepared, near: Polished, white: Whitener, worth: float = WORTH
-) -> tuple[Prepared, Polished]:
+    given: Prepared, near: Fit, white: Whitener, worth: float = WORTH
+) -> tuple[Prepared, Fit]:
     """The problem of fitting to residuals that a filter makes white, and its solution from a plain fit nearby."""
     given = whitened(given, white)
-    known = taken_over(given.problem, near)
-    return given, polish(given.problem, near.refined, STEPS, worth, known)
+    known = reweighted(given.problem, near)
+    return given, polish(given.problem, near.optimum, STEPS, worth, known)
 
 
-def squares_of(given: Prepared, polished: Polished) -> float:
+def squares_of(given: Prepared, polished: Fit) -> float:
     """The sum of squares that a fit leaves of the training runs."""
     residuals = np.asarray(polished.evaluation.residuals)
-    return float(np.square(residuals[given.problem.counted]).sum())
+    return float(np.square(residuals[given.problem.fitted_blocks]).sum())
 
 
 def whitened(given: Prepared, white: Whitener) -> Prepared:
@@ -81,7 +79,7 @@ def training_runs(given: Prepared) -> list[int]:
     return [run for run, role in enumerate(given.roles) if role == "train"]
 
 
-def residuals_of(given: Prepared, fit: Polished) -> list[Series]:
+def residuals_of(given: Prepared, fit: Fit) -> list[Series]:
     """What is measured less what is simulated, A and rad/s, of every training run in the order of time."""
     signal = -np.asarray(fit.evaluation.residuals) * fit.noise[:, None]
     return [series_of(given.problem.tape, run, signal) for run in training_runs(given)]

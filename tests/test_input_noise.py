@@ -10,7 +10,7 @@ from scipy.signal import cont2discrete
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import identify
-from pmdc_jax.identify.unfelt import smoothed
+from pmdc_jax.identify.corrections.input_noise import smoothed
 from pmdc_jax.recording import Recording
 
 NOISE = 0.1  # V

@@ -8,7 +8,6 @@ undone: the derivative of a cubic spline through the same angles is the speed th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,11 +15,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_banded
 
-from ..simulate import Tape
-from .likelihood import LIKELIER, Samples, unlikely
-from .noise import quantum
-from .polish import Polished, polish
-from .prepare import Prepared
+from ...simulate import Tape
+from ..likelihood import LIKELIER, Samples, negative_log_likelihood
+from ..noise import quantum
+from ..polish import Fit, polish
+from ..prepare import Prepared
 
 # An encoder has fewer lines, and a whole number of them
 LINES, WHOLE = 2e4, 0.02
@@ -34,7 +33,7 @@ BANDS = ((0.4, 0.6), (0.9, 0.95), (0.98, 1.0))
 NONE = 1 / 8
 
 
-class Sensed(NamedTuple):
+class Averaging(NamedTuple):
     """What a sensor may make of a speed, to third order in the sample time, and how to undo it.
 
     The samples at both ends are as given, or nearly so.
@@ -68,21 +67,20 @@ def _last_undone(mean: Samples) -> Samples:
     return two_undone((mean + ahead) / 2)
 
 
-TWO = Sensed("the last and the next sample", _over_two, two_undone)
-LAST = Sensed("the last sample", _over_last, _last_undone)
-LATE = Sensed("", lambda x: np.append(x[:1], x[:-1]), lambda x: np.append(x[1:], x[-1:]))
+TWO = Averaging("the last and the next sample", _over_two, two_undone)
+LAST = Averaging("the last sample", _over_last, _last_undone)
+LATE = Averaging("", lambda x: np.append(x[:1], x[:-1]), lambda x: np.append(x[1:], x[-1:]))
 
 
 def of_averaged(given: Prepared) -> Callable[[Samples], Samples]:
     """What the sensors of runs made of their speeds, as far as it was undone."""
-    return {TWO.over: TWO.of, LAST.over: LAST.of}.get(given.averaged, lambda speed: speed)
+    return given.averaging.of if given.averaging else lambda speed: speed
 
 
 def as_recorded(given: Prepared) -> Prepared:
     """The runs with their outputs as recorded, whatever was undone."""
     measured = jnp.asarray(Tape.from_recordings(given.runs).measured)
-    problem = replace(given.problem, tape=replace(given.problem.tape, measured=measured))
-    return given._replace(problem=problem, averaged="")
+    return given.with_tape(measured=measured)._replace(averaging=None)
 
 
 def seems_averaged(given: Prepared) -> bool:
@@ -91,7 +89,7 @@ def seems_averaged(given: Prepared) -> bool:
     return bool(counts) and counted_over(counts)[0] is not None
 
 
-def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
+def without_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the speed itself where a mean was recorded, and the fit to them.
 
     A mean over the last sample is told from a delay only if the speed is counted, and from an inductance only beside
@@ -105,18 +103,18 @@ def without_averaging(given: Prepared, fit: Polished) -> tuple[Prepared, Polishe
     if mean is None or (mean is LAST and not given.problem.samples[0] > 0):
         return given, fit
     undone, better = _without(given, fit, mean)
-    left = unlikely(given, better, mean.of)
-    if not unlikely(given, fit) - left > enough:
+    left = negative_log_likelihood(given, better, mean.of)
+    if not negative_log_likelihood(given, fit) - left > enough:
         return given, fit
     if not counts:
         # a mean over two samples is in time as it is; undone, it has another noise than what is but late
-        last, late = (_without(given, fit, sensed)[1] for sensed in (LAST, LATE))
-        if unlikely(given, last, LAST.of) < left or late.refined.fitness < fit.refined.fitness:
+        last, late = (_without(given, fit, other)[1] for other in (LAST, LATE))
+        if negative_log_likelihood(given, last, LAST.of) < left or late.fitness < fit.fitness:
             return given, fit
     return undone, better
 
 
-def counted_over(counts: Sequence[np.ndarray]) -> tuple[Sensed | None, float]:
+def counted_over(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
     """Of what speeds are the mean that are multiples of a count a sample, if of anything; and how much likelier that
     must make them, by the logarithm; if less than nothing, no less likely by more.
 
@@ -131,7 +129,7 @@ def counted_over(counts: Sequence[np.ndarray]) -> tuple[Sensed | None, float]:
     return TWO if highest < NONE * high else None, -LIKELIER
 
 
-def differenced_over(speeds: Sequence[np.ndarray]) -> tuple[Sensed | None, float]:
+def differenced_over(speeds: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
     """The same of other speeds: nothing of differences over two samples is at the highest frequency, but of any other
     signal with noise or steps there is as much as near it."""
     _, high, highest = _powers(speeds) if speeds else (0.0, 0.0, 0.0)
@@ -155,7 +153,7 @@ def _powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
     return np.mean(powers, axis=0)
 
 
-def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, Polished]:
+def _without(given: Prepared, fit: Fit, averaging: Averaging) -> tuple[Prepared, Fit]:
     """The runs with the speed of which a mean was recorded, and the fit to them."""
     tape = given.problem.tape
     measured = np.array(tape.measured)
@@ -164,10 +162,10 @@ def _without(given: Prepared, fit: Polished, sensed: Sensed) -> tuple[Prepared, 
         known = np.asarray(tape.weight)[mine, 1].ravel() > 0
         if known.sum() > 2 and not given.differentiated[run]:
             speed = measured[mine, 1].ravel()
-            speed[known] = sensed.undone(speed[known])
+            speed[known] = averaging.undone(speed[known])
             measured[mine, 1] = speed.reshape(-1, measured.shape[2])
-    problem = replace(given.problem, tape=replace(tape, measured=jnp.asarray(measured)))
-    return given._replace(problem=problem, averaged=sensed.over), polish(problem, fit.refined)
+    undone = given.with_tape(measured=jnp.asarray(measured))._replace(averaging=averaging)
+    return undone, polish(undone.problem, fit.optimum)
 
 
 def _speeds(given: Prepared) -> list[tuple[np.ndarray, float]]:

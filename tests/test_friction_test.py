@@ -10,7 +10,7 @@ from scipy.signal import lsim
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import Motor, identify
-from pmdc_jax.identify.dry import _load_filter, _response
+from pmdc_jax.identify.friction_test import _load_filter, _response
 from pmdc_jax.recording import Recording
 from pmdc_jax.simulate import Tape
 

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from benchmarks.naming.plant import Plant, simulate
 from benchmarks.virtual_bench import prbs, staircase
 from pmdc_jax import identify
-from pmdc_jax.identify.averaged import LAST, TWO, counted_over, differenced_over
+from pmdc_jax.identify.corrections.speed_averaging import LAST, TWO, counted_over, differenced_over
 from pmdc_jax.identify.noise import quantum
 from pmdc_jax.recording import Recording
 

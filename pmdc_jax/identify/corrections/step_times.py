@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import expm
 
-from ..recording import Recording
-from ..simulate.tape import BLOCK
-from .averaged import of_averaged
-from .likelihood import LIKELIER, unlikely
-from .polish import Polished, polish
-from .prepare import Prepared
-from .problem import Problem
+from ...recording import Recording
+from ...simulate.tape import BLOCK
+from ..likelihood import LIKELIER, negative_log_likelihood
+from ..polish import Fit, polish
+from ..prepare import Prepared
+from ..problem import Problem
+from .speed_averaging import of_averaged
 
 # A step is so many times what the voltage does from sample to sample around it, and this share of its range
 STANDS_OUT, LARGE = 10.0, 0.05
@@ -35,8 +35,6 @@ SPREAD, OUTSIDE = 0.15, 0.2
 # Each of them must make the runs so much likelier
 EACH = 5.0
 PASSES = 5
-# What is said of the voltage
-STEPPED = "steps between samples"
 # Squares by which a step shows, as a share of those of the one that shows most, below which it does not
 HARDLY = 1e-8
 
@@ -49,7 +47,7 @@ class Steps(NamedTuple):
     share: Float[np.ndarray, " steps"]  # of the sample before, for how long they had come
 
 
-def with_steps(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
+def with_step_times(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the steps of their voltages where the motor felt them, and the fit to them; both as they are if
     these steps come with the samples, or all as late."""
     problem = given.problem
@@ -69,9 +67,11 @@ def with_steps(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
         if again:
             steps, _ = _moved(placed.problem, better, steps)
         placed = _placed(given, better, steps)
-        better = polish(placed.problem, better.refined)
+        better = polish(placed.problem, better.optimum)
     sensed = of_averaged(given)
-    gained = unlikely(given, fit, sensed) - unlikely(given, better, sensed)
+    gained = negative_log_likelihood(given, fit, sensed) - negative_log_likelihood(
+        given, better, sensed
+    )
     return (placed, better) if gained > enough else (given, fit)
 
 
@@ -97,7 +97,7 @@ def _come_anywhere(steps: Sequence[Steps]) -> bool:
     return bool(np.mean(inside) > 1 - OUTSIDE and np.std(np.clip(share, 0, 1)) > SPREAD)
 
 
-def _moved(problem: Problem, fit: Polished, steps: Sequence[Steps]) -> tuple[list[Steps], float]:
+def _moved(problem: Problem, fit: Fit, steps: Sequence[Steps]) -> tuple[list[Steps], float]:
     """The steps at the times that make the misfit of a fit least, and by how much that is likelier in white noise."""
     tape = problem.tape
     scale = np.asarray(tape.weight) / fit.noise[:, None]
@@ -115,16 +115,16 @@ def _moved(problem: Problem, fit: Polished, steps: Sequence[Steps]) -> tuple[lis
     return moved, squares / 2
 
 
-def _placed(given: Prepared, fit: Polished, steps: Sequence[Steps]) -> Prepared:
+def _placed(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
     """The runs with steps at their times, and these as unknowns."""
     problem, tape = given.problem, given.problem.tape
     value = np.array(tape.value)
     rise = np.zeros_like(value) if tape.rise is None else np.array(tape.rise)
     most = max(len(s.at) for s in steps)
-    unknown = np.zeros((*np.shape(tape.measured), most))
+    nuisance = np.zeros((*np.shape(tape.measured), most))
     for run, s in enumerate(steps):
         mine = np.flatnonzero(tape.blocks_of(run))
-        unknown[mine, ..., : len(s.at)] = _responses(problem, fit, run, s)
+        nuisance[mine, ..., : len(s.at)] = _responses(problem, fit, run, s)
         share = np.clip(s.share, 0.0, 1.0)
         block, sample = np.divmod(s.at - 1, BLOCK)
         before = given.runs[run].voltage
@@ -134,17 +134,17 @@ def _placed(given: Prepared, fit: Polished, steps: Sequence[Steps]) -> Prepared:
             value[mine[block], sample] = before[s.at - 1] + share * s.height
             rise[mine[block], sample] = 6 * share * (1 - share) * s.height
     tape = replace(tape, value=jnp.asarray(value), rise=jnp.asarray(rise))
-    problem = replace(problem, tape=tape, unknown=jnp.asarray(unknown))
-    return given._replace(problem=problem, timing=STEPPED)
+    problem = replace(problem, tape=tape, nuisance=jnp.asarray(nuisance))
+    return given._replace(problem=problem, stepped=True)
 
 
 def _responses(
-    problem: Problem, fit: Polished, run: int, steps: Steps
+    problem: Problem, fit: Fit, run: int, steps: Steps
 ) -> Float[np.ndarray, "blocks 2 samples steps"]:
     """What the outputs of a run gain, in A and rad/s, as each of its steps comes a sample earlier: as fast as at the
     time where it is."""
     tape, step = problem.tape, problem.tape.sample_time_of(run)
-    motor = problem.parameters(fit.refined.unknowns.coordinates)
+    motor = problem.parameters(fit.coordinates)
     A, B = map(np.asarray, motor.state_space(tape.drive_of(run)))
     length = int(tape.blocks_of(run).sum()) * BLOCK
     after = _powers(expm(A * step), length)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from scipy import fft, ndimage
 
 from ..simulate import free_run
-from .polish import Polished
+from .polish import Fit
 from .problem import Problem, apart
 
 # Neighbouring frequencies over which the power of a misfit is averaged
@@ -18,18 +18,18 @@ NEIGHBOURS = 33
 MEDIAN = 0.4549
 
 
-def of_rotor(problem: Problem, fit: Polished) -> Float[Array, "blocks 2 samples"]:
+def of_rotor(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
     """Current and speed of the rotor itself, A and rad/s, where its sensors make something else of them: a free run."""
     effects = problem.parameters.effects
     if all(effect.equation != "sensor" for effect in effects):
         return fit.evaluation.seen
-    unknowns = fit.refined.unknowns
+    unknowns = fit.unknowns
     motor, local = problem.parameters(unknowns.coordinates), jnp.asarray(unknowns.local)
     bare = motor.with_effects(effect for effect in motor.effects if effect.equation != "sensor")
     return free_run(bare, problem.tape, *apart(local))
 
 
-def turned(problem: Problem, fit: Polished) -> Problem:
+def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
     """The problem with its rotor turned as well as recordings and simulation together tell.
 
     The angle is the integral of the speed. That of the measured one strays by the sensor's noise, that of the

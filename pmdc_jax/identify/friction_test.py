@@ -18,11 +18,11 @@ from scipy.signal import lfilter, ss2tf
 
 from ..motor import Motor
 from ..simulate import LOCAL, Tape
-from .colour import Series, Whitener, plain, whitener
+from .generalised_least_squares import residuals_of, series_of, training_runs
 from .identification import Identification
-from .polish import Polished
+from .noise_model import Series, Whitener, plain, whitener
+from .polish import Fit
 from .prepare import Prepared
-from .sharpen import residuals_of, series_of, training_runs
 
 # So many standard errors are no chance
 CLEARLY = 5.0
@@ -45,7 +45,7 @@ class Missing(NamedTuple):
     moved: Float[np.ndarray, " parameters"]  # how far the coordinates would move with it
 
 
-def missing_friction(given: Prepared, fit: Polished) -> Missing | None:
+def missing_friction(given: Prepared, fit: Fit) -> Missing | None:
     """The dry friction that a fit lacks by the runs it was fitted to; None if it has some, or lacks none clearly."""
     problem, count = given.problem, len(given.problem.free)
     if any(effect.holds == "speed" for effect in problem.parameters.effects):
@@ -78,11 +78,11 @@ def of_friction(missing: Missing | None, found: Identification) -> Iterator[str]
         )
 
 
-def _rows(given: Prepared, fit: Polished) -> list[Series]:
+def _rows(given: Prepared, fit: Fit) -> list[Series]:
     """Of every training run: the derivatives by the motor's parameters, what dry friction of one newton metre would
     change, the derivatives by what is the run's own, and last the residual; in A and rad/s."""
     problem, tape = given.problem, given.problem.tape
-    motor, count = problem.parameters(fit.refined.unknowns.coordinates), len(problem.free)
+    motor, count = problem.parameters(fit.coordinates), len(problem.free)
     of_grid = {tape.grid_of(run): run for run in training_runs(given)}
     filters = {grid: _load_filter(motor, tape, run) for grid, run in of_grid.items()}
     J = np.asarray(fit.evaluation.jacobian) * fit.noise[:, None, None]

@@ -16,39 +16,39 @@ from .identifiability import SHARE, explain
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import white_noise
 from .parameters import Parameters, unit_of
-from .polish import Polished, fit_own, polish
+from .polish import Fit, fit_run_unknowns, polish
 from .prepare import Prepared
 from .problem import Problem
 from .profile import QUADRATIC, profile_interval
-from .refine import Refined
+from .refine import Optimum
 from .solve import SAME, Solved
 from .uncertainty import FLAT, Information, information_of
 
-TIDYINGS = 3
+TIE_ITERATIONS = 3
 # What a fit leaves is told of if it is so many times the white noise
 MISSED = 2.0
 # Of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
-# A parameter is unseen alone if so much of it is hidden
+# A parameter is unseen alone if so much of it is unseen at all
 ALONE = 0.99
 # ... and large enough to show if it changes the outputs by this share of what the strongest one does
 TO_SHOW = 0.3
 
 
-def judge(given: Prepared, solved: Solved) -> Identification:
+def results_of(given: Prepared, solved: Solved) -> Identification:
     """What a fit tells of every parameter and of every run."""
     problem, training = given.problem, given.training
-    polished = _let_go(problem, solved.polished)
+    polished = _released_from_bounds(problem, solved.fit)
     parameters = problem.parameters
     info = information_of(problem, polished)
-    chosen = _tidy(problem, polished, info)
-    lifted = [_lifted(problem, chosen, k) for k in _vanished(parameters, info)]
+    chosen = _with_Kt_equal_Kb(problem, polished, info)
+    lifted = [_refit_with_visible(problem, chosen, k) for k in _invisible_alone(parameters, info)]
     alike = [information_of(problem, fit) for fit in lifted if fit is not None]
-    info = max(info, *alike, key=lambda i: i.hidden.sum()) if alike else info
-    best = chosen.refined
+    info = max(info, *alike, key=lambda i: i.unseen_share.sum()) if alike else info
+    best = chosen.optimum
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
-    unknowns, ended = fit_own(problem, best.unknowns)
+    unknowns, ended = fit_run_unknowns(problem, best.unknowns)
     fit = _fits(
         given.runs, given.roles, problem.tape, np.asarray(ended.seen), np.asarray(unknowns.local)
     )
@@ -72,15 +72,15 @@ def judge(given: Prepared, solved: Solved) -> Identification:
 
 
 def _intervals(
-    problem: Problem, best: Refined, info: Information
+    problem: Problem, best: Optimum, info: Information
 ) -> dict[int, tuple[float, float]]:
     """The 95 % intervals of the coordinates that have one, as many at a time as there are cores."""
     coordinates = np.asarray(best.unknowns.coordinates)
 
     def interval(k: int) -> tuple[float, float]:
-        spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.reach[k])
+        spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.interval_factor[k])
         # no refit follows an unseen direction as far as the truth may lie along it
-        hidden = info.blind[k] > info.covariance[k, k] / 2
+        hidden = info.unseen_variance[k] > info.covariance[k, k] / 2
         if not problem.parameters.logarithmic[k] or spread < QUADRATIC or hidden:
             return coordinates[k] - reach * spread, coordinates[k] + reach * spread
         return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
@@ -89,51 +89,51 @@ def _intervals(
     return dict(zip(identified, side_by_side(interval, identified), strict=True))
 
 
-def _let_go(problem: Problem, polished: Polished) -> Polished:
+def _released_from_bounds(problem: Problem, polished: Fit) -> Fit:
     """The fit with no coordinate held at its bound that lies there by chance, along an unseen direction of several."""
 
-    def released(held: Sequence[int]) -> Polished:
-        return polished._replace(refined=polished.refined._replace(at_bound=tuple(held)))
+    def released(held: Sequence[int]) -> Fit:
+        return polished._replace(optimum=polished.optimum._replace(at_bound=tuple(held)))
 
-    bound = polished.refined.at_bound
+    bound = polished.at_bound
     unseen = information_of(problem, released(())).unseen if bound else ()
     several = [d for d in unseen if np.max(np.abs(d)) <= ALONE]
     return released([k for k in bound if all(abs(d[k]) <= SHARE for d in several)])
 
 
-def _vanished(parameters: Parameters, info: Information) -> list[int]:
+def _invisible_alone(parameters: Parameters, info: Information) -> list[int]:
     """Positive parameters that alone change nothing, as where one is next to nothing."""
-    return [int(k) for k in np.flatnonzero(info.hidden > ALONE) if parameters.logarithmic[k]]
+    return [int(k) for k in np.flatnonzero(info.unseen_share > ALONE) if parameters.logarithmic[k]]
 
 
-def _lifted(problem: Problem, polished: Polished, k: int) -> Polished | None:
+def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
     """A fit as good with a parameter as large as to show, if there is one: only there it shows what it trades with.
 
     Where voltage and speed alone are measured, friction may be nothing, and then Kb is what turns a volt into speed;
     or friction takes its share of the volt, and Kb is less.
     """
-    jacobian = np.asarray(polished.evaluation.jacobian)[problem.counted]
+    jacobian = np.asarray(polished.evaluation.jacobian)[problem.fitted_blocks]
     lengths = np.sqrt(np.square(jacobian[..., : len(problem.free)]).sum((0, 1, 2)))
-    coordinates = np.array(polished.refined.unknowns.coordinates)
+    coordinates = np.array(polished.coordinates)
     coordinates[k] += np.log(TO_SHOW * lengths.max() / max(lengths[k], 1e-300))
     coordinates[k] = np.clip(
         coordinates[k], problem.parameters.lower[k], problem.parameters.upper[k]
     )
-    unknowns = polished.refined.unknowns._replace(coordinates=jnp.asarray(coordinates))
+    unknowns = polished.unknowns._replace(coordinates=jnp.asarray(coordinates))
     held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
-    lifted = polish(held, polished.refined._replace(unknowns=unknowns))
+    lifted = polish(held, polished.optimum._replace(unknowns=unknowns))
     # no fit at all, if it ended where nothing can be simulated
-    as_good = lifted.refined.fitness <= polished.refined.fitness * (1 + SAME)
-    return polish(problem, lifted.refined._replace(at_bound=()), steps=0) if as_good else None
+    as_good = lifted.fitness <= polished.fitness * (1 + SAME)
+    return polish(problem, lifted.optimum._replace(at_bound=()), steps=0) if as_good else None
 
 
-def _tidy(problem: Problem, polished: Polished, info: Information) -> Polished:
+def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit:
     """Along an unseen direction in which Kt may be anything, choose Kt = Kb, equals in SI.
 
     The direction is straight only nearby, so whatever else is free is refined again; a fit that is worse
     then is no choice.
     """
-    names, best = problem.parameters.names, polished.refined
+    names, best = problem.parameters.names, polished.optimum
     if "Kt" not in names or "Kb" not in names:
         return polished
     k, b = names.index("Kt"), names.index("Kb")
@@ -142,13 +142,13 @@ def _tidy(problem: Problem, polished: Polished, info: Information) -> Polished:
         return polished
     held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
     tidied = polished
-    for _ in range(TIDYINGS):  # Kb moves a little as well
-        coordinates = np.array(tidied.refined.unknowns.coordinates)
+    for _ in range(TIE_ITERATIONS):  # Kb moves a little as well
+        coordinates = np.array(tidied.coordinates)
         coordinates += along[0] * (coordinates[b] - coordinates[k]) / along[0][k]
         coordinates[k] = coordinates[b]
-        unknowns = tidied.refined.unknowns._replace(coordinates=jnp.asarray(coordinates))
-        tidied = polish(held, tidied.refined._replace(unknowns=unknowns))
-    return tidied if tidied.refined.fitness <= best.fitness * (1 + SAME) else polished
+        unknowns = tidied.unknowns._replace(coordinates=jnp.asarray(coordinates))
+        tidied = polish(held, tidied.optimum._replace(unknowns=unknowns))
+    return tidied if tidied.fitness <= best.fitness * (1 + SAME) else polished
 
 
 def _plain(motor: Motor) -> Motor:
@@ -161,7 +161,7 @@ def _plain(motor: Motor) -> Motor:
 
 def _estimates(
     parameters: Parameters,
-    best: Refined,
+    best: Optimum,
     info: Information,
     given: Prepared,
     intervals: Mapping[int, tuple[float, float]],
@@ -196,10 +196,10 @@ def _estimates(
     return estimates
 
 
-def _status(k: int, best: Refined, info: Information) -> Status:
+def _status(k: int, best: Optimum, info: Information) -> Status:
     if k in best.at_bound:
         return "at_bound"
-    if info.hidden[k] > SHARE or np.sqrt(info.covariance[k, k]) > FLAT:
+    if info.unseen_share[k] > SHARE or np.sqrt(info.covariance[k, k]) > FLAT:
         return "not_identifiable"
     return "identified"
 
@@ -269,16 +269,17 @@ def missed(fit: Mapping[str, RunFit]) -> Iterator[str]:
 
 def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:
     messages = [
-        f"{run.name}: the {run.drive} holds {given.unfelt[run.name]:.3g} {UNITS[run.drive]} of noise that the motor "
-        "did not feel: it was taken out"
+        f"{run.name}: the {run.drive} holds {given.input_noise[run.name]:.3g} {UNITS[run.drive]} of noise that the "
+        "motor did not feel: it was taken out"
         for run in given.runs
-        if run.name in given.unfelt
+        if run.name in given.input_noise
     ]
-    if given.timing:
-        messages.append(f"the voltage {given.timing}: it is taken for that")
-    if given.averaged:
+    acts = "steps between samples" if given.stepped else given.timing and given.timing.what
+    if acts:
+        messages.append(f"the voltage {acts}: it is taken for that")
+    if given.averaging:
         messages.append(
-            f"the speed is a mean over {given.averaged}, as differences of an angle are: it is taken for that"
+            f"the speed is a mean over {given.averaging.over}, as differences of an angle are: it is taken for that"
         )
     if solved.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")

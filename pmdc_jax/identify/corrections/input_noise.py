@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..simulate import Tape, uniform
-from .colour import whitener
-from .likelihood import unlikely
-from .polish import Polished, polish
-from .prepare import Prepared
-from .problem import Problem
-from .sharpen import series_of
+from ...simulate import Tape, uniform
+from ..generalised_least_squares import series_of
+from ..likelihood import negative_log_likelihood
+from ..noise_model import whitener
+from ..polish import Fit, polish
+from ..prepare import Prepared
+from ..problem import Problem
 
 # Noise of a smaller share of the largest value is rounding
 ROUNDING = 1e-7
@@ -39,7 +39,7 @@ FELT, CLEAR = 0.5, 5.0
 MISSED = 1.1
 
 
-def without_unfelt(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
+def without_input_noise(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with what drives them smoothed where the motor did not feel its rough part, and the fit to them.
 
     **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if nothing was found, or makes
@@ -50,18 +50,18 @@ def without_unfelt(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     if not any(map(np.any, rough)):
         return given, fit
     smooth = _driven(given, [d - r for d, r in zip(drives, rough, strict=True)])
-    felt = _felt(given, fit, polish(smooth, fit.refined, steps=0))
+    felt = _felt(given, fit, polish(smooth, fit.optimum, steps=0))
     if not any(share < 1 for share in felt):
         return given, fit
     lost = [(1 - share) * r for share, r in zip(felt, rough, strict=True)]
     problem = _driven(given, [d - x for d, x in zip(drives, lost, strict=True)])
-    better = polish(problem, fit.refined)
-    if unlikely(given, better) > unlikely(given, fit):
+    better = polish(problem, fit.optimum)
+    if negative_log_likelihood(given, better) > negative_log_likelihood(given, fit):
         return given, fit
-    unfelt = {
+    taken = {
         run.name: float(np.std(x)) for run, x in zip(given.runs, lost, strict=True) if np.any(x)
     }
-    return given._replace(problem=problem, unfelt=unfelt), better
+    return given._replace(problem=problem, input_noise=taken), better
 
 
 def _driven(given: Prepared, drives: list[np.ndarray]) -> Problem:
@@ -76,7 +76,7 @@ def _driven(given: Prepared, drives: list[np.ndarray]) -> Problem:
     return replace(given.problem, tape=replace(tape, value=value, rise=rise))
 
 
-def _felt(given: Prepared, rough: Polished, smooth: Polished) -> list[float]:
+def _felt(given: Prepared, rough: Fit, smooth: Fit) -> list[float]:
     """Of every run the share of the rough part that the motor felt, one unless it is clearly less than half.
 
     By regression of what the whole drive leaves on the response to its rough part, both made white by what the smooth

@@ -45,7 +45,7 @@ class Whitener:
     scales: list[Float[np.ndarray, "outputs outputs"]]
 
     @property
-    def is_plain(self) -> bool:
+    def is_white(self) -> bool:
         """Whether the noise is white, and as large in every run."""
         sizes: dict[tuple[int, ...], list[np.ndarray]] = {}
         for S in self.scales:

@@ -18,14 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..recording import Recording
-from ..simulate import Tape, uniform
-from .averaged import as_recorded, of_averaged, seems_averaged, without_averaging
-from .likelihood import LIKELIER, unlikely
-from .polish import Polished, polish
-from .prepare import Prepared
-from .problem import normal_matrix
-from .resampling import on_clock
+from ...recording import Recording
+from ...simulate import Tape, uniform
+from ..likelihood import LIKELIER, negative_log_likelihood
+from ..polish import Fit, polish
+from ..prepare import Prepared
+from ..problem import normal_matrix
+from .speed_averaging import as_recorded, of_averaged, seems_averaged, without_averaging
+from .uneven_sampling import on_clock
 
 # Another timing is not even asked where the misfit shows less than this share of half a sample
 SHOWS = 0.3
@@ -47,7 +47,7 @@ OTHERWISE = (
 )
 
 
-def likelier_timings(given: Prepared, fit: Polished) -> list[Timing]:
+def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
     """How the voltages of the runs may act: each way that is clearly likelier than the one that they are taken for.
 
     **Arguments**: `given`, the runs less what their sensors put into them; `fit`, to these.
@@ -56,18 +56,18 @@ def likelier_timings(given: Prepared, fit: Polished) -> list[Timing]:
         return []  # without a current, or without a speed, only a delay would show
     early = _early(given, fit)
     # a speed that is a mean over the last sample comes half a sample late, too, and may hide it
-    hidden = not given.averaged and seems_averaged(given)
+    hidden = given.averaging is None and seems_averaged(given)
     if abs(early) < SHOWS and not hidden:
         return []
 
     @cache
     def unlikely_with(timing: Timing) -> float:
         other = as_recorded(with_timing(given, timing))
-        nearer = polish(other.problem, fit.refined)
+        nearer = polish(other.problem, fit.optimum)
         # what is a mean over the last sample, and what is late, only a fit in time can tell
-        return how_unlikely(*without_averaging(*on_clock(other, nearer)))
+        return negative_log_likelihood_as_recorded(*without_averaging(*on_clock(other, nearer)))
 
-    enough = how_unlikely(given, fit) - LIKELIER
+    enough = negative_log_likelihood_as_recorded(given, fit) - LIKELIER
     asked = [t for t in OTHERWISE if hidden or (t.ahead < 0) == (early < 0)]
     clearly = [timing for timing in asked if unlikely_with(timing) < enough]
     if all(run.load is None for run in given.training):
@@ -75,13 +75,13 @@ def likelier_timings(given: Prepared, fit: Polished) -> list[Timing]:
     return [min(t, t._replace(load=True), key=unlikely_with) for t in clearly]
 
 
-def how_unlikely(given: Prepared, fit: Polished) -> float:
+def negative_log_likelihood_as_recorded(given: Prepared, fit: Fit) -> float:
     """How unlikely a fit makes the runs as recorded, but for their first samples: nobody can foretell these where a
     voltage acts later."""
-    return unlikely(_without_first(as_recorded(given)), fit, of_averaged(given))
+    return negative_log_likelihood(_without_first(as_recorded(given)), fit, of_averaged(given))
 
 
-def _early(given: Prepared, fit: Polished) -> float:
+def _early(given: Prepared, fit: Fit) -> float:
     """By how many halves of a sample the voltages seem to act before they are taken to: by regression of the misfit on
     what half a sample does, less what the parameters could do of it.
 
@@ -89,11 +89,11 @@ def _early(given: Prepared, fit: Polished) -> float:
     """
     means = with_timing(given, OTHERWISE[0]).problem
     means = replace(means, tape=replace(means.tape, rise=None))
-    sooner, evaluation = polish(means, fit.refined, steps=0).evaluation.seen, fit.evaluation
+    sooner, evaluation = polish(means, fit.optimum, steps=0).evaluation.seen, fit.evaluation
     scale = given.problem.tape.weight / fit.noise[:, None]
-    change = (sooner - evaluation.seen) * scale * given.problem.counted[:, None, None]
+    change = (sooner - evaluation.seen) * scale * given.problem.fitted_blocks[:, None, None]
     matrix = np.asarray(
-        normal_matrix(evaluation._replace(residuals=change), means.tape, means.counts)
+        normal_matrix(evaluation._replace(residuals=change), means.tape, means.fitted_runs)
     )
     hessian, slope = matrix[:-1, :-1], matrix[:-1, -1]
     own = matrix[-1, -1] - slope @ np.linalg.pinv(hessian, hermitian=True) @ slope
@@ -109,9 +109,7 @@ def with_timing(given: Prepared, timing: Timing) -> Prepared:
     value, load, rise = jax.tree.map(jnp.asarray, (driven.value, driven.load, driven.rise))
     tape = replace(tape, value=value, load=load, rise=rise)
     problem = replace(given.problem, tape=tape)
-    acting = given._replace(
-        runs=runs, problem=problem, timing=timing.what, straight=timing.straight
-    )
+    acting = given._replace(runs=runs, problem=problem, timing=timing)
     return _without_first(acting) if timing.ahead < 0 else acting
 
 
@@ -120,8 +118,7 @@ def _without_first(given: Prepared) -> Prepared:
     tape = given.problem.tape
     weight = np.array(tape.weight)
     weight[np.asarray(tape.begins), :, 0] = 0.0
-    tape = replace(tape, weight=jnp.asarray(weight))
-    return given._replace(problem=replace(given.problem, tape=tape))
+    return given.with_tape(weight=jnp.asarray(weight))
 
 
 def _acting(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:

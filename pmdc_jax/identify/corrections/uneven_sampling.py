@@ -6,38 +6,38 @@ noise; each recorded sample is moved instead, by what the fitted motor does betw
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import attrs
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..clock import GAP
-from ..recording import Recording
-from ..simulate import Tape
-from ..simulate.uneven import seen_at_record
-from .polish import Polished, polish
-from .prepare import Prepared
+from ...clock import GAP
+from ...recording import Recording
+from ...simulate import Tape
+from ...simulate.uneven import seen_at_record
+from ..polish import Fit, polish
+from ..prepare import Prepared
 
-# So often at most; and until samples move by so little that, taken together, they could move no estimate by more than
-# the root of this in standard errors
-PASSES, SETTLED = 12, 0.01
+# Refits at most
+PASSES = 12
+# ... until samples move by so little that, taken together, they could move no estimate by more than the root of this in
+# standard errors
+AT_REST = 0.01
 # Steps that shrink at this rate at most are followed to their end
 SHRINKING = 0.9
 
 
-def on_clock(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
+def on_clock(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with every sample of an uneven clock moved to the even sample next to it, as the fitted motor moves, and
     the fit to them; both as they are where all clocks are even."""
     uneven = any(run.uneven is not None for run in given.runs)
     last = None
     for _ in range(PASSES if uneven else 0):
         before, given = given, _moved(given, fit)
-        fit, start = polish(given.problem, fit.refined), fit
-        if _squares_between(before, given, fit) < SETTLED:
+        fit, start = polish(given.problem, fit.optimum), fit
+        if _squares_between(before, given, fit) < AT_REST:
             break
-        step = np.asarray(fit.refined.unknowns.coordinates - start.refined.unknowns.coordinates)
+        step = np.asarray(fit.coordinates - start.coordinates)
         rate = step @ last / (last @ last) if last is not None else 0.0
         last = step
         if 0 < rate < SHRINKING:
@@ -46,25 +46,25 @@ def on_clock(given: Prepared, fit: Polished) -> tuple[Prepared, Polished]:
     return given, fit
 
 
-def _ahead(given: Prepared, fit: Polished, step: Float[np.ndarray, " parameters"]) -> Polished:
+def _ahead(given: Prepared, fit: Fit, step: Float[np.ndarray, " parameters"]) -> Fit:
     """The fit at parameters further on, within their bounds (Irons and Tuck, doi:10.1002/nme.1620010306)."""
-    parameters, unknowns = given.problem.parameters, fit.refined.unknowns
+    parameters, unknowns = given.problem.parameters, fit.unknowns
     further = jnp.clip(unknowns.coordinates + step, parameters.lower, parameters.upper)
-    refined = fit.refined._replace(unknowns=unknowns._replace(coordinates=further))
-    return polish(given.problem, refined, steps=0)
+    optimum = fit.optimum._replace(unknowns=unknowns._replace(coordinates=further))
+    return polish(given.problem, optimum, steps=0)
 
 
-def _squares_between(before: Prepared, after: Prepared, fit: Polished) -> float:
+def _squares_between(before: Prepared, after: Prepared, fit: Fit) -> float:
     """By how much the samples that count were moved, in variances of the noise."""
     one, other = before.problem.tape, after.problem.tape
     moved = (np.asarray(other.measured) - np.asarray(one.measured)) * np.asarray(other.weight)
-    return float(np.square(moved / fit.noise[:, None])[after.problem.counted].sum())
+    return float(np.square(moved / fit.noise[:, None])[after.problem.fitted_blocks].sum())
 
 
-def _moved(given: Prepared, fit: Polished) -> Prepared:
+def _moved(given: Prepared, fit: Fit) -> Prepared:
     """The runs with their samples moved as this fit moves."""
     tape, seen = given.problem.tape, fit.evaluation.seen
-    motor = given.problem.parameters(fit.refined.unknowns.coordinates)
+    motor = given.problem.parameters(fit.coordinates)
     runs = []
     for k, run in enumerate(given.runs):
         if run.uneven is not None:
@@ -75,8 +75,8 @@ def _moved(given: Prepared, fit: Polished) -> Prepared:
     laid, begins = Tape.from_recordings(runs), np.asarray(tape.begins)
     # a first sample is measured when the even clock begins, and counts if it did
     laid.weight[begins, :, 0] = np.asarray(tape.weight)[begins, :, 0]
-    tape = replace(tape, measured=jnp.asarray(laid.measured), weight=jnp.asarray(laid.weight))
-    return given._replace(runs=runs, problem=replace(given.problem, tape=tape))
+    moved = given._replace(runs=runs)
+    return moved.with_tape(measured=jnp.asarray(laid.measured), weight=jnp.asarray(laid.weight))
 
 
 def _next_to(run: Recording, now: np.ndarray, then: np.ndarray) -> Recording:
