@@ -31,7 +31,7 @@ from .notation import (
     write_estimate,
 )
 from .page import figure_json, write_page
-from .summary import runs_in_order
+from .summary import role_word, runs_in_order
 from .verdict import (
     VERDICTS,
     drifts,
@@ -74,14 +74,13 @@ def _tiles(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """Label, number and small print of the figures worth knowing first."""
     role = role_that_counts(diagnosis)
     gap = diagnosis.gap[role]
-    label = "Hold-out error" if role == "holdout" else "Training error"
     error = significant(gap.before)
     if diagnosis.effects:
         error += f" → {significant(gap.after)}"
     tiles = [
         ("Verdict", VERDICTS[diagnosis.verdict], f"nothing missing: {chance(diagnosis.p_nothing)}")
     ]
-    tiles.append((label, error, "times the noise"))
+    tiles.append((f"{role_word(role).capitalize()} error", error, "times the noise"))
     if diagnosis.effects and diagnosis.closed_fraction is not None:
         tiles.append(("Gap closed", percent(100 * diagnosis.closed_fraction), ""))
     tiles.append(("Effects added", str(len(diagnosis.effects)), ""))
@@ -144,7 +143,7 @@ def _gaps(diagnosis: Diagnosis) -> list[dict[str, str]]:
     return [
         {
             "run": run,
-            "role": "hold-out" if fits[run].role == "holdout" else "training",
+            "role": role_word(fits[run].role),
             "before": significant(gap.before),
             "after": significant(gap.after),
             "floor": significant(gap.floor),

@@ -10,7 +10,17 @@ from plotly.subplots import make_subplots
 
 from ..diagnose.diagnosis import Gap, LearnedCurve, NextExperiment, Region
 from ..identify.identification import RunFit
-from .figures import DASHED, INK, INPUT, RESIDUAL, SIMULATED, envelope, style
+from .figures import (
+    INK,
+    INPUT,
+    RESIDUAL,
+    RESIDUALS,
+    SIMULATED,
+    envelope,
+    mark_noise,
+    residual,
+    style,
+)
 
 BEFORE, AFTER = RESIDUAL, SIMULATED
 AXES = {
@@ -19,10 +29,6 @@ AXES = {
     "voltage": "voltage [V]",
     "angle": "angle [rad]",
     "time": "share of a run",
-}
-RESIDUALS = {
-    "speed": ("Δ speed<br>[rad/s]", "speed_rad_s"),
-    "current": ("Δ current<br>[A]", "current_A"),
 }
 BINS = 30
 # ratio of the gaps from which on bars need a logarithmic axis
@@ -92,7 +98,7 @@ def residual_figure(
         return None
     figure = make_subplots(rows=len(channels), cols=1, shared_xaxes=True, vertical_spacing=0.05)
     for row, channel in enumerate(channels, start=1):
-        title, deviation = RESIDUALS[channel]
+        title, column = RESIDUALS[channel]
         for name, fit, colour in (("before", before, BEFORE), ("after", after, AFTER)):
             left = residual(fit, channel)
             if left is None:
@@ -103,8 +109,7 @@ def residual_figure(
                 x=time, y=values, name=name, line=line, showlegend=row == 1, legendgroup=name
             )
             figure.add_trace(trace, row=row, col=1)
-        for level in _two_deviations(noise.get(deviation)):
-            figure.add_hline(y=level, line=DASHED, row=row)  # pyright: ignore[reportArgumentType]
+        mark_noise(figure, row, noise.get(column))
         figure.update_yaxes(title_text=title, row=row, col=1)
     figure.update_xaxes(title_text="time [s]", row=len(channels), col=1)
     style(figure, height=80 + 150 * len(channels))
@@ -147,12 +152,6 @@ def averages(
     return np.array([m[0] for m in means]), np.array([m[1] for m in means])
 
 
-def residual(fit: RunFit, channel: str) -> np.ndarray | None:
-    """Measured minus simulated of "speed" or "current", None where the run does not hold it."""
-    measured, simulated = getattr(fit, channel), getattr(fit, f"{channel}_simulated")
-    return None if measured is None or simulated is None else np.asarray(measured - simulated)
-
-
 def curve_figure(curve: LearnedCurve) -> go.Figure:
     """A term of an equation as the data draw it, with a band of two standard errors either side."""
     over, under = curve.value + 2 * curve.stderr, curve.value - 2 * curve.stderr
@@ -188,10 +187,6 @@ def experiment_figure(experiment: NextExperiment, points: int) -> go.Figure:
     figure.update_xaxes(title_text="time [s]")
     figure.update_yaxes(title_text="voltage [V]")
     return figure
-
-
-def _two_deviations(noise: float | None) -> tuple[float, ...]:
-    return (-2 * noise, 2 * noise) if noise else ()
 
 
 def _range(fits: Mapping[str, RunFit], variable: str) -> list[float] | None:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from ..diagnose.diagnosis import Diagnosis
 from .notation import amount, chance, field_words, significant, words_of, write_estimate
-from .summary import runs_in_order, status_word
-from .terminal import STATUS_STYLES, console_for, parameter_table, plain_table
+from .summary import role_word, runs_in_order
+from .terminal import parameter_table, plain_table, print_tables, status_text
 from .verdict import drifts, moved, verdict_sentences, would_be_seen
 
 
 def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Effects, what adding them did, and the verdict on standard output."""
-    console_for(stderr=False).print(diagnosis_tables(diagnosis))
+    print_tables(diagnosis_tables(diagnosis))
 
 
 def diagnosis_tables(diagnosis: Diagnosis) -> RenderableType:
@@ -31,7 +29,7 @@ def diagnosis_tables(diagnosis: Diagnosis) -> RenderableType:
 
 
 def _effects(diagnosis: Diagnosis) -> Table:
-    headers = ("Effect", "Parameter", "Value", "Unit", "Std. error", "95 % interval", "p")
+    headings = ("Effect", "Parameter", "Value", "Unit", "Std. error", "95 % interval", "p")
     rows = []
     for effect in diagnosis.effects:
         for number, (field, estimate) in enumerate(effect.parameters.items()):
@@ -42,30 +40,31 @@ def _effects(diagnosis: Diagnosis) -> Table:
             probability = chance(effect.p_value).removeprefix("p ").removeprefix("= ")
             end = probability if first else ""
             rows.append((name, field_words(effect.name, field), *numbers, end))
-    return _filled("Missing", headers, (0, 1, 3), rows)
+    return plain_table("Missing", headings, rows, left=(0, 1, 3), first_wraps="ellipsis")
 
 
 def _parameters(diagnosis: Diagnosis) -> Table:
     if not diagnosis.effects:
         return parameter_table(diagnosis.final)
-    headers = ("Parameter", "Before", "", "After", "", "Std. error", "Moved", "Status")
+    headings = ("Parameter", "Before", "", "After", "", "Std. error", "Moved", "Status")
     rows = []
     for one in drifts(diagnosis):
         before, after = write_estimate(one.before), write_estimate(one.after)
-        status = Text(status_word(one.after.status), STATUS_STYLES.get(one.after.status, ""))
         numbers = (before.value, before.unit, after.value, after.unit, after.stderr)
-        rows.append((one.name, *numbers, moved(one), status))
-    return _filled("Parameters", headers, (0, 2, 4, 7), rows)
+        rows.append((one.name, *numbers, moved(one), status_text(one.after)))
+    return plain_table("Parameters", headings, rows, left=(0, 2, 4, 7), first_wraps="ellipsis")
 
 
 def _gaps(diagnosis: Diagnosis) -> Table:
-    headers = ("Run", "Role", "Before", "After", "Noise")
+    headings = ("Run", "Role", "Before", "After", "Noise")
     rows = []
     for run, fit in runs_in_order(diagnosis.final):
         gap = diagnosis.gap_of_run[run]
-        role = "hold-out" if fit.role == "holdout" else "training"
-        rows.append((run, role, *(significant(x) for x in (gap.before, gap.after, gap.floor))))
-    return _filled("Free-run error over the noise", headers, (0, 1), rows)
+        numbers = (significant(error) for error in (gap.before, gap.after, gap.floor))
+        rows.append((run, role_word(fit.role), *numbers))
+    return plain_table(
+        "Free-run error over the noise", headings, rows, left=(0, 1), first_wraps="ellipsis"
+    )
 
 
 def _detectable(diagnosis: Diagnosis) -> Table:
@@ -73,20 +72,11 @@ def _detectable(diagnosis: Diagnosis) -> Table:
     for one in would_be_seen(diagnosis):
         names = (words_of(one.effect), field_words(one.effect, one.parameter))
         rows.append((*names, amount(one.amplitude, one.unit, 2)))
-    headers = ("Effect", "Parameter", "From")
-    return _filled("Would have been seen nine times of ten", headers, (0, 1), rows)
-
-
-def _filled(
-    title: str,
-    headers: Sequence[str],
-    left: Sequence[int],
-    rows: Iterable[Sequence[str | Text]],
-) -> Table:
-    """A table whose columns stand right but for those in `left`."""
-    table = plain_table(title)
-    for number, header in enumerate(headers):
-        table.add_column(header, justify="left" if number in left else "right", no_wrap=number > 0)
-    for row in rows:
-        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
-    return table
+    headings = ("Effect", "Parameter", "From")
+    return plain_table(
+        "Would have been seen nine times of ten",
+        headings,
+        rows,
+        left=(0, 1),
+        first_wraps="ellipsis",
+    )

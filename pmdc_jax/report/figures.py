@@ -16,6 +16,11 @@ MEASURED, SIMULATED, RESIDUAL, INPUT = "#a3b0c0", "#0b5fcc", "#c9702b", "#4b5563
 INK, GRID, EDGE = "#27313f", "#e6e9ee", "#c3cad4"
 DASHED = {"color": INK, "width": 1, "dash": "4px 3px"}
 FONT = "Inter, system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
+# axis title of a residual, and the key of its noise
+RESIDUALS = {
+    "speed": ("Δ speed<br>[rad/s]", "speed_rad_s"),
+    "current": ("Δ current<br>[A]", "current_A"),
+}
 BUTTONS = ["toImage", "zoom2d", "pan2d", "resetScale2d"]
 POINTS_PER_TRACE = 4000
 POINTS_PER_PAGE = 90_000  # about one megabyte as base64: the page stays under 6 MB with plotly.js
@@ -46,13 +51,18 @@ def run_figure(fit: RunFit, noise: Mapping[str, float | None], points: int) -> g
             time, values = envelope(fit.time, trace["y"], points)
             figure.add_trace(go.Scatter(trace, x=time, y=values), row=row, col=1)
         figure.update_yaxes(title_text=panel.title, row=row, col=1)
-        for level in (-2 * panel.noise, 2 * panel.noise) if panel.noise else ():
-            # plotly's annotation of `row` knows only "all"
-            figure.add_hline(y=level, line=DASHED, row=row)  # pyright: ignore[reportArgumentType]
+        mark_noise(figure, row, panel.noise)
     figure.update_xaxes(title_text="time [s]", row=len(panels), col=1)
     style(figure, height=90 + int(190 * sum(heights)))
     figure.update_layout(hovermode="x unified")
     return figure
+
+
+def mark_noise(figure: go.Figure, row: int, noise: float | None) -> None:
+    """Dashed lines at two standard deviations of the noise either side of zero, where it is known."""
+    for level in (-2 * noise, 2 * noise) if noise else ():
+        # plotly's annotation of `row` knows only "all"
+        figure.add_hline(y=level, line=DASHED, row=row)  # pyright: ignore[reportArgumentType]
 
 
 def search_figure(search: Search) -> go.Figure:
@@ -172,21 +182,23 @@ def _panels(fit: RunFit, noise: Mapping[str, float | None]) -> list[_Panel]:
         _Panel("speed<br>[rad/s]", 1.0, speed),
         _Panel("current<br>[A]", 1.0, current),
         _Panel("voltage<br>[V]", 0.55, [voltage]),
-        _residual("Δ speed<br>[rad/s]", fit.speed, fit.speed_simulated, noise.get("speed_rad_s")),
-        _residual("Δ current<br>[A]", fit.current, fit.current_simulated, noise.get("current_A")),
+        *(_residual_panel(fit, channel, noise) for channel in RESIDUALS),
     ]
     # a quantity the run does not hold is an empty trace
     panels = [panel._replace(traces=[one for one in panel.traces if one]) for panel in panels]
     return [panel for panel in panels if panel.traces]
 
 
-def _residual(
-    title: str, measured: np.ndarray | None, simulated: np.ndarray | None, noise: float | None
-) -> _Panel:
-    residual = None
-    if measured is not None and simulated is not None:
-        residual = measured - simulated
-    return _Panel(title, 0.55, [_line("residual", residual, RESIDUAL, 0.7)], noise)
+def _residual_panel(fit: RunFit, channel: str, noise: Mapping[str, float | None]) -> _Panel:
+    title, column = RESIDUALS[channel]
+    line = _line("residual", residual(fit, channel), RESIDUAL, 0.7)
+    return _Panel(title, 0.55, [line], noise.get(column))
+
+
+def residual(fit: RunFit, channel: str) -> np.ndarray | None:
+    """Measured minus simulated of "speed" or "current", None where the run does not hold it."""
+    measured, simulated = getattr(fit, channel), getattr(fit, f"{channel}_simulated")
+    return None if measured is None or simulated is None else np.asarray(measured - simulated)
 
 
 def _line(

@@ -28,7 +28,7 @@ from .notation import (
     write_estimate,
 )
 from .page import figure_json, write_page
-from .summary import runs_in_order, status_word, summary
+from .summary import role_word, runs_in_order, status_word, summary
 
 
 def write_report(identification: Identification, path: str | Path) -> None:
@@ -119,7 +119,7 @@ def _runs(identification: Identification, points: int) -> list[_Run]:
         _Run(
             name=name,
             anchor=f"run-{number}",
-            role="hold-out" if fit.role == "holdout" else "training",
+            role=role_word(fit.role),
             numbers=_numbers(fit),
             figure=figure_json(run_figure(fit, identification.noise, points)),
             caption=_caption(fit, points),

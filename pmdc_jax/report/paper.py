@@ -9,7 +9,6 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from ..motor import PARAMETERS
@@ -28,6 +27,7 @@ from ..wheelchair import (
 from .figures import INPUT, MEASURED, RESIDUAL, SIMULATED, style
 from .notation import significant, thousands
 from .page import figure_json, write_page
+from .terminal import plain_table
 from .tuning import TITLES
 
 COLOURS = (RESIDUAL, SIMULATED, INPUT)
@@ -122,8 +122,8 @@ def _printed_remarks(paper: Paper) -> list[str]:
 def paper_tables(paper: Paper) -> RenderableType:
     """Both tables and the remarks."""
     tables = [
-        _terminal_table("Table 1: the motor, from a virtual load test", *table_1(paper)),
-        _terminal_table("Table 2: steps to 481 rad/s", *table_2(paper)),
+        plain_table("Table 1: the motor, from a virtual load test", *table_1(paper)),
+        plain_table("Table 2: steps to 481 rad/s", *table_2(paper)),
     ]
     return Group(tables[0], "", tables[1], "", *(Text(one) for one in remarks(paper)))
 
@@ -243,14 +243,3 @@ def steps_figure(paper: Paper) -> go.Figure:
     figure.update_xaxes(title_text="time [ms]", row=2, col=1)
     style(figure, height=460)
     return figure
-
-
-def _terminal_table(title: str, headings: list[str], rows: list[list[str]]) -> Table:
-    table = Table(
-        title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0)
-    )
-    for k, heading in enumerate(headings):
-        table.add_column(Text(heading), justify="left" if k == 0 else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*map(Text, row))  # a cell such as [s] is not markup
-    return table

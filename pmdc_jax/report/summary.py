@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from ..identify.identification import Estimate, Identification, RunFit
+from ..identify.identification import Estimate, Identification, Role, RunFit
 from .notation import NARROW, enumerate_words, percent, significant
 
 STATUS_WORDS = {
@@ -23,6 +23,11 @@ NOISE_LEVEL = 1.25
 def status_word(status: str) -> str:
     """The status as it is printed everywhere."""
     return STATUS_WORDS.get(status, status.replace("_", " "))
+
+
+def role_word(role: Role) -> str:
+    """What a run was for, as it is printed everywhere."""
+    return "hold-out" if role == "holdout" else "training"
 
 
 def summary(identification: Identification) -> list[str]:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 from attrs import evolve
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, Group, OverflowMethod, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from ..identify.identification import Identification
+from ..identify.identification import Estimate, Identification
 from ..progress import ReportProgress
 from ..recording import Finding
 from .notation import enumerate_words, percent, significant, write_estimate
-from .summary import runs_in_order, status_word, summary
+from .summary import role_word, runs_in_order, status_word, summary
 
 STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
 SEVERITY_STYLES = {"error": "red", "warning": "yellow"}
@@ -81,41 +81,63 @@ def progress() -> Iterator[ReportProgress | None]:
 
 def parameter_table(identification: Identification) -> Table:
     """Every parameter with its uncertainty and status."""
-    table = plain_table("Parameters")
-    for header in ("Parameter", "Value", "Unit", "Std. error", "95 % interval", "Status"):
-        left = header in ("Parameter", "Unit", "Status")
-        table.add_column(header, justify="left" if left else "right", no_wrap=True)
+    headings = ("Parameter", "Value", "Unit", "Std. error", "95 % interval", "Status")
+    rows = []
     for name, estimate in identification.parameters.items():
         written = write_estimate(estimate)
-        status = Text(status_word(estimate.status), STATUS_STYLES.get(estimate.status, ""))
-        row = (written.value, written.unit, written.stderr, written.interval)
-        table.add_row(Text(name), *row, status)
-    return table
+        numbers = (written.value, written.unit, written.stderr, written.interval)
+        rows.append((name, *numbers, status_text(estimate)))
+    return plain_table("Parameters", headings, rows, left=(0, 2, 5))
+
+
+def status_text(estimate: Estimate) -> Text:
+    """The status in its colour."""
+    return Text(status_word(estimate.status), STATUS_STYLES.get(estimate.status, ""))
 
 
 def _fit_table(identification: Identification) -> Table:
-    table = plain_table("Free-run simulation")
-    table.add_column("Run", overflow="fold")
-    table.add_column("Role", no_wrap=True)
-    for header in ("Speed RMSE\n[rad/s]", "Speed fit", "Current RMSE\n[A]", "Current fit"):
-        table.add_column(Text(header), justify="right", no_wrap=True)
-    for name, fit in runs_in_order(identification):
-        table.add_row(
-            Text(name),
-            "hold-out" if fit.role == "holdout" else "training",
+    quantities = ("Speed RMSE\n[rad/s]", "Speed fit", "Current RMSE\n[A]", "Current fit")
+    rows = [
+        (
+            name,
+            role_word(fit.role),
             significant(fit.speed_rmse),
             percent(fit.speed_fit_percent),
             significant(fit.current_rmse),
             percent(fit.current_fit_percent),
         )
-    return table
+        for name, fit in runs_in_order(identification)
+    ]
+    headings = ("Run", "Role", *quantities)
+    return plain_table("Free-run simulation", headings, rows, left=(0, 1), first_wraps="fold")
 
 
-def plain_table(title: str) -> Table:
-    """A table without lines."""
-    return Table(
+def plain_table(
+    title: str,
+    headings: Sequence[str],
+    rows: Iterable[Sequence[str | Text]],
+    left: Sequence[int] = (0,),
+    first_wraps: OverflowMethod | None = None,
+) -> Table:
+    """A table without lines.
+
+    **Arguments**: `left`, numbers of the columns that are flush left; `first_wraps`, what a narrow terminal does to a
+    word too long for the first column, whose cells it wraps; None where it wraps no column, and shortens all.
+    """
+    table = Table(
         title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0)
     )
+    for number, heading in enumerate(headings):
+        wraps = first_wraps if number == 0 else None
+        table.add_column(
+            Text(heading),  # not markup: units stand in brackets
+            justify="left" if number in left else "right",
+            no_wrap=wraps is None,
+            overflow=wraps or "ellipsis",
+        )
+    for row in rows:
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    return table
 
 
 def console_for(stderr: bool) -> Console:

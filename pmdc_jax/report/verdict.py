@@ -27,7 +27,7 @@ from .notation import (
     words_of,
     write_estimate,
 )
-from .summary import as_sentence, cautions
+from .summary import as_sentence, cautions, role_word
 
 VERDICTS = {
     "named": "named",
@@ -271,7 +271,7 @@ def role_that_counts(diagnosis: Diagnosis) -> Role:
 def _gap(diagnosis: Diagnosis) -> str:
     role = role_that_counts(diagnosis)
     gap = diagnosis.gap[role]
-    what = "Hold-out" if role == "holdout" else "Training"
+    what = role_word(role).capitalize()
     sentence = f"{what} error {significant(gap.before)} to {significant(gap.after)} times the noise"
     if diagnosis.closed_fraction is None:
         return f"{sentence}."
