@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from .alignment import alignment, sampling
-from .clock import GAP, evenly_stamped, is_even
+from .angle import unwrapped
+from .clock import GAP, came_evenly
 from .plausibility import angle_against_speed, lost_signs, plain_units, signs, speed_of
 from .recording import Finding, Recording
 from .unmeasured import flat_tops, noise_of
@@ -59,9 +60,9 @@ def jitter(run: Recording) -> Iterator[Finding]:
     scatter = steps / np.mean(steps) - 1
     deviation = float(np.sqrt(np.mean(scatter**2) / 2))
     if deviation > JITTER:
-        samples = "came evenly all the same, by how they go on: they are taken as even"
-        if not is_even(evenly_stamped(run).time):
-            samples = "are taken when they were stamped"
+        samples = "are taken when they were stamped"
+        if came_evenly(run):
+            samples = "came evenly all the same, by how they go on: they are taken as even"
         yield Finding(
             run.name,
             "time",
@@ -109,17 +110,14 @@ def wrapped_angle(run: Recording) -> Iterator[Finding]:
     """An angle that starts again after each turn."""
     if run.angle is None:
         return
-    jumps = np.diff(run.angle)
-    # of the encoders in use, one counts 0 ... 2 pi and the other -pi ... pi
-    wraps = np.flatnonzero(np.abs(np.abs(jumps) - 2 * np.pi) < 0.5)
-    ordinary = np.nanpercentile(np.abs(jumps), 90)
-    if len(wraps) >= 2 and ordinary < 1.0 and np.nanmax(run.angle) - np.nanmin(run.angle) < 6.3:
+    _, wraps = unwrapped(run.angle)
+    if len(wraps):
         yield Finding(
             run.name,
             "angle",
             "note",
-            f"it starts again after each turn, {len(wraps)} times: it is taken as going on",
-            f"first at {place(run, int(wraps[0]) + 1)}",
+            f"it starts again after each turn, {_count(len(wraps), 'time')}: it is taken as going on",
+            f"first at {place(run, int(wraps[0]))}",
             "If it does not, unwrap it yourself, for example by numpy.unwrap",
         )
 

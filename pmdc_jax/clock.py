@@ -37,15 +37,30 @@ def is_even(time: Samples) -> bool:
 
 def evenly_stamped(recording: Recording) -> Recording:
     """A record with even time stamps where its own are not, but its samples came evenly; as it is otherwise."""
-    time, ticks = recording.time, np.arange(len(recording))
-    step, begin = np.polyfit(ticks, time, 1)
-    late = time - (begin + ticks * step)
-    motion = recording.angle if recording.speed is None else recording.speed
-    if motion is None or is_even(time) or np.max(np.abs(late)) > BEYOND * step:
+    if is_even(recording.time) or not came_evenly(recording):
         return recording
+    even, _ = _even_clock(recording.time)
+    return attrs.evolve(recording, time=even)
+
+
+def came_evenly(recording: Recording) -> bool:
+    """Whether samples came evenly: as their time stamps say, or, where these are uneven, by how the motion goes on."""
+    if is_even(recording.time):
+        return True
+    even, step = _even_clock(recording.time)
+    late = recording.time - even
+    motion = recording.angle if recording.speed is None else recording.speed
+    if motion is None or np.max(np.abs(late)) > BEYOND * step:
+        return False
     share, error = _following(motion, late, step)
-    came_evenly = share + CLEAR * error < HALF
-    return attrs.evolve(recording, time=begin + ticks * step) if came_evenly else recording
+    return bool(share + CLEAR * error < HALF)
+
+
+def _even_clock(time: Samples) -> tuple[Samples, float]:
+    """The even time stamps nearest to some, by least squares, and their step."""
+    ticks = np.arange(len(time))
+    step, begin = np.polyfit(ticks, time, 1)
+    return begin + ticks * step, float(step)
 
 
 def _following(signal: Samples, late: Samples, step: float) -> tuple[float, float]:

@@ -189,15 +189,19 @@ def with_angle(run, scale):
     return evolve(run, angle=scale * np.cumsum(run.speed) * run.sample_time)
 
 
-def wrapped(run):
-    return evolve(run, speed=None, angle=np.mod(0.05 * np.arange(len(run)), 2 * np.pi))
+def wrapped(run, step=0.05):
+    return evolve(run, speed=None, angle=np.mod(step * np.arange(len(run)), 2 * np.pi))
 
 
-def test_a_wrapped_angle_is_noted_and_goes_on():
-    run = wrapped(good_run(1, "prbs"))
-    (found,) = [f for f in check([run]) if f.column == "angle"]
-    assert found.severity == "note" and "starts again after each turn" in found.what
-    np.testing.assert_allclose(speed_by_spline(run.angle, run.time), 0.05 / run.sample_time)
+@pytest.mark.parametrize("step", [0.0022, 0.05, 2.0])
+def test_a_wrapped_angle_is_noted_and_goes_on(step):
+    """Once in the run, often, and by a rotor that turns by a third from sample to sample."""
+    run = wrapped(good_run(1, "prbs"), step)
+    (found,) = [f for f in check([run]) if f.column == "angle" and "turn" in f.what]
+    times = int(step * (len(run) - 1) / (2 * np.pi))
+    assert found.severity == "note"
+    assert f"starts again after each turn, {times} time" in found.what
+    np.testing.assert_allclose(speed_by_spline(run.angle, run.time), step / run.sample_time)
 
 
 def test_stamps_that_jitter_are_noted_with_what_the_samples_are_taken_for():

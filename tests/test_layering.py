@@ -28,6 +28,7 @@ BELOW = {
     "effects": set(),
     "motor": {"effects"},
     "simulate": {
+        "angle",
         "clock",
         "compiled",
         "effects",
@@ -37,9 +38,10 @@ BELOW = {
         "recording",
         "threads",
     },
+    "angle": set(),
     "clock": {"recording"},
     "unmeasured": {"recording"},
-    "check": {"alignment", "clock", "plausibility", "recording", "unmeasured"},
+    "check": {"alignment", "angle", "clock", "plausibility", "recording", "unmeasured"},
     "json_file": {"errors"},
     "motor_file": {"effects", "errors", "files", "json_file", "motor"},
     "control": {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
+from ..angle import unwrapped
 from ..clock import GAP, is_even
 from ..errors import InputError
 from ..recording import Recording
@@ -90,15 +91,7 @@ def speed_by_spline(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
     from scipy.interpolate import CubicSpline  # late, for it takes long to load
 
     known = ~np.isnan(angle)
-    unwrapped = np.full_like(angle, np.nan)
-    jumps = np.abs(np.diff(angle[known]))
-    # a wrapped angle jumps by most of a turn between samples; a travel in metres or turns never does
-    wraps = (
-        len(jumps) > 0
-        and np.nanmax(angle) - np.nanmin(angle) <= 2 * np.pi * 1.01
-        and np.max(jumps) > np.pi
-    )
-    unwrapped[known] = np.unwrap(angle[known]) if wraps else angle[known]
+    going_on, _ = unwrapped(angle)
     speed = np.full_like(angle, np.nan)
-    speed[known] = CubicSpline(time[known], unwrapped[known])(time[known], 1)
+    speed[known] = CubicSpline(time[known], going_on[known])(time[known], 1)
     return speed
