@@ -14,21 +14,21 @@ from scipy import stats
 from benchmarks import virtual_bench as vb
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import naming
-from pmdc_jax.diagnose.candidates import FULLER, STARTS, TABLE, Scales
+from pmdc_jax.diagnose.assessment import Assessment
+from pmdc_jax.diagnose.candidates import TRIALS, Scales
 from pmdc_jax.diagnose.compare import Fitted
+from pmdc_jax.diagnose.effect_relations import FULLER, are_rivals, is_within
 from pmdc_jax.diagnose.evidence import Block, products
 from pmdc_jax.diagnose.experiment import difference_between
-from pmdc_jax.diagnose.kinship import are_rivals, is_within
 from pmdc_jax.diagnose.library import Library
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
-from pmdc_jax.diagnose.naming import Namer, Naming
+from pmdc_jax.diagnose.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.periodic import common_line, spectrum
 from pmdc_jax.diagnose.pipeline import may_be_none
+from pmdc_jax.diagnose.quantisation import READINGS, readings
 from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
-from pmdc_jax.diagnose.rounding import READINGS, readings
 from pmdc_jax.diagnose.screen import Screen, Signal, common_to_waves, log_chance
-from pmdc_jax.diagnose.seen import Seen
 from pmdc_jax.diagnose.shortlist import effect_of, promising, shortlist
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate, Identification
@@ -44,14 +44,16 @@ PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 SCALES = Scales(10.0, 300.0, 10.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0)
 
 
-def promises_of(gains: dict[str, float], unexplained: float) -> Seen:
+def promises_of(gains: dict[str, float], unexplained: float) -> Assessment:
     """Evidence of effects with such gains, the first of them the most significant."""
-    candidates = [TABLE[name](name, SCALES)[0] for name in gains]
+    candidates = [TRIALS[name].columns(name, SCALES)[0] for name in gains]
     signals = [
         Signal(gain, -1e3 + k, candidate, Mock(spec=Block))
         for k, (gain, candidate) in enumerate(zip(gains.values(), candidates, strict=True))
     ]
-    found = Mock(spec=Seen, of_candidates=signals, of_curves=signals[:1], unexplained=unexplained)
+    found = Mock(
+        spec=Assessment, of_candidates=signals, of_curves=signals[:1], unexplained=unexplained
+    )
     found.screen = Mock(spec=Screen, candidates=candidates)
     found.clearest = max(signals, key=lambda s: s.gain)
     return found
@@ -73,14 +75,15 @@ def test_an_effects_own_formula_is_no_reason_to_leave_out_a_larger_one(gains, fi
 
 
 def test_every_effect_has_a_row():
-    assert set(TABLE) == set(EFFECTS)
+    assert set(TRIALS) == set(EFFECTS)
 
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_candidates_are_within_the_ranges(name):
     """Each shape is an effect that can be built, and of which a positive coefficient makes a legal one."""
-    candidates = TABLE[name](name, SCALES)
-    starts = STARTS[name](SCALES) if name in STARTS else []
+    candidates = TRIALS[name].columns(name, SCALES)
+    begins = TRIALS[name].starts
+    starts = begins(SCALES) if begins else []
     assert candidates or starts
     for values in starts:
         assert values.keys() == EFFECTS[name].ranges.keys()
@@ -96,43 +99,45 @@ def test_candidates_are_within_the_ranges(name):
             assert r.scale == "linear" or built[field] > 0
 
 
-class Undecided(Namer):
+class Undecided(StepwiseSelection):
     """Two sets of effects, each of which looks better by the filter of the other one."""
 
     def __init__(self):
         self.base, self.one, self.other = (
             Mock(spec=Model, is_possible=True, effects=()) for _ in range(3)
         )
-        self.passed, self.trials = set(), 0
+        self.superseded, self.trials = set(), 0
         self.comparison = Mock(ranked=lambda models, white: [Mock(spec=Fitted, model=models[-1])])
 
-    def _tried(self, current, found):
+    def _trials(self, current, found):
         self.trials += 1
         assert self.trials < 5
         return [self.other if current is self.one else self.one]
 
-    _see = staticmethod(lambda model: Mock(spec=Seen, unexplained=np.inf))
-    _by_plain_squares = staticmethod(lambda *models: None)
+    assess = staticmethod(lambda model: Mock(spec=Assessment, unexplained=np.inf))
+    _by_unfiltered_misfit = staticmethod(lambda *models: None)
     _best = staticmethod(lambda tried, white: tried[0])
-    _spared = staticmethod(lambda model: model)
-    _is_settled = staticmethod(lambda *models: True)
-    _tied = staticmethod(lambda *models: [])
+    _eliminated = staticmethod(lambda model: model)
+    _explains_more_than_a_formula = staticmethod(lambda *models: True)
+    _equivalent_swaps = staticmethod(lambda *models: [])
     _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))
 
 
 def test_what_was_left_for_a_better_model_is_not_come_back_to():
-    namer = Undecided()
-    assert namer.name().chosen is namer.other
-    assert namer.trials == 3
+    selection = Undecided()
+    assert selection.name().chosen is selection.other
+    assert selection.trials == 3
 
 
 def test_what_only_mends_a_formula_does_not_hide_what_plain_squares_find():
     """A filter may swallow most of an effect: what it leaves then looks like the formula of another one."""
-    namer = Undecided()
-    namer._by_plain_squares = lambda current, found: namer.other
-    namer._is_settled = lambda current, found, better: better is namer.other
-    namer._in_other_form = lambda *models: []
-    assert namer._step(namer.base, namer._see(namer.base)) is namer.other
+    selection = Undecided()
+    selection._by_unfiltered_misfit = lambda current, found: selection.other
+    selection._explains_more_than_a_formula = lambda current, found, better: (
+        better is selection.other
+    )
+    selection._in_other_form = lambda *models: []
+    assert selection._step(selection.base, selection.assess(selection.base)) is selection.other
 
 
 @pytest.mark.parametrize(
@@ -155,18 +160,22 @@ def test_a_full_set_exchanges_what_acts_in_the_same_equation(monkeypatch, count,
     effects = ("asymmetric_friction", "speed_sensor_delay", "current_sensor_offset")[:count]
     peak = Mock(spec=Signal, candidate=Mock(effect="stribeck_friction"), gain=1.0)
     monkeypatch.setattr(naming, "clear", lambda found: [peak])
-    namer = Undecided()
-    namer.refits = Mock(without=Mock(return_value=Mock(spec=Model)))
-    namer.refits.with_signal.return_value = Mock(spec=Model)
-    namer._see = lambda model: Mock(spec=Seen, of_candidates=[peak], screen=Mock(spec=Screen))
-    namer._better = lambda current, found, tried: tried[0] if tried else None
-    found = Mock(spec=Seen, left=left, is_trace=lambda model: False, screen=Mock(white="white"))
+    selection = Undecided()
+    selection.refits = Mock(without=Mock(return_value=Mock(spec=Model)))
+    selection.refits.with_signal.return_value = Mock(spec=Model)
+    selection.assess = lambda model: Mock(
+        spec=Assessment, of_candidates=[peak], screen=Mock(spec=Screen)
+    )
+    selection._better = lambda current, found, tried: tried[0] if tried else None
+    found = Mock(
+        spec=Assessment, left=left, is_trace=lambda model: False, screen=Mock(white="white")
+    )
     current = Mock(spec=Model, effects=effects)
-    better = namer._in_exchange(current, found)
-    assert namer.refits.without.call_count == asked
+    better = selection._in_exchange(current, found)
+    assert selection.refits.without.call_count == asked
     if asked:
-        namer.refits.without.assert_called_with(current, "asymmetric_friction", "white")
-        assert better is namer.refits.with_signal.return_value
+        selection.refits.without.assert_called_with(current, "asymmetric_friction", "white")
+        assert better is selection.refits.with_signal.return_value
 
 
 def test_a_motor_that_cannot_be_simulated_suggests_no_run(x64):
@@ -183,7 +192,7 @@ def test_a_motor_that_cannot_be_simulated_suggests_no_run(x64):
 def test_only_waves_that_records_show_are_tried():
     """At 40 rad/s, of samples of 20 ms, one of seven periods comes round in one and an eighth."""
     seldom = SCALES._replace(slow=40.0, sample_time=0.02)
-    tried = TABLE["cogging_torque"]
+    tried = TRIALS["cogging_torque"].columns
     assert [c.columns[0]["periods"] for c in tried("", seldom)] == list(range(1, 8))
     assert max(c.columns[0]["periods"] for c in tried("", SCALES)) == 48
 
@@ -290,8 +299,8 @@ def test_an_amplitude_that_may_be_next_to_nothing(effect, field, interval, nothi
 def test_what_waves_of_any_period_gain_is_evidence_for_none():
     """As where the residuals are slow: one period of cogging is asked for by what it gains beyond the others."""
     evidence = evidence_of(*random_evidence(0))
-    cogging = TABLE["cogging_torque"]("cogging_torque", SCALES)
-    others = TABLE["constant_load"]("constant_load", SCALES)
+    cogging = TRIALS["cogging_torque"].columns("cogging_torque", SCALES)
+    others = TRIALS["constant_load"].columns("constant_load", SCALES)
     freedom = 2 * 3  # cosine and sine in each of three runs
     blocks = [Block((0, 1), own=True)] * len(cogging)
 

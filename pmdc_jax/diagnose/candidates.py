@@ -72,7 +72,7 @@ NOTHING = 1e-12
 
 def candidates(scales: Scales) -> list[Candidate]:
     """All shapes of all effects of the library that are to be tried."""
-    return [c for name in EFFECTS for c in TABLE[name](name, scales)]
+    return [c for name in EFFECTS for c in TRIALS[name].columns(name, scales)]
 
 
 def _amplitude(field: str, size: Callable[[Scales], float], signed: bool = False, **shapes):
@@ -204,8 +204,8 @@ def _compliance(name: str, scales: Scales) -> list[Candidate]:
     return [candidate(hertz) for hertz in RINGING if hertz * scales.sample_time < 0.5]
 
 
-def _no_column(name: str, scales: Scales) -> list[Candidate]:
-    """No column at all: what play does is nothing like proportional to it. See `STARTS`."""
+def _no_columns(name: str, scales: Scales) -> list[Candidate]:
+    """No column at all: what play does is nothing like proportional to it. It is begun from `Trial.starts`."""
     del name, scales
     return []
 
@@ -223,35 +223,16 @@ def _backlash_starts(scales: Scales) -> list[Values]:
     ]
 
 
-# Where else to begin refitting an effect that is easily fitted wrongly: from one start after another
-STARTS: Mapping[str, Callable[[Scales], list[Values]]] = {
-    "shaft_compliance": _shaft_starts,
-    "gear_backlash": _backlash_starts,
-}
-
-
 def _other_teeth(gear: Values) -> list[Values]:
     """Stiffer and softer ones; how fast they come to rest, their damping says and not their stiffness."""
     stiffness = "stiffness_Nm_rad"
     return [{stiffness: times * gear[stiffness]} for times in (10.0, 3.0, 1.7, 0.6)]
 
 
-# What else to try from where the refit of an effect ended that has many optima: teeth that meet at other moments
-AROUND: Mapping[str, Callable[[Values], list[Values]]] = {"gear_backlash": _other_teeth}
-
-
 # A peak of dry friction that is clearly one: as high again, within this share of the speeds that occur
 PEAK, SLOW = 2.0, 0.05
 # ... and play: this share of what the largest torque twists a shaft by
 PLAY = 0.3
-
-
-class Fuller(NamedTuple):
-    """A fuller form of an effect."""
-
-    effect: str
-    begun: Callable[[Any, Scales], Values]  # by the simple form, what makes it fuller clearly there
-    extra: tuple[str, ...]  # the fields that make it so
 
 
 def _with_peak(friction: CoulombFriction, scales: Scales) -> Values:
@@ -264,12 +245,6 @@ def _with_play(shaft: ShaftCompliance, scales: Scales) -> Values:
     return {"gap_rad": PLAY * scales.torque / same["stiffness_Nm_rad"], **same}
 
 
-FULLER: Mapping[str, Fuller] = {
-    "coulomb_friction": Fuller("stribeck_friction", _with_peak, ("static_Nm", "speed_rad_s")),
-    "shaft_compliance": Fuller("gear_backlash", _with_play, ("gap_rad",)),
-}
-
-
 def _times(scales: Scales) -> list[float]:
     """Time constants of a sensor, from a fraction of a sample on."""
     return [x for x in (5e-4, 1.5e-3, 4e-3, 1e-2, 3e-2) if 0.2 < x / scales.sample_time < 200]
@@ -279,30 +254,64 @@ def _thermal(scales: Scales) -> list[float]:
     return [scales.duration * x for x in (0.03, 0.1, 0.3, 1.0)]
 
 
-TABLE: Mapping[str, Callable[[str, Scales], list[Candidate]]] = {
-    "coulomb_friction": _amplitude("torque_Nm", lambda s: s.torque),
-    "stribeck_friction": _stribeck,
-    "asymmetric_friction": _asymmetric,
-    "quadratic_drag": _amplitude("drag_Nms2_rad2", lambda s: s.torque / s.speed**2),
-    "cogging_torque": _periodic("amplitude_Nm", lambda s: s.torque),
-    "torque_ripple": _periodic("amplitude", lambda s: 1.0, {"emf_share": 0.0}, {"emf_share": 1.0}),
-    "constant_load": _amplitude("torque_Nm", lambda s: s.torque, signed=True),
-    "shaft_compliance": _compliance,
-    "gear_backlash": _no_column,
-    "brush_voltage_drop": _amplitude("voltage_V", lambda s: s.voltage),
-    "resistance_heating": _amplitude(
-        "rise_per_W", lambda s: 1 / (s.voltage * s.current), time_constant_s=_thermal
+class Fuller(NamedTuple):
+    """A fuller form of an effect."""
+
+    effect: str
+    begun: Callable[[Any, Scales], Values]  # by the simple form, what makes it fuller clearly there
+    extra: tuple[str, ...]  # the fields that make it so
+
+
+class Trial(NamedTuple):
+    """How an effect is tried."""
+
+    # its shapes, each a regression on columns, by its name and the scales of the recordings
+    columns: Callable[[str, Scales], list[Candidate]]
+    # where else to begin refitting it, one start after another, if it is easily fitted wrongly
+    starts: Callable[[Scales], list[Values]] | None = None
+    # what else to try from where its refit ended, if it has many optima
+    around: Callable[[Values], list[Values]] | None = None
+    # effects that it contains, and replaces
+    contains: frozenset[str] = frozenset()
+    # a fuller form of it, which the runs must rule out
+    fuller: Fuller | None = None
+
+
+TRIALS: Mapping[str, Trial] = {
+    "coulomb_friction": Trial(
+        _amplitude("torque_Nm", lambda s: s.torque),
+        fuller=Fuller("stribeck_friction", _with_peak, ("static_Nm", "speed_rad_s")),
     ),
-    "torque_constant_saturation": _amplitude(
-        "per_A2", lambda s: 1 / s.current**2, emf_share=lambda s: (0.0, 1.0)
+    "stribeck_friction": Trial(_stribeck, contains=frozenset({"coulomb_friction"})),
+    "asymmetric_friction": Trial(
+        _asymmetric, contains=frozenset({"coulomb_friction", "constant_load"})
     ),
-    "inductance_saturation": _amplitude("per_A2", lambda s: 1 / s.current**2),
+    "quadratic_drag": Trial(_amplitude("drag_Nms2_rad2", lambda s: s.torque / s.speed**2)),
+    "cogging_torque": Trial(_periodic("amplitude_Nm", lambda s: s.torque)),
+    "torque_ripple": Trial(
+        _periodic("amplitude", lambda s: 1.0, {"emf_share": 0.0}, {"emf_share": 1.0})
+    ),
+    "constant_load": Trial(_amplitude("torque_Nm", lambda s: s.torque, signed=True)),
+    "shaft_compliance": Trial(
+        _compliance, starts=_shaft_starts, fuller=Fuller("gear_backlash", _with_play, ("gap_rad",))
+    ),
+    "gear_backlash": Trial(_no_columns, starts=_backlash_starts, around=_other_teeth),
+    "brush_voltage_drop": Trial(_amplitude("voltage_V", lambda s: s.voltage)),
+    "resistance_heating": Trial(
+        _amplitude("rise_per_W", lambda s: 1 / (s.voltage * s.current), time_constant_s=_thermal)
+    ),
+    "torque_constant_saturation": Trial(
+        _amplitude("per_A2", lambda s: 1 / s.current**2, emf_share=lambda s: (0.0, 1.0))
+    ),
+    "inductance_saturation": Trial(_amplitude("per_A2", lambda s: 1 / s.current**2)),
     # a voltage within it that is noise, or a small signal, has a sign which the motor does not feel
-    "input_dead_zone": _either(
-        _amplitude("width_V", lambda s: s.voltage),
-        _finite("width_V", lambda s: [share * s.voltage for share in (0.01, 0.05)]),
+    "input_dead_zone": Trial(
+        _either(
+            _amplitude("width_V", lambda s: s.voltage),
+            _finite("width_V", lambda s: [share * s.voltage for share in (0.01, 0.05)]),
+        )
     ),
-    "speed_sensor_lag": _finite("time_constant_s", _times),
-    "speed_sensor_delay": _finite("delay_s", _times),
-    "current_sensor_offset": _amplitude("offset_A", lambda s: s.current, signed=True),
+    "speed_sensor_lag": Trial(_finite("time_constant_s", _times)),
+    "speed_sensor_delay": Trial(_finite("delay_s", _times)),
+    "current_sensor_offset": Trial(_amplitude("offset_A", lambda s: s.current, signed=True)),
 }

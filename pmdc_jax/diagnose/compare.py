@@ -9,7 +9,7 @@ import numpy as np
 
 from ..identify.generalised_least_squares import residuals_of, sharpened, squares_of
 from ..identify.noise_model import Whitener, whitener
-from .kinship import is_within
+from .effect_relations import is_within
 from .model import Model
 
 # Models whose criterion is nearer than this are not told apart

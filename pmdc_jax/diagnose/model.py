@@ -21,7 +21,7 @@ from ..identify.polish import Fit, polish, reweighted
 from ..identify.prepare import Prepared
 from ..identify.refine import Optimum
 from ..identify.rotor_angle import of_rotor, with_rotor_angle
-from ..identify.solve import settle
+from ..identify.solve import polish_with_angle
 from ..motor import Motor
 from .response import Path, path_of
 
@@ -86,9 +86,9 @@ class Model:
         return training_runs(self.given)
 
 
-def settled(effects: tuple[str, ...], given: Prepared, start: Optimum, white: Whitener) -> Model:
+def refit_from(effects: tuple[str, ...], given: Prepared, start: Optimum, white: Whitener) -> Model:
     """A model fitted from a start to residuals that a filter makes white."""
-    given, ended = settle(whitened(given, white), start)
+    given, ended = polish_with_angle(whitened(given, white), start)
     given = given._replace(problem=replace(given.problem, whitening=None))
     # no step: what it leaves as it is
     plain = polish(given.problem, ended.optimum, steps=0)
@@ -103,10 +103,10 @@ def model_of(effects: tuple[str, ...], given: Prepared, polished: Fit) -> Model:
     return Model(effects, given, polished)
 
 
-def ended(model: Model, white: Whitener) -> tuple[Prepared, Fit]:
+def final_fit(model: Model, white: Whitener) -> tuple[Prepared, Fit]:
     """The last fit of a model."""
     known = reweighted(model.given.problem, model.fit)
-    plainly = settle(model.given, model.fit.optimum, known)
+    plainly = polish_with_angle(model.given, model.fit.optimum, known)
     return last_fit(*plainly, model.fit, white)
 
 

@@ -6,22 +6,21 @@ from collections.abc import Sequence
 from typing import NamedTuple, TypeGuard
 
 import numpy as np
-from scipy import stats
 
 from ..effects import EFFECTS
 from ..identify.noise_model import Whitener
 from ..identify.polish import Fit
 from ..identify.prepare import Prepared
 from ..identify.solve import Solved
-from .candidates import FULLER
+from .assessment import ALARM, HARDER, MUCH_OF_IT, Assessment, chance_of_nothing
 from .compare import FAR, MARGIN, Comparison, Fitted, plainest
-from .kinship import CONTAINS, are_rivals, spelt_out
+from .effect_relations import CONTAINS, are_rivals, spelt_out
 from .library import Library
-from .model import Model, ended
+from .model import Model, final_fit
 from .periodic import Line, line_of
 from .refits import Refits
+from .rivals import chances_without, rivals_of
 from .screen import Screen, Signal, beyond_curves, screen, signals
-from .seen import ALARM, HARDER, MUCH_OF_IT, Seen, chance_of_nothing
 from .shortlist import (
     COMPARABLE,
     SHORTLIST,
@@ -43,12 +42,8 @@ NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
 SWALLOWED = 1e-2
 # What is to take away most of a misfit foretells this share of it, at least
 FORETOLD = 0.05
-# A fuller form of an effect is ruled out if it leaves so many squares more: two standard errors
-RULED_OUT = 4.0
 # The simplest effect by which a rotor sticks
 DRY = "coulomb_friction"
-# Rivals whose criterion is nearer than the margin, and this share of what neither explains, are not told apart
-OF_UNEXPLAINED = 0.1
 
 
 class Naming(NamedTuple):
@@ -68,7 +63,7 @@ class Naming(NamedTuple):
     line: Line | None  # a steady oscillation that the chosen one does not have
 
 
-class Namer:
+class StepwiseSelection:
     """Gathers evidence, has sets of effects refitted, and compares them."""
 
     def __init__(self, base: Model, solved: Solved, report):
@@ -76,46 +71,50 @@ class Namer:
         self.base, self.library = base, Library(base)
         self.comparison = Comparison()
         self.refits = Refits(base, solved, self.library, self.comparison, report)
-        self.seen: dict[Model, Seen] = {}
+        self.assessments: dict[Model, Assessment] = {}
         # by effect: those that did as well when it was added
         self.instead: dict[str, set[str]] = {}
         # that a better one has replaced, or is to: judged by another filter each may look like the better one
-        self.passed: set[Model] = set()
+        self.superseded: set[Model] = set()
 
     def name(self) -> Naming:
         """Add effects while the evidence asks for them; then see which could be spared or replaced."""
-        current, found = self.base, self._see(self.base)
-        self.passed.add(current)
+        current, found = self.base, self.assess(self.base)
+        self.superseded.add(current)
         while better := self._step(current, found):
-            current, found = better, self._see(better)
-            self.passed.add(current)
-        return self._naming(self._better(current, found, self._tied(current, found)) or current)
+            current, found = better, self.assess(better)
+            self.superseded.add(current)
+        return self._naming(
+            self._better(current, found, self._equivalent_swaps(current, found)) or current
+        )
 
-    def _step(self, current: Model, found: Seen) -> Model | None:
+    def _step(self, current: Model, found: Assessment) -> Model | None:
         """A better model than the current one, with one effect more or another one, that settles something, if there is
         one."""
-        ways = [self._by_evidence, self._settling, self._by_plain_squares]
+        ways = [self._by_evidence, self._by_likeliest_effect, self._by_unfiltered_misfit]
         if found.unexplained < SWALLOWED:
-            ways = [self._by_plain_squares, self._by_evidence, self._settling]
+            ways = [self._by_unfiltered_misfit, self._by_evidence, self._by_likeliest_effect]
         ways.append(self._in_exchange)
-        models = (self._settled(current, found, way(current, found)) for way in ways)
+        models = (self._accepted(current, found, way(current, found)) for way in ways)
         return next(filter(None, models), None)
 
-    def _settled(self, current: Model, found: Seen, better: Model | None) -> Model | None:
+    def _accepted(self, current: Model, found: Assessment, better: Model | None) -> Model | None:
         """A better model if it is more than a way to mend a formula, or else in another form that is."""
-        if better is None or self._is_settled(current, found, better):
+        if better is None or self._explains_more_than_a_formula(current, found, better):
             return better
         # a simple form may be but a step to the one that is there
         added = set(better.effects) - set(current.effects)
-        again = self._see(better)
+        again = self.assess(better)
         best = self._better(better, again, self._in_other_form(better, again, added))
-        return best if best and self._is_settled(current, found, best) else None
+        return best if best and self._explains_more_than_a_formula(current, found, best) else None
 
-    def _by_evidence(self, current: Model, found: Seen) -> Model | None:
+    def _by_evidence(self, current: Model, found: Assessment) -> Model | None:
         """The best of the models that the evidence asks to be tried."""
-        return self._better(current, found, self._tried(current, found))
+        return self._better(current, found, self._trials(current, found))
 
-    def _better(self, current: Model, found: Seen, tried: Sequence[Model | None]) -> Model | None:
+    def _better(
+        self, current: Model, found: Assessment, tried: Sequence[Model | None]
+    ) -> Model | None:
         """The best of some models in place of the current one, if it is better, without what it can do without."""
         possible = [model for model in tried if self._is_new(model)]
         if not possible:
@@ -125,13 +124,15 @@ class Namer:
         # for noise what is missing
         if plainest(self.comparison.ranked([current, best], found.screen.white)) is current:
             return None
-        return self._spared(best)
+        return self._eliminated(best)
 
     def _is_new(self, model: Model | None) -> TypeGuard[Model]:
         """Whether a model is possible, and none that was left for a better one."""
-        return model is not None and model.is_possible and model not in self.passed
+        return model is not None and model.is_possible and model not in self.superseded
 
-    def _is_settled(self, current: Model, found: Seen, better: Model) -> bool:
+    def _explains_more_than_a_formula(
+        self, current: Model, found: Assessment, better: Model
+    ) -> bool:
         """Whether a better model is more than a way to mend the formula of what the current one has.
 
         What was left is clearly something else; or little is, beside what the better one takes away.
@@ -142,7 +143,7 @@ class Namer:
 
     def _leaves_little(self, current: Model, better: Model) -> bool:
         """Whether a better model leaves little beside what it takes away."""
-        again = self._see(better)
+        again = self.assess(better)
         if again.left >= ALARM:
             return True
         white, grown = self.comparison.white(better), len(better.effects) > len(current.effects)
@@ -150,10 +151,12 @@ class Namer:
             self.comparison.left(current, white).squares
             - self.comparison.left(better, white).squares
         )
-        share = NEXT_TO_NOTHING if grown and not self._see(current).is_foreign(current) else LITTLE
+        share = (
+            NEXT_TO_NOTHING if grown and not self.assess(current).is_foreign(current) else LITTLE
+        )
         return bool(again.clearest.gain < share * gained)
 
-    def _settling(self, current: Model, found: Seen) -> Model | None:
+    def _by_likeliest_effect(self, current: Model, found: Assessment) -> Model | None:
         """The current model with the effect that promises most, however little, if it settles what no formula explains:
         beside one that was fitted wrongly for want of it, it does more than it promises."""
         if not 0 < len(current.effects) < MOST or found.left >= ALARM or found.is_formula(current):
@@ -163,7 +166,7 @@ class Namer:
         better = self._better(current, found, self._with(current, found, most))
         return better if better and self._leaves_little(current, better) else None
 
-    def _by_plain_squares(self, current: Model, found: Seen) -> Model | None:
+    def _by_unfiltered_misfit(self, current: Model, found: Assessment) -> Model | None:
         """The current model with one of the effects that take away most of what is left, no filter between, if that
         leaves far less: a filter takes for noise what lasts as long as a short run."""
         far = current.fit.fitness / FAR
@@ -177,7 +180,7 @@ class Namer:
         better = [m for m in tried if m is not None and m.fit.fitness < far]
         return self._better(current, found, better)
 
-    def _in_exchange(self, current: Model, found: Seen) -> Model | None:
+    def _in_exchange(self, current: Model, found: Assessment) -> Model | None:
         """A model that has no room for one more effect, with the one that promises most in the place of each of those
         in the same equation."""
         if len(current.effects) < MOST or found.left >= ALARM or found.is_trace(current):
@@ -190,7 +193,7 @@ class Namer:
         for old in current.effects:
             if EFFECTS[old].equation == EFFECTS[new].equation:
                 smaller = self.refits.without(current, old, found.screen.white)
-                seen = self._see(smaller)
+                seen = self.assess(smaller)
                 most = [s for s in seen.of_candidates if effect_of(s) == new][:1]
                 tried += self._with(smaller, seen, most)
         return self._better(current, found, tried)
@@ -201,22 +204,22 @@ class Namer:
         return self._naming(self.refits.without(named.chosen, effect, white))
 
     def _naming(self, current: Model) -> Naming:
-        first, found = self._see(self.base), self._see(current)
+        first, found = self.assess(self.base), self.assess(current)
         return Naming(
             chosen=current,
-            rivals=self._rivals(current, found),
+            rivals=rivals_of(current, found, self.refits, self.comparison),
             first=first.screen,
             last=found.screen,
             nothing=first.left,
             left=found.left,
             explained=found.is_formula(current),
             noise=np.sqrt(beyond_curves(found.screen)) if found.left < ALARM else 1.0,
-            without=self._without(current, found.screen.white),
-            ended=ended(current, self.comparison.white(current)),
+            without=chances_without(current, found.screen.white, self.refits, self.comparison),
+            ended=final_fit(current, self.comparison.white(current)),
             line=line_of(current),
         )
 
-    def _tried(self, current: Model, found: Seen) -> list[Model | None]:
+    def _trials(self, current: Model, found: Assessment) -> list[Model | None]:
         """The current model with one effect more, or with a richer or a harder one in place of another."""
         here = set(current.effects)
         if len(here) == MOST:
@@ -232,7 +235,7 @@ class Namer:
         if found.asks_for_more():
             tried += self._with(current, found, shortlist(current, found))
         if found.left < ALARM and not here and not tried:
-            tried += self._sought(current, found)
+            tried += self._searched_with_friction(current, found)
         return tried + harder
 
     def _is_enough(self, model: Model | None) -> bool:
@@ -240,10 +243,10 @@ class Namer:
         may look like many an effect beside it."""
         if model is None or not model.is_possible:
             return False
-        found = self._see(model)
+        found = self.assess(model)
         return found.left >= ALARM or found.is_trace(model)
 
-    def _sought(self, current: Model, found: Seen) -> list[Model | None]:
+    def _searched_with_friction(self, current: Model, found: Assessment) -> list[Model | None]:
         """The motor with dry friction, searched for anew, if that may explain a misfit of which no first-order response
         is clear, and leaves far less: a motor whose rotor sticks for long is far from one that is thought to creep."""
         far = current.fit.fitness / FAR
@@ -255,12 +258,14 @@ class Namer:
         model = self.refits.sought(current, DRY)
         return [model] if model.fit.fitness < far else []
 
-    def _in_other_form(self, model: Model, found: Seen, added: set[str]) -> list[Model | None]:
+    def _in_other_form(
+        self, model: Model, found: Assessment, added: set[str]
+    ) -> list[Model | None]:
         """The model with what was added to it in a richer or a harder form."""
         fuller = [s for s in richer(model, found, MUCH_OF_IT) if CONTAINS[effect_of(s)] & added]
         return self._with(model, found, fuller) + self._in_harder_form(model, found, added)
 
-    def _tied(self, current: Model, found: Seen) -> list[Model | None]:
+    def _equivalent_swaps(self, current: Model, found: Assessment) -> list[Model | None]:
         """The model with others in the place of its effects that did as well as these when they were added."""
         if len(current.effects) < 2:
             return []
@@ -270,42 +275,25 @@ class Namer:
             for other in sorted(self.instead.get(effect, set()) - set(current.effects))
         ]
 
-    def _with(self, current: Model, found: Seen, signals: Sequence[Signal]) -> list[Model | None]:
+    def _with(
+        self, current: Model, found: Assessment, signals: Sequence[Signal]
+    ) -> list[Model | None]:
         return [self.refits.with_signal(current, s, found.screen) for s in signals]
 
-    def _in_harder_form(self, current: Model, found: Seen, effects: set[str]) -> list[Model | None]:
+    def _in_harder_form(
+        self, current: Model, found: Assessment, effects: set[str]
+    ) -> list[Model | None]:
         return [
             self.refits.in_place(current, found.screen.white, simpler, HARDER[simpler])
             for simpler in sorted(effects & HARDER.keys())
         ]
 
-    def _rivals(self, chosen: Model, found: Seen) -> list[Model]:
-        """Other sets that explain the runs as well, the best first."""
-        models = [chosen, *(m for m in self.refits.models.values() if m.is_possible)]
-        ranked = self.comparison.ranked(models, found.screen.white)
-        least = next(f.criterion for f in ranked if f.model is chosen)
-        margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.left < ALARM else 0.0)
-        near = [f.model for f in ranked if f.criterion < least + margin]
-        rivals = [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]
-        return rivals + self._not_ruled_out(chosen, found.screen.white)
+    def assess(self, model: Model) -> Assessment:
+        if model not in self.assessments:
+            self.assessments[model] = self._assessed(model)
+        return self.assessments[model]
 
-    def _not_ruled_out(self, chosen: Model, white: Whitener) -> list[Model]:
-        """The set with an effect in a fuller form, clearly so, where the runs show too little of it to tell."""
-        simple = [effect for effect in chosen.effects if effect in FULLER]
-        fuller = [self.refits.clearly_in_full(chosen, white, effect) for effect in simple]
-        least = self.comparison.left(chosen, white).squares
-        return [
-            model
-            for model in fuller
-            if self.comparison.left(model, white).squares < least + RULED_OUT
-        ]
-
-    def _see(self, model: Model) -> Seen:
-        if model not in self.seen:
-            self.seen[model] = self._look(model)
-        return self.seen[model]
-
-    def _look(self, model: Model) -> Seen:
+    def _assessed(self, model: Model) -> Assessment:
         found = screen(model, self.library)
         of_candidates, of_curves = signals(found)
         count = len(found.candidates) + len(found.curves)
@@ -316,7 +304,7 @@ class Namer:
             base, mine = (self.comparison.left(m, found.white) for m in (self.base, model))
             explained = base.squares - mine.squares
         removed = self.base.fit.fitness - model.fit.fitness
-        return Seen(found, of_candidates, of_curves, left, explained, removed)
+        return Assessment(found, of_candidates, of_curves, left, explained, removed)
 
     def _best(self, tried: Sequence[Model], white: Whitener) -> Model:
         """The best of some refits, by the filter of what the one that leaves least leaves."""
@@ -337,7 +325,7 @@ class Namer:
             if len(mine - its) == len(its - mine) == 1 and are_rivals(mine, its):
                 self.instead.setdefault(*(mine - its), set()).update(its - mine)
 
-    def _spared(self, model: Model) -> Model:
+    def _eliminated(self, model: Model) -> Model:
         """The model without effects that it can do without, or with simpler forms of them, alone or beside another one,
         that leave nothing more."""
         white = self.comparison.white(model)
@@ -347,25 +335,25 @@ class Namer:
                 self._is_new(smaller)
                 and self.comparison.ranked([model, smaller], white)[0].model is smaller
             ):
-                return self._spared(smaller)
+                return self._eliminated(smaller)
         for effect in model.effects:
             for simple in sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys()):
                 simpler = self.refits.in_place(model, white, effect, simple)
                 if self._is_new(simpler) and self._does_as_well(simpler, model):
-                    return self._spared(simpler)
-                two = simpler and self._beside(simpler, model, effect)
+                    return self._eliminated(simpler)
+                two = simpler and self._simple_form_with_another(simpler, model, effect)
                 if two and self._is_far_better(two, model, white):
-                    return self._spared(two)
+                    return self._eliminated(two)
         return model
 
-    def _beside(self, simpler: Model, model: Model, rich: str) -> Model | None:
+    def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:
         """A model with a simpler form of a rich effect, and one more beside it that promises as much as the rich form.
 
         Stribeck friction bends as drag does, if viscous friction makes up for the rest.
         """
         if len(simpler.effects) == MOST:
             return None
-        found = self._see(simpler)
+        found = self.assess(simpler)
         promised = {effect_of(s): s for s in clear(found)}
         enough = COMPARABLE * promised[rich].gain if rich in promised else 0.0
         here = set(simpler.effects)
@@ -391,17 +379,6 @@ class Namer:
             self.comparison.left(m, self.comparison.white(model)).criterion
             for m in (model, simpler)
         )
-        rest = self._see(model)
+        rest = self.assess(model)
         margin = MARGIN + (rest.clearest.gain if rest.left < ALARM else 0.0)
-        return bool(plain < rich + margin) or self._see(simpler).left >= ALARM
-
-    def _without(self, chosen: Model, white: Whitener) -> dict[str, float]:
-        chances = {}
-        for effect in chosen.effects:
-            smaller = self.refits.without(chosen, effect, white)
-            both = {
-                f.model.effects: f.squares for f in self.comparison.ranked([chosen, smaller], white)
-            }
-            gain = both[smaller.effects] - both[chosen.effects]
-            chances[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
-        return chances
+        return bool(plain < rich + margin) or self.assess(simpler).left >= ALARM

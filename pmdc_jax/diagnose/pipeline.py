@@ -19,6 +19,7 @@ from ..identify.solve import Solved, solve
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..recording import Runs
+from .assessment import ALARM
 from .diagnosis import (
     Detectable,
     Diagnosis,
@@ -33,9 +34,8 @@ from .evidence import Block
 from .experiment import next_experiment
 from .library import Library
 from .model import model_of
-from .naming import Namer, Naming
+from .naming import Naming, StepwiseSelection
 from .screen import Screen, log_chance
-from .seen import ALARM
 
 # A hat of a curve whose misfit is so many standard errors is part of a region
 CLEAR = 4.0
@@ -74,14 +74,14 @@ def diagnose(
     given, solved = solve(given, search, seed, progress)
     identified = time.perf_counter()
     report("gathering evidence", solved.fit.fitness)
-    namer = Namer(model_of((), given, solved.fit), solved, report)
-    naming = namer.name()
+    selection = StepwiseSelection(model_of((), given, solved.fit), solved, report)
+    naming = selection.name()
     named = time.perf_counter()
     report("judging the uncertainty", naming.chosen.fit.fitness)
     base = results_of(given, solved)
     final = _judged(naming, solved)
-    while (idle := _idle(naming, final, namer.library)) is not None:
-        naming = namer.without(naming, idle)
+    while (idle := _idle(naming, final, selection.library)) is not None:
+        naming = selection.without(naming, idle)
         final = _judged(naming, solved)
     verdict = _verdict(naming)
     gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)

@@ -20,11 +20,11 @@ from ..identify.refine import Optimum
 from ..identify.solve import POOR, Solved, searched
 from ..identify.uncertainty import FLAT, information_of
 from ..threads import side_by_side, side_by_side_until
-from .candidates import AROUND, FULLER, STARTS, Values
+from .candidates import TRIALS, Values
 from .compare import Comparison
-from .kinship import CONTAINS, spelt_out
+from .effect_relations import CONTAINS, FULLER, spelt_out
 from .library import Library
-from .model import Model, model_of, settled
+from .model import Model, model_of, refit_from
 from .screen import Screen, Signal
 
 # Share of the gain foretold by the evidence that a refit keeps, or else is tried in another way
@@ -135,7 +135,7 @@ class Refits:
             held.add("Kt")
         free = jnp.asarray([name not in held for name in given.problem.parameters.names])
         given = given._replace(problem=replace(given.problem, free=free))
-        return settled(effects, given, begun, white)
+        return refit_from(effects, given, begun, white)
 
     def _in_full(self, current: Model, effect: str, effects: tuple[str, ...]) -> Start:
         """Where to begin refitting with the fuller form of an effect, by the fit of the simple one."""
@@ -151,7 +151,7 @@ class Refits:
         given, begun = self._start(model, rest, {})
 
         def refit() -> Model:
-            return settled(rest, given, begun, white)
+            return refit_from(rest, given, begun, white)
 
         smaller = self._once(rest, model, refit)
         assert smaller is not None
@@ -183,7 +183,8 @@ class Refits:
 
     def _starts(self, current: Model, effects: tuple[str, ...]) -> list[Start]:
         """Where else to begin refitting the last of some effects."""
-        others = STARTS.get(effects[-1], lambda scales: [])(self.library.scales)
+        starts = TRIALS[effects[-1]].starts
+        others = starts(self.library.scales) if starts else []
         return [self._start(current, effects, {effects[-1]: values}) for values in others]
 
     def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener) -> Model:
@@ -199,9 +200,9 @@ class Refits:
         best = min(ends, key=lambda end: end.fitness)
         unknowns = best_backlash_start(given.problem, best.unknowns, starts[0][1].unknowns.local)
         begun = best._replace(unknowns=unknowns)
-        if effects[-1] in AROUND:
-            return _best_around(effects, given, begun)
-        return settled(effects, given, begun, white)
+        if around := TRIALS[effects[-1]].around:
+            return _best_around(effects, given, begun, around)
+        return refit_from(effects, given, begun, white)
 
     def _refitted(
         self,
@@ -215,13 +216,13 @@ class Refits:
         least squares; and as those leave it, if that is far less of what is measured: then what the filter took for
         noise was what is missing."""
         given, begun = start
-        model = settled(effects, given, begun, white)
+        model = refit_from(effects, given, begun, white)
         if self._keeps(model, current, signal, white):
             return model
         plain = polish(given.problem, begun)
         if plain.fitness < KEPT * _fitness(model):
             return model_of(effects, given, plain)
-        plainly = settled(effects, given, plain.optimum, white)
+        plainly = refit_from(effects, given, plain.optimum, white)
         left = self.comparison.left
         return min((model, plainly), key=lambda m: left(m, white).squares)
 
@@ -301,23 +302,28 @@ def _roughly(start: Start) -> Optimum:
     return end if np.isfinite(end.fitness) else end._replace(fitness=np.inf)
 
 
-def _best_around(effects: tuple[str, ...], given: Prepared, begun: Optimum) -> Model:
+def _best_around(
+    effects: tuple[str, ...],
+    given: Prepared,
+    begun: Optimum,
+    around: Callable[[Values], list[Values]],
+) -> Model:
     """The best refit from a start and from around where that ends, where the last effect has many optima, by the filter
     of what the start leaves."""
     white = whitener(residuals_of(given, polish(given.problem, begun, steps=0)))
-    model, sharp = settled(effects, given, begun, white), whitened(given, white)
+    model, sharp = refit_from(effects, given, begun, white), whitened(given, white)
     here = polish(sharp.problem, model.fit.optimum, steps=0).optimum
     effect, names = effects[-1], sharp.problem.parameters.names
     columns = {field: names.index(f"{effect}.{field}") for field in EFFECTS[effect].ranges}
     coordinates = np.asarray(here.unknowns.coordinates)
     starts = []
-    for values in AROUND[effect]({f: float(np.exp(coordinates[k])) for f, k in columns.items()}):
+    for values in around({f: float(np.exp(coordinates[k])) for f, k in columns.items()}):
         elsewhere = coordinates.copy()
         elsewhere[[columns[field] for field in values]] = np.log(list(values.values()))
         unknowns = here.unknowns._replace(coordinates=jnp.asarray(elsewhere))
         starts.append((sharp, Optimum(unknowns, np.inf, (), False)))
     best = min(side_by_side(_roughly, starts), key=lambda end: end.fitness)
-    return settled(effects, given, best, white) if best.fitness < here.fitness else model
+    return refit_from(effects, given, best, white) if best.fitness < here.fitness else model
 
 
 def _turns(model: Model, effect: str) -> list[np.ndarray | None]:

@@ -20,8 +20,8 @@ from ..motor import Motor
 from ..simulate import Tape
 from .library import TOGETHER, Change
 from .model import Model, RunSeries, rows_of
+from .quantisation import readings
 from .response import Path, respond
-from .rounding import readings
 
 # Samples that are made white at once
 STRETCH = 2048

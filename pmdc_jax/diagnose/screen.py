@@ -16,7 +16,7 @@ from .candidates import Candidate
 from .evidence import Block, Evidence, blocks_of, products
 from .library import Curve, Library, curves_over
 from .model import Model
-from .rounding import READINGS
+from .quantisation import READINGS
 from .rows import Rows, gathered
 
 # How much stronger slow noise may be at the slowest waves than at most of them

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..effects import EFFECTS
-from .candidates import STARTS
-from .kinship import CONTAINS, spelt_out
+from .assessment import ALARM, FORMULA, MOST_OF_IT, MUCH_OF_IT, Assessment
+from .candidates import TRIALS
+from .effect_relations import CONTAINS, spelt_out
 from .model import Model
 from .screen import Signal
-from .seen import ALARM, FORMULA, MOST_OF_IT, MUCH_OF_IT, Seen
 
 # So many candidates for one effect are refitted in full simulation
 SHORTLIST = 3
@@ -21,7 +21,7 @@ COMPARABLE = 0.6
 TIED = 1e-3
 
 
-def shortlist(current: Model, found: Seen) -> list[Signal]:
+def shortlist(current: Model, found: Assessment) -> list[Signal]:
     """The most significant shape of each of the few effects that explain most.
 
     If that is an effect which is there already and little is left, its own formula is what is left to be desired,
@@ -36,7 +36,7 @@ def shortlist(current: Model, found: Seen) -> list[Signal]:
     own = own and obvious[0].gain > MUCH_OF_IT * most
     exact = own and EFFECTS[effect_of(obvious[0])].equation == "sensor"
     if own and not exact and found.unexplained < FORMULA:
-        ranked = [s for s in ranked if effect_of(s) in STARTS]
+        ranked = [s for s in ranked if TRIALS[effect_of(s)].starts]
     elif fuller := richer(current, found):
         return fuller
     # what may be slow noise is trusted less, but is tried for what it explains
@@ -59,7 +59,7 @@ def promising(signals: Sequence[Signal], here: set[str], least: float) -> list[S
     return [s for s in ranked if s.gain > max(MUCH_OF_IT * ranked[0].gain, least)]
 
 
-def clear(found: Seen) -> list[Signal]:
+def clear(found: Assessment) -> list[Signal]:
     """The most significant shape of every effect that chance would not bring about.
 
     A torque may look like slow noise because another one is missing beside it: what takes away much of the clearest
@@ -73,7 +73,7 @@ def clear(found: Seen) -> list[Signal]:
     return [s for s in best.values() if s.log_p < enough or s.gain > much]
 
 
-def richer(current: Model, found: Seen, share: float = MOST_OF_IT) -> list[Signal]:
+def richer(current: Model, found: Assessment, share: float = MOST_OF_IT) -> list[Signal]:
     """An effect that contains one which is there, and explains such a share of what is left; if there is one."""
     here = spelt_out(set(current.effects))
     enough = share * found.clearest.gain

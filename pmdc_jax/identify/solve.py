@@ -127,7 +127,7 @@ def searched(
         before, found = found, look(seed + attempt)
         found = found._replace(evaluations=before.evaluations + found.evaluations)
         ends = sorted([*ends, *_refine_all(problem, found)], key=_fitness)
-    given, polished = settle(given, ends[0])
+    given, polished = polish_with_angle(given, ends[0])
     seconds = {"search": searched - began, "refine": time.perf_counter() - searched}
     record = _search_record(search, found, ends)
     return given, Solved(polished, record, seed, found.interrupted, seconds)
@@ -139,7 +139,9 @@ def _where_effects_show(given: Prepared) -> Parameters:
     return given.parameters(effects, effect_bounds(effects, given.training))
 
 
-def settle(given: Prepared, end: Optimum, known: Evaluation | None = None) -> tuple[Prepared, Fit]:
+def polish_with_angle(
+    given: Prepared, end: Optimum, known: Evaluation | None = None
+) -> tuple[Prepared, Fit]:
     """Polish; again, as long as it helps, where a torque depends on how the better motor turns."""
     polished = polish(given.problem, end, known=known)
     for _ in range(ANGLE_ITERATIONS if given.problem.angular else 0):

@@ -15,7 +15,7 @@ from ..diagnose.diagnosis import (
     unlike_held_out,
     worse_held_out,
 )
-from ..diagnose.kinship import CONTAINS
+from ..diagnose.effect_relations import CONTAINS
 from ..identify.identification import Estimate, Role, RunFit
 from .notation import (
     amount,

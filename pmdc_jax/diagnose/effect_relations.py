@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-# An effect that contains another one replaces it
-CONTAINS = {
-    "stribeck_friction": {"coulomb_friction"},
-    "asymmetric_friction": {"coulomb_friction", "constant_load"},
-}
+from .candidates import TRIALS
+
+# An effect that contains others replaces them
+CONTAINS = {effect: trial.contains for effect, trial in TRIALS.items() if trial.contains}
+# The simple forms of which there are fuller ones
+FULLER = {effect: trial.fuller for effect, trial in TRIALS.items() if trial.fuller}
 
 
 def are_rivals(a: set[str], b: set[str]) -> bool:
@@ -22,7 +23,7 @@ def is_within(a: set[str], b: set[str]) -> bool:
 def spelt_out(effects: set[str]) -> set[str]:
     """The same torque in motion, by effects that one which is richer in another way can be part of."""
     if "asymmetric_friction" in effects:
-        return (effects - {"asymmetric_friction"}) | {"coulomb_friction", "constant_load"}
+        return (effects - {"asymmetric_friction"}) | CONTAINS["asymmetric_friction"]
     return effects
 
 
@@ -33,7 +34,7 @@ def _same_class(a: set[str], b: set[str]) -> bool:
 
 def _contains(a: set[str], b: set[str]) -> bool:
     """Whether one set is the other but for an effect that another one contains."""
-    return any(_simplified(x) <= y or _simplified(x) == _simplified(y) for x, y in ((a, b), (b, a)))
+    return _simplified(a) <= b or _simplified(b) <= a or _simplified(a) == _simplified(b)
 
 
 def _simplified(effects: set[str]) -> set[str]:

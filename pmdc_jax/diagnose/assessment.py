@@ -9,8 +9,7 @@ import numpy as np
 
 from ..effects import EFFECTS
 from ..effects.base import AbstractEffect
-from .candidates import FULLER
-from .kinship import CONTAINS
+from .effect_relations import CONTAINS, FULLER
 from .library import Curve
 from .model import Model
 from .screen import Screen, Signal
@@ -39,7 +38,7 @@ def chance_of_nothing(
     return float(min(1.0, np.exp(smallest + np.log(count))))
 
 
-class Seen(NamedTuple):
+class Assessment(NamedTuple):
     """The evidence against a model, read once."""
 
     screen: Screen
