@@ -100,18 +100,18 @@ class Motor(eqx.Module):
     @property
     def switches(self) -> bool:
         """Whether there are dry elements, or teeth that touch and part."""
-        return any(effect.holds or effect.twists for effect in self.effects)
+        return any(effect.holds or effect.contact_state for effect in self.effects)
 
     @property
     def toothed(self) -> AbstractEffect | None:
         """The effect that has teeth."""
-        return next((effect for effect in self.effects if effect.twists), None)
+        return next((effect for effect in self.effects if effect.contact_state), None)
 
     def with_effects(self, effects: Iterable[AbstractEffect]) -> Motor:
         """The same motor with other effects than its own."""
         return eqx.tree_at(lambda motor: motor.effects, self, tuple(effects))
 
-    def rest(
+    def initial_state(
         self,
         current: Scalars,
         speed: Scalars,
@@ -126,7 +126,7 @@ class Motor(eqx.Module):
         current, speed, load, angle = (jnp.zeros(shape) + x for x in (current, speed, load, angle))
         extra = {}
         for effect in self.effects:
-            extra |= effect.rest(speed, load, angle)
+            extra |= effect.initial_states(speed, load, angle)
         return State(current, speed, extra)
 
     def at(self, state: State) -> Motor:

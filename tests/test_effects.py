@@ -775,7 +775,7 @@ def test_a_state_is_the_same_in_all_effects_that_have_it(x64):
     known = {}
     for name, motor in motors.items():
         assert not set(motor.states) & {"current", "speed"}
-        state = motor.rest(jnp.asarray(5.0), speed, load, angle)
+        state = motor.initial_state(jnp.asarray(5.0), speed, load, angle)
         rate = motor.derivative(state, jnp.asarray(3.0), load)
         for extra in motor.states:
             both = float(state.extra[extra]), float(rate.extra[extra])
@@ -786,7 +786,7 @@ def test_a_state_is_the_same_in_all_effects_that_have_it(x64):
 def test_states_have_rates(x64, name):
     """An effect moves its own states, all of them, and no other."""
     motor = with_effect(name)
-    state = motor.rest(jnp.asarray(5.0), jnp.asarray(10.0))
+    state = motor.initial_state(jnp.asarray(5.0), jnp.asarray(10.0))
     rates = motor.derivative(state, jnp.asarray(3.0), jnp.asarray(0.0))
     assert set(rates.extra) == set(EFFECTS[name].states) == set(motor.states)
     assert jax.tree.structure(rates) == jax.tree.structure(state)
@@ -795,7 +795,7 @@ def test_states_have_rates(x64, name):
 @every_effect
 def test_only_dry_elements_grip(name):
     motor = with_effect(name)
-    state = motor.rest(jnp.asarray(0.0), jnp.asarray(0.0))
+    state = motor.initial_state(jnp.asarray(0.0), jnp.asarray(0.0))
     for holds in ("current", "speed"):
         grip = motor.grip(holds, state)
         assert (grip is not None) == (EFFECTS[name].holds == holds)

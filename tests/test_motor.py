@@ -118,7 +118,7 @@ def test_the_derivative_is_the_state_space(x64, m):
     rng = np.random.default_rng(2)
     A, B = (np.asarray(x) for x in motor(**m).state_space())
     for x, u in rng.standard_normal((5, 2, 2)):
-        state = motor(**m).rest(jnp.asarray(x[0]), jnp.asarray(x[1]))
+        state = motor(**m).initial_state(jnp.asarray(x[0]), jnp.asarray(x[1]))
         rate = motor(**m).derivative(state, jnp.asarray(u[0]), jnp.asarray(u[1]))
         np.testing.assert_allclose([rate.current, rate.speed], A @ x + B @ u, rtol=1e-9)
         assert rate.extra == {}
@@ -135,7 +135,7 @@ def test_the_mechanical_half_alone(x64, kind):
     A, B = half.state_space(drive)
     np.testing.assert_allclose(A, [[0, 0], [0, -PAPER["f"] / PAPER["J"]]], rtol=1e-14, atol=0)
     np.testing.assert_allclose(B, [[0, 0], [gain / PAPER["J"], -1 / PAPER["J"]]], rtol=1e-14)
-    state = half.rest(jnp.asarray(0.0), jnp.asarray(40.0))
+    state = half.initial_state(jnp.asarray(0.0), jnp.asarray(40.0))
     rate = half.derivative(state, jnp.asarray(2.0), jnp.asarray(0.1), drive)
     assert rate.current == 0
     expected = (gain * 2.0 - PAPER["f"] * 40.0 - 0.1) / PAPER["J"]

@@ -332,7 +332,7 @@ def _turns(model: Model, effect: str) -> list[np.ndarray | None]:
     By none, where its angle is known or counts as zero; by whole periods of another effect that the model has.
     """
     others = [e for e in model.motor.effects if "angle" in e.states and e.name != effect]
-    count = round(2 * np.pi / float(others[0].recurrence()["angle"])) if others else 0
+    count = round(2 * np.pi / float(others[0].repeats_after()["angle"])) if others else 0
     whole = 2 * np.pi * np.arange(count) / count if count else None
     turnable = np.asarray(model.given.problem.turnable)
     return [whole if turnable[run] else np.zeros(1) for run in model.training]

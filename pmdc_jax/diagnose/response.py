@@ -148,7 +148,7 @@ def _one_sample(motor: Motor, tape: Tape, path: Path) -> State:
 def _states(motor: Motor, tape: Tape, path: Path) -> State:
     """The motor's states on the path; those that its effects add follow from current and speed there."""
     load = jnp.asarray(tape.load).T
-    start = motor.rest(path.current, path.speed, load, path.angle)
+    start = motor.initial_state(path.current, path.speed, load, path.angle)
     if not set(motor.states) - {"angle"}:
         return start
     along, drive = _of_blocks(motor, tape)

@@ -23,7 +23,7 @@ class _Angular(AbstractEffect):
 
     states: ClassVar = ("angle",)
 
-    def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
+    def initial_states(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del speed, load
         return {"angle": angle}
 
@@ -62,10 +62,10 @@ class CoggingTorque(_Angular):
     def torque(self, state: State) -> Scalars:
         return self.amplitude_Nm * _wave(self, state)
 
-    def over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
+    def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
         return replace(self, amplitude_Nm=self.amplitude_Nm * _fitted(self, state.speed * seconds))
 
-    def recurrence(self) -> dict[str, Scalars]:
+    def repeats_after(self) -> dict[str, Scalars]:
         return _period(self)
 
 
@@ -106,10 +106,10 @@ class TorqueRipple(_Angular):
         constants = motor.Kt * (1 + ripple), motor.Kb * (1 + self.emf_share * ripple)
         return eqx.tree_at(lambda m: (m.Kt, m.Kb), motor, constants)
 
-    def over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
+    def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
         return replace(self, amplitude=self.amplitude * _fitted(self, state.speed * seconds))
 
-    def recurrence(self) -> dict[str, Scalars]:
+    def repeats_after(self) -> dict[str, Scalars]:
         return _period(self)
 
 

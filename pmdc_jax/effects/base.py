@@ -9,12 +9,12 @@ each of which does nothing unless the effect overrides it:
 - `voltage_drop` and `torque`: smooth terms of the electrical and the mechanical equation
 - `load_at_rotor`: what of the load torque acts on the rotor itself
 - `grip`: a dry, set-valued term that can hold a state at exactly zero (stiction, brush contact)
-- `teeth` and `loose`: flanks that touch and part (a gear)
-- `over_step`: how it acts on average over a step, or until something switches
-- `states`, `rest` and `derivative`: states of its own, how they begin and how they move
-- `recurrence`: after how much of a state everything is as before
+- `teeth` and `without_contact`: flanks that touch and part (a gear)
+- `averaged_over_step`: how it acts on average over a step, or until something switches
+- `states`, `initial_states` and `derivative`: states of its own, how they begin and how they move
+- `repeats_after`: after how much of a state everything is as before
 - `linear`: the linear effect that it is, or nearly is, whose states then join the exact step
-- `stiffens`: how much faster it makes the motor
+- `fastest_rate`: how much faster it makes the motor
 - `sensors` and `speed_delay`: how current and speed are seen
 
 New effects are one class here and one row in the table `EFFECTS` of this package.
@@ -51,16 +51,16 @@ class Grip(NamedTuple):
 
 
 class Teeth(NamedTuple):
-    """Two flanks that touch, or do not: on which side (+-1), how far in rad they overlap, and by what twist in rad the
-    torque is that they would pass if they stuck together. They push and never pull."""
+    """Two flanks that touch, or do not: on which side (+-1), how far in rad they overlap, and the compression in rad by
+    which they would pass their torque, damping included, if they stuck together. They push and never pull."""
 
     side: Scalars
-    bite: Scalars
-    push: Scalars
+    overlap: Scalars
+    compression: Scalars
 
     @property
     def touch(self) -> Bool[Array | np.ndarray, "*#batch"]:
-        return (self.bite > 0) & (self.push > 0)
+        return (self.overlap > 0) & (self.compression > 0)
 
 
 class ParameterRange(NamedTuple):
@@ -93,9 +93,9 @@ class AbstractEffect(eqx.Module):
     # which state a dry element holds at zero
     holds: ClassVar[Literal["speed", "current"] | None] = None
     # the state by which its teeth come to touch and part
-    twists: ClassVar[str | None] = None
+    contact_state: ClassVar[str | None] = None
     # the state of a spring, which a run may begin with wound up in any way
-    winds: ClassVar[str | None] = None
+    spring_state: ClassVar[str | None] = None
     # with it the motor is still a linear system with inputs, as long as no dry element changes direction and no teeth
     # come to touch or part
     affine: ClassVar[bool] = False
@@ -133,7 +133,7 @@ class AbstractEffect(eqx.Module):
         """Limits of the dry element; needs `holds`."""
         raise NotImplementedError(f"{self.name} has no dry element")
 
-    def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
+    def initial_states(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         """The effect's own states where a run begins with this speed (rad/s), load (N m) and angle (rad)."""
         del load, angle
         return dict.fromkeys(self.states, 0.0 * speed)
@@ -143,7 +143,7 @@ class AbstractEffect(eqx.Module):
         del motor, state, load
         return {}
 
-    def recurrence(self) -> dict[str, Scalars]:
+    def repeats_after(self) -> dict[str, Scalars]:
         """By how much a state of its own can differ and all else goes on alike."""
         return {}
 
@@ -152,23 +152,23 @@ class AbstractEffect(eqx.Module):
         return None
 
     def teeth(self, state: State, side: Scalars | None = None) -> Teeth:
-        """How its teeth stand, on the side where they are nearer or the one given; needs `twists`."""
+        """How its teeth stand, on the side where they are nearer or the one given; needs `contact_state`."""
         raise NotImplementedError(f"{self.name} has no teeth")
 
     def play(self) -> Scalars | float:
         """By how much its teeth can be apart, rad."""
         return 0.0
 
-    def over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
+    def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
         """The effect as it acts throughout a step of so many seconds that begins with this state."""
         del state, seconds
         return self
 
-    def loose(self) -> AbstractEffect:
+    def without_contact(self) -> AbstractEffect:
         """The effect while its teeth do not touch."""
         return self
 
-    def stiffens(self, motor: Motor, current: Scalars) -> Scalars | None:
+    def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars | None:
         """How much faster, in 1/s, the motor becomes at a current in A; None where `longest_step` is always enough."""
         del motor, current
         return None

@@ -68,5 +68,5 @@ class InductanceSaturation(AbstractEffect):
             lambda m: m.L, motor, motor.L * (1 / (1 + self.per_A2 * state.current**2))
         )
 
-    def stiffens(self, motor: Motor, current: Scalars) -> Scalars:
+    def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars:
         return motor.R * (1 / motor.L) * self.per_A2 * current**2

@@ -28,7 +28,7 @@ class SpeedSensorLag(AbstractEffect):
 
     time_constant_s: Scalars
 
-    def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
+    def initial_states(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del load, angle
         return {"reported_speed": speed}
 

@@ -59,7 +59,7 @@ class ShaftCompliance(_TwoInertias):
     label: ClassVar = "Compliant shaft"
     formula: ClassVar = "T_s = k twist + d (w - w_L), s J dw_L/dt = T_s - T_load"
     states: ClassVar = ("load_speed", "twist")
-    winds: ClassVar = "twist"
+    spring_state: ClassVar = "twist"
     affine: ClassVar = True
     ranges: ClassVar = {
         "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
@@ -72,7 +72,7 @@ class ShaftCompliance(_TwoInertias):
             state
         )
 
-    def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
+    def initial_states(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del angle
         return {"load_speed": speed, "twist": load * (1 / self.stiffness_Nm_rad)}
 
@@ -83,7 +83,7 @@ class ShaftCompliance(_TwoInertias):
 class GearBacklash(_TwoInertias):
     """Backlash: a compliant shaft, or gear, that carries torque only once its play is taken up.
 
-    As `shaft_compliance`, with T_s = stiffness bite + damping (w - w_L) while the teeth touch, where bite = twist
+    As `shaft_compliance`, with T_s = stiffness overlap + damping (w - w_L) while the teeth touch, where overlap = twist
     -+ gap/2 is how far they are pressed together, and nothing inside the gap; teeth push and never pull. Without gap
     it is nearly a compliant shaft. A run begins with the teeth in contact on the side that the load presses them to,
     or in the middle without load; in a fit, as the run itself says.
@@ -99,12 +99,12 @@ class GearBacklash(_TwoInertias):
     name: ClassVar = "gear_backlash"
     label: ClassVar = "Gear backlash"
     formula: ClassVar = (
-        "T_s = k bite + d (w - w_L) while the teeth touch, bite = |twist| - gap/2, else 0"
+        "T_s = k overlap + d (w - w_L) while the teeth touch, overlap = |twist| - gap/2, else 0"
     )
     states: ClassVar = ("gear_speed", "gear_twist")
     affine: ClassVar = True
-    twists: ClassVar = "gear_twist"
-    winds: ClassVar = "gear_twist"
+    contact_state: ClassVar = "gear_twist"
+    spring_state: ClassVar = "gear_twist"
     ranges: ClassVar = {
         "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
         "damping_Nms_rad": ParameterRange("N m s/rad", 1e-11, 1e6),
@@ -117,29 +117,29 @@ class GearBacklash(_TwoInertias):
     def teeth(self, state: State, side: Scalars | None = None) -> Teeth:
         twist = state.extra["gear_twist"]
         side = jnp.where(twist < 0, -1.0, 1.0) if side is None else side
-        bite = side * twist - self.gap_rad / 2
+        overlap = side * twist - self.gap_rad / 2
         slip = self.damping_Nms_rad * (1 / self.stiffness_Nm_rad) * self.slip(state)
-        return Teeth(side, bite, bite + side * slip)
+        return Teeth(side, overlap, overlap + side * slip)
 
     def torque(self, state: State) -> Scalars:
         teeth = self.teeth(state)
-        return jnp.where(teeth.touch, teeth.side * self.stiffness_Nm_rad * teeth.push, 0.0)
+        return jnp.where(teeth.touch, teeth.side * self.stiffness_Nm_rad * teeth.compression, 0.0)
 
     def play(self) -> Scalars:
         return self.gap_rad
 
-    def over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
+    def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
         """As it stays until its teeth touch or part."""
         del seconds
         return self._held(self.gap_rad, self.teeth(state))
 
-    def stiffens(self, motor: Motor, current: Scalars) -> Scalars:
+    def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars:
         """The rate at which teeth ring: a step is then a third of the time that they touch before they bounce."""
         del current
         share = self.load_share
         return jnp.sqrt(self.stiffness_Nm_rad / (motor.J * share * (1 - share)))
 
-    def rest(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
+    def initial_states(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del angle
         twist = load * (1 / self.stiffness_Nm_rad) + jnp.sign(load) * self.gap_rad / 2
         return {"gear_speed": speed, "gear_twist": twist}
@@ -149,16 +149,16 @@ class GearBacklash(_TwoInertias):
         one = jnp.ones_like(self.gap_rad)
         return self._held(0.0 * one, Teeth(one, one, one))
 
-    def loose(self) -> AbstractEffect:
+    def without_contact(self) -> AbstractEffect:
         one = jnp.ones_like(self.gap_rad)
         return self._held(self.gap_rad, Teeth(one, -one, -one))
 
-    def _held(self, gap_rad: Scalars, stand: Teeth) -> HeldTeeth:
+    def _held(self, gap_rad: Scalars, stand: Teeth) -> FixedTeeth:
         shaft = (self.stiffness_Nm_rad, self.damping_Nms_rad, self.load_share)
-        return HeldTeeth(*shaft, gap_rad, stand)
+        return FixedTeeth(*shaft, gap_rad, stand)
 
 
-class HeldTeeth(GearBacklash):
+class FixedTeeth(GearBacklash):
     """Backlash whose teeth go on touching, on one side, or not touching, as they stood."""
 
     stood: Teeth
@@ -168,5 +168,5 @@ class HeldTeeth(GearBacklash):
 
     def torque(self, state: State) -> Scalars:
         teeth = self.teeth(state, self.stood.side)
-        push = teeth.side * self.stiffness_Nm_rad * teeth.push
+        push = teeth.side * self.stiffness_Nm_rad * teeth.compression
         return jnp.where(self.stood.touch, push, 0.0)

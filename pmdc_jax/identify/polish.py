@@ -190,7 +190,7 @@ def best_initial_angle(problem: Problem, unknowns: Unknowns) -> Unknowns:
 
     From half a period away slopes lead to another optimum, or nowhere.
     """
-    waves = [e.recurrence() for e in problem.parameters(unknowns.coordinates).effects]
+    waves = [e.repeats_after() for e in problem.parameters(unknowns.coordinates).effects]
     periods = [float(wave["angle"]) for wave in waves if "angle" in wave]
     turnable = np.asarray(problem.turnable & ~jnp.asarray(problem.fitted_runs))
     if not periods or not turnable.any():

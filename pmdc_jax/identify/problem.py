@@ -77,9 +77,9 @@ class Problem(eqx.Module):
         return any("angle" in effect.states for effect in self.parameters.effects)
 
     @property
-    def winds(self) -> bool:
+    def has_spring(self) -> bool:
         """Whether a spring may be wound up as a run begins."""
-        return any(effect.winds for effect in self.parameters.effects)
+        return any(effect.spring_state for effect in self.parameters.effects)
 
     @property
     def turnable(self) -> Bool[Array, " runs"]:
@@ -97,7 +97,7 @@ class Problem(eqx.Module):
         drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid][first] > 0, tape.drive)
         angle = self.turnable & self.angular
         load = jnp.asarray(tape.load_unknown)
-        twist = self.winds & drive.free
+        twist = self.has_spring & drive.free
         own = jnp.stack([drive.voltage, drive.free, load, angle, twist], 1)
         return jnp.concatenate([self.free[None, :] & self.fitted_runs[:, None], own], 1)
 

@@ -124,7 +124,7 @@ def _errors_of_linear(motors: Motor, tape: Tape):
         _, drive = pick_grid(grids, tape, grid)
         along = jax.tree.map(lambda leaf: _repeated(_taken(leaf, grid), rows), grids)
         samples = (tape.value[block], tape.load[block], tape.measured[block], tape.weight[block])
-        initial = motors.rest(*tape.initial[tape.run[block]])
+        initial = motors.initial_state(*tape.initial[tape.run[block]])
         begins = tape.begins[block]
         state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
         stride = jax.tree.map(lambda leaf: leaf[grid], strides)
@@ -146,7 +146,7 @@ def _errors_of_linear(motors: Motor, tape: Tape):
 
     zero = jnp.zeros_like(motors.R)
     nothing = jnp.zeros((rows, len(zero)))
-    start = Walk(motors.rest(zero, zero), (nothing, nothing))
+    start = Walk(motors.initial_state(zero, zero), (nothing, nothing))
     saveat = diffrax.SaveAt(t1=True)
     errors = walk(HeldInput(advance), start, tape.value.shape[0], saveat).seen
     # rows are summed only here: XLA would merge the sum into the arithmetic and give up vector instructions
@@ -199,7 +199,7 @@ def _errors_with_effects(motors: Motor, tape: Tape):
 
         run = tape.run[block]
         current, speed = tape.initial[run]
-        initial = motors.rest(current, speed, tape.load[block, 0], tape.angle[run])
+        initial = motors.initial_state(current, speed, tape.load[block, 0], tape.angle[run])
         begins = tape.begins[block]
         state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
         samples = (
@@ -213,7 +213,7 @@ def _errors_with_effects(motors: Motor, tape: Tape):
         return Walk(state, errors)
 
     zero = jnp.zeros_like(motors.R)
-    start = Walk(motors.rest(zero, zero), (zero, zero))
+    start = Walk(motors.initial_state(zero, zero), (zero, zero))
     saveat = diffrax.SaveAt(t1=True)
     errors = walk(HeldInput(advance), start, tape.value.shape[0], saveat).seen
     return _finite(errors[0][0]), _finite(errors[1][0])

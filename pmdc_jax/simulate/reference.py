@@ -39,7 +39,7 @@ def reference_solution(
         t0=times[0],
         t1=times[-1],
         dt0=None,
-        y0=motor.rest(initial[0], initial[1], load[0]),
+        y0=motor.initial_state(initial[0], initial[1], load[0]),
         saveat=diffrax.SaveAt(ts=times),
         stepsize_controller=diffrax.ClipStepSizeController(
             diffrax.PIDController(rtol=tolerance, atol=tolerance), jump_ts=times[1:-1]

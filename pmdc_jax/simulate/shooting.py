@@ -117,9 +117,7 @@ def sensitivities(
         motor = assemble(parameters)
         return motor, along_grids(motor, tape)
 
-    prepared, d_prepared = jax.vmap(
-        lambda direction: jax.jvp(prepare, (parameters,), (direction,)), out_axes=(None, 0)
-    )(jnp.eye(count))
+    prepared, d_prepared = _along_columns(prepare, (parameters,), (jnp.eye(count),))
     motor = prepared[0]
     d_motor = jax.tree.map(lambda leaf: _pad_columns(leaf, every), d_prepared[0])
     ones = jnp.eye(LOCAL, every, count)[:, :, None]
@@ -176,8 +174,12 @@ def _begins(motor: Motor, own: Own, tape: Tape) -> Starts:
     """How the run of each block begins."""
     first = jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs))
     load = jnp.asarray(tape.load)[first, 0] + own.load_offset
-    state = motor.rest(own.current, own.speed, load, own.angle)
-    wound = {e.winds: state.extra[e.winds] + own.twist for e in motor.effects if e.winds}
+    state = motor.initial_state(own.current, own.speed, load, own.angle)
+    wound = {
+        e.spring_state: state.extra[e.spring_state] + own.twist
+        for e in motor.effects
+        if e.spring_state
+    }
     return _pack(state._replace(extra=state.extra | wound)).T[tape.run]
 
 
@@ -192,7 +194,7 @@ def _guess(motor: Motor, own: Own, tape: Tape, begins: Starts) -> Starts:
     first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
     angle = own.angle[tape.run] + before[:-1] - before[first]
     load = jnp.asarray(tape.load)[:, 0] + own.load_offset[tape.run]
-    guess = _pack(motor.rest(current, speed, load, angle)).T
+    guess = _pack(motor.initial_state(current, speed, load, angle)).T
     return jnp.where(jnp.asarray(tape.begins)[:, None], begins, guess)
 
 
@@ -259,10 +261,9 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
             after = _turned(state, after, turn[k])
             return after, outputs(motor, along, drive, state, value[k], load, steps, rises)
 
-        (state, seen), (d_state, d_seen) = jax.vmap(
-            lambda *tangents: jax.jvp(look_and_step, (motor, along, state, load[k]), tangents),
-            out_axes=(None, 0),
-        )(d_motor, d_along, d_state, d_load)
+        (state, seen), (d_state, d_seen) = _along_columns(
+            look_and_step, (motor, along, state, load[k]), (d_motor, d_along, d_state, d_load)
+        )
         return Walk((state, d_state), (seen, d_seen))
 
     state = _unpack(motor, starts.T)
@@ -323,7 +324,7 @@ def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts, limits=Non
 
 def _recurrence(motor: Motor) -> Float[Array, " states"]:
     """After how much of each state all is as before; zero for never."""
-    known = {name: p for effect in motor.effects for name, p in effect.recurrence().items()}
+    known = {name: p for effect in motor.effects for name, p in effect.repeats_after().items()}
     return jnp.stack(
         [jnp.zeros(()), jnp.zeros(()), *(known.get(n, jnp.zeros(())) for n in motor.states)]
     )

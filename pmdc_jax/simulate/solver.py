@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
 from .exponential import Matrix, phi_functions, product
-from .switches import crossed, knocked, knocks_of, once
+from .switches import computed_once, contact_correction, contact_response, stick_or_reverse
 
 if TYPE_CHECKING:
     from .tape import Tape
@@ -35,8 +35,8 @@ class Stages(NamedTuple):
     """Weights of ETDRK4 for whatever is not linear."""
 
     half: Matrix  # exp(A h / 2)
-    push: Matrix  # h / 2 phi_1(A h / 2)
-    turn: Matrix  # (exp(A h / 2) - 1) push
+    half_input: Matrix  # h / 2 phi_1(A h / 2)
+    half_minus_one: Matrix  # (exp(A h / 2) - 1) half_input
     first: Matrix  # h (phi_1 - 3 phi_2 + 4 phi_3)
     middle: Matrix  # h (2 phi_2 - 4 phi_3)
     last: Matrix  # h (4 phi_3 - phi_2)
@@ -50,7 +50,7 @@ class Weights(NamedTuple):
     step: Float[Array, "*#batch"]  # s
     stages: Stages | None = None  # where the rest changes within a step
     # what the torque does that teeth begin or cease to pass within a step, in rad of twist, where there are teeth
-    knocks: Float[Array, "powers n *#batch"] | None = None
+    contact: Float[Array, "powers n *#batch"] | None = None
 
 
 class Look(NamedTuple):
@@ -87,18 +87,22 @@ def propagator(
     teeth = motor.toothed
     if teeth is None:
         return along
-    assert teeth.twists is not None
-    loose = motor.with_effects(e.loose() for e in motor.effects)
-    A_apart, _ = _linear_part(loose, drive)
+    assert teeth.contact_state is not None
+    open_teeth = motor.with_effects(e.without_contact() for e in motor.effects)
+    A_apart, _ = _linear_part(open_teeth, drive)
     apart = _by_linear_part(motor, step, A_apart, B, straight)
-    push = (A - A_apart)[:, 2 + _linear_states(motor).index(teeth.twists)]
-    apart = _with_knocks(apart, knocks_of(A, push, step))
-    return _with_knocks(along, knocks_of(A_apart, push, step))._replace(apart=apart)
+    push = (A - A_apart)[:, 2 + _linear_states(motor).index(teeth.contact_state)]
+    apart = _with_contact_response(apart, contact_response(A, push, step))
+    return _with_contact_response(along, contact_response(A_apart, push, step))._replace(
+        apart=apart
+    )
 
 
-def _with_knocks(along: Propagator, knocks: Float[Array, "powers n *#batch"]) -> Propagator:
+def _with_contact_response(
+    along: Propagator, contact: Float[Array, "powers n *#batch"]
+) -> Propagator:
     assert along.weights is not None
-    return along._replace(weights=along.weights._replace(knocks=knocks))
+    return along._replace(weights=along.weights._replace(contact=contact))
 
 
 def _by_linear_part(
@@ -122,11 +126,11 @@ def _by_linear_part(
             weights = Weights(step * phi1, A, step * jnp.ones_like(motor.R))
         return Propagator(phi0, inputs, weights, ramp=ramp)
     (half0, half1, *_), (phi0, phi1, phi2, phi3) = phi_functions(A * step, 3)
-    push = step / 2 * half1
+    half_input = step / 2 * half1
     stages = Stages(
         half=half0,
-        push=push,
-        turn=product(half0, push) - push,
+        half_input=half_input,
+        half_minus_one=product(half0, half_input) - half_input,
         first=step * (phi1 - 3 * phi2 + 4 * phi3),
         middle=step * (2 * phi2 - 4 * phi3),
         last=step * (4 * phi3 - phi2),
@@ -161,11 +165,11 @@ def steps_in_sample(motor: Motor, tape: Tape) -> int | Int[Array, ""]:
 def steps_within(motor: Motor, seconds: float, current: Scalars) -> int | Int[Array, ""]:
     """Into how many equal steps that time is divided, so that none is longer than the effects allow at currents up to
     `current` in A."""
-    allowed = [e.longest_step for e in motor.effects if e.holds or e.twists or not e.affine]
+    allowed = [e.longest_step for e in motor.effects if e.holds or e.contact_state or not e.affine]
     if not allowed:
         return 1
     least = min(max(round(seconds / min(allowed)), 1), FINEST)
-    rates = [rate for e in motor.effects if (rate := e.stiffens(motor, current)) is not None]
+    rates = [rate for e in motor.effects if (rate := e.fastest_rate(motor, current)) is not None]
     if not rates:
         return least
     # of a population, as most of it needs: what a wild one needs would hold up all
@@ -248,12 +252,12 @@ def _step(
         )
     weights = along.weights
     assert weights is not None
-    motor = motor.with_effects(e.over_step(state, weights.step) for e in motor.effects)
+    motor = motor.with_effects(e.averaged_over_step(state, weights.step) for e in motor.effects)
     rate, after = _unswitched(motor, along, weights, drive, state, value, load, rise)
     x, begun, moved = _vector(motor, state), _vector(motor, rate), _vector(motor, after)
     slow = _slow(motor, after)
-    if teeth is not None and weights.knocks is not None:
-        mend = knocked(teeth, weights.step, weights.knocks, state, rate, after)
+    if teeth is not None and weights.contact is not None:
+        mend = contact_correction(teeth, weights.step, weights.contact, state, rate, after)
         moved = _add(moved, mend)
     if motor.switches:
         now, still = motor.at(state), state._replace(current=0.0 * x[0], speed=0.0 * x[1])
@@ -265,7 +269,7 @@ def _step(
                 # for each intermediate result, and a population takes twice as long
                 moved = jax.lax.cond(
                     jnp.any(jnp.sign(x[row]) * moved[row] <= 0),
-                    partial(crossed, row),
+                    partial(stick_or_reverse, row),
                     lambda grips, before, after, *_: after,
                     *((hold, ahead), x, moved, begun[row] / unit, push, decay),
                 )
@@ -293,7 +297,7 @@ def _unswitched(
         return _vector(motor, rate), _slow(motor, rate)
 
     if weights.stages is None:
-        begun, s0 = once(rates(x, slow, 0.5), always)
+        begun, s0 = computed_once(rates(x, slow, 0.5), always)
         moved = _add(x, _times(weights.push, begun))
         if rise is not None:
             moved = _add(moved, _bend(motor, along, drive, state, value, load, rise))
@@ -302,14 +306,14 @@ def _unswitched(
     def rest(x, slow, when):
         """What the linear part leaves over, and the rates of the states that are not in it."""
         rate, slow = rates(x, slow, when)
-        return once((_add(rate, _times(-linear, x)), slow), always)
+        return computed_once((_add(rate, _times(-linear, x)), slow), always)
 
-    half, push, turn, first, middle, last = weights.stages
+    half, half_input, half_minus_one, first, middle, last = weights.stages
     moved, halfway = _times(along.whole, x), _times(half, x)
     n0, s0 = rest(x, slow, 0.0)
-    n1, s1 = rest(_add(halfway, _times(push, n0)), _shifted(slow, h / 2, s0), 0.5)
-    n2, s2 = rest(_add(halfway, _times(push, n1)), _shifted(slow, h / 2, s1), 0.5)
-    end = _add(moved, _times(2 * push, n2), _times(turn, n0))
+    n1, s1 = rest(_add(halfway, _times(half_input, n0)), _shifted(slow, h / 2, s0), 0.5)
+    n2, s2 = rest(_add(halfway, _times(half_input, n1)), _shifted(slow, h / 2, s1), 0.5)
+    end = _add(moved, _times(2 * half_input, n2), _times(half_minus_one, n0))
     n3, s3 = rest(end, _shifted(slow, h, s2), 1.0)
     moved = _add(moved, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
     slow = _shifted(slow, h / 6, {k: s0[k] + 2 * (s1[k] + s2[k]) + s3[k] for k in slow})

@@ -25,13 +25,13 @@ SHARES = (1 - np.cos(np.pi * (np.arange(6) + 0.5) / 6)) / 2
 TO_POWERS = np.linalg.inv(np.vander(SHARES, increasing=True))
 
 
-def once(values: T, always: Bool[Array, ""]) -> T:
+def computed_once(values: T, always: Bool[Array, ""]) -> T:
     """The same values, behind a branch that is always taken: XLA, which would compute them anew for each of all that
     depends on them, computes them once. A play of teeth is simulated in half the time."""
     return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
 
 
-def knocks_of(
+def contact_response(
     A: Matrix, push: Float[Array, "n *#batch"], step: Float[Array, ""]
 ) -> Float[Array, "powers n *#batch"]:
     """What a constant push does that lasts for a share of the step until its end, over that share: the coefficients
@@ -42,10 +42,10 @@ def knocks_of(
     return jnp.einsum("pn,in...->pi...", TO_POWERS, pushed)
 
 
-def knocked(
+def contact_correction(
     effect: AbstractEffect,
     step: Scalars,
-    knocks: Float[Array, "powers n *#batch"],
+    contact: Float[Array, "powers n *#batch"],
     before: State,
     rate: State,
     after: State,
@@ -55,7 +55,7 @@ def knocked(
     When they do is found by the parabola through what decides it, at both ends of the step, with its slope at the
     begin; and so is how the torque goes on that they then begin or cease to pass.
 
-    **Arguments**: `knocks`, what that torque does to the motor as it then is; `rate`, of the state at the begin;
+    **Arguments**: `contact`, what that torque does to the motor as it then is; `rate`, of the state at the begin;
     `after`, how the step ends if they do not.
     """
     start = effect.teeth(before)
@@ -64,7 +64,7 @@ def knocked(
 
     def stand(state: State) -> Float[Array, "2 *#batch"]:
         teeth = effect.teeth(state, side)
-        return jnp.stack([teeth.bite, teeth.push])
+        return jnp.stack([teeth.overlap, teeth.compression])
 
     first, slope = jax.jvp(stand, (before,), (rate,))
     last, slope = stand(after), slope * step
@@ -83,18 +83,18 @@ def knocked(
     # a push that goes on as a parabola: the polynomial of a constant one, integrated once for its slope, twice for
     # its bend
     sizes, power = [], left
-    for p in range(1, len(knocks) + 1):
+    for p in range(1, len(contact) + 1):
         sizes.append(power * (torque + left / (p + 1) * (rise + left / (p + 2) * bend)))
         power = power * left
-    sizes = once(sizes, jnp.all(step > 0))
-    by_state = jnp.moveaxis(knocks, 1, 0)
+    sizes = computed_once(sizes, jnp.all(step > 0))
+    by_state = jnp.moveaxis(contact, 1, 0)
     return tuple(
         reduce(add, (size * term for size, term in zip(sizes, terms, strict=True)))
         for terms in by_state
     )
 
 
-def crossed(
+def stick_or_reverse(
     row: int,
     grips: tuple[Grip, Grip],
     before: tuple[Scalars, ...],
@@ -127,7 +127,7 @@ def crossed(
     needed = acting + after[row] / (push[row] * rest)
     taken = jnp.where(needed > hold.forward, forward, needed)
     taken = jnp.where(needed < -hold.backward, -backward, taken)
-    taken = jnp.where(direction == 0, needed - _loose(hold, begun, needed), taken)
+    taken = jnp.where(direction == 0, needed - _breakaway_excess(hold, begun, needed), taken)
     change = jnp.where(crosses, (acting - taken) * rest, 0.0)
     sticks = crosses & (taken == needed)
     # the other states follow this one, so they answer with the square of the time that is left
@@ -136,7 +136,7 @@ def crossed(
     return tuple(mended)
 
 
-def _loose(hold: Grip, begun: Scalars, mean: Scalars) -> Scalars:
+def _breakaway_excess(hold: Grip, begun: Scalars, mean: Scalars) -> Scalars:
     """What is left over, as a mean over the step, of a force beyond what holds a state at zero.
 
     The force goes on a straight line from what it has `begun` with, through its `mean` at half the step; where it
