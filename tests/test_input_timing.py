@@ -162,7 +162,9 @@ def logged(how: str) -> list[Recording]:
     return runs
 
 
-@pytest.mark.parametrize("how", LOGS)
+@pytest.mark.parametrize(
+    "how", [pytest.param(k, marks=pytest.mark.slow) if "counted" in k else k for k in LOGS]
+)
 def test_a_voltage_acts_when_it_did(how):
     """Held from their rows on, these voltages would make L wrong by up to 60 % and R by 5 %."""
     found = identify(logged(how))

@@ -56,7 +56,7 @@ OVER = {
 }
 
 
-SLOW = {"counts of two samples", "counts of the last sample"}
+SLOW = {"counts of two samples", "counts of the last sample", "tachometer"}
 
 
 @pytest.mark.parametrize(

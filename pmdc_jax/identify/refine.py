@@ -21,7 +21,7 @@ class Optimum(NamedTuple):
     """Where a refinement ended."""
 
     unknowns: Unknowns
-    fitness: float  # sum over both outputs of the mean square residual over the noise variance
+    fitness: float  # squared residuals over the noise variances, over the samples of the output that has most
     at_bound: tuple[int, ...]  # which coordinates were held at a bound
     converged: bool  # by the gradient, not by the solver's word
 

@@ -161,7 +161,7 @@ def _go_on(kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Val
 def _asked(kind: Kind, seed, generation, state):
     algorithm, settings = _algorithm(kind)
     asked, state = algorithm.ask(_keys(seed, generation)[0], state, settings)
-    return jnp.clip(asked, 0.0, 1.0), tuple(map(_settled, jax.tree.leaves(state)))
+    return jnp.clip(asked, 0.0, 1.0), tuple(map(_strongly_typed, jax.tree.leaves(state)))
 
 
 def _keys(seed, generation) -> Array:
@@ -178,7 +178,7 @@ def _algorithm(kind: Kind):
     return algorithm, default.replace(std_init=SPREAD) if method.distribution else default
 
 
-def _settled(leaf: Array) -> Array:
+def _strongly_typed(leaf: Array) -> Array:
     """With a type that is not weak, as it is after a step: otherwise the first step would be compiled apart."""
     return jax.lax.convert_element_type(leaf, leaf.dtype)
 
