@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from .motor import Motor
     from .motor_file import load_motor, load_uncertainty, save_motor
     from .paper import paper
-    from .recording import Recording, read_recording, write_recording
+    from .recording import Recording
+    from .recording_file import read_recording, write_recording
     from .simulate import simulate
 
 # Names are loaded when first used: importing this package costs nothing and changes no setting.
@@ -41,12 +42,12 @@ _HOME = {
     "load_motor": "motor_file",
     "load_uncertainty": "motor_file",
     "paper": "paper",
-    "read_recording": "recording",
+    "read_recording": "recording_file",
     "save_controller": "control.controller_file",
     "save_motor": "motor_file",
     "simulate": "simulate",
     "tune": "control.tuning",
-    "write_recording": "recording",
+    "write_recording": "recording_file",
 }
 
 __all__ = [

@@ -135,7 +135,7 @@ def constant_load(run: Recording) -> Iterator[Finding]:
         )
 
 
-def spare_torque(run: Recording) -> Iterator[Finding]:
+def unused_torque(run: Recording) -> Iterator[Finding]:
     """A torque beside a voltage: only one of them can drive."""
     if run.torque is not None and run.drive == "voltage":
         yield Finding(
@@ -211,7 +211,7 @@ LOOKS = (
     wrapped_angle,
     constant_load,
     leaps,
-    spare_torque,
+    unused_torque,
     signs,
     lost_signs,
     angle_against_speed,

@@ -181,7 +181,7 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
     check_outputs({"--out": out}, [motor, input])
     columns = dict(pairs("--column", column))
     from .motor_file import load_motor
-    from .recording import read_recording, write_recording
+    from .recording_file import read_recording, write_recording
     from .simulate import simulate
 
     driven = read_recording(input, columns, to_simulate=True)
@@ -320,7 +320,7 @@ def _work_on(
     options: dict[str, Any],
 ) -> Result:
     """Read the runs and do the long work on them, telling how far it got."""
-    from .recording import read_recording
+    from .recording_file import read_recording
     from .report.terminal import progress
 
     with progress() as on_progress:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from .errors import InputError
+from .files import result_folder
 from .progress import ReportProgress
 
 if TYPE_CHECKING:
@@ -65,16 +65,3 @@ def demo(
     save_controller(controller, tuning.law)
     write_tuning_report(tuning, page)
     return Tour(diagnosis, tuning)
-
-
-def result_folder(path: Path, first: str) -> Path:
-    """Make the folder now, and see whether a file `first` can be written there: better to fail before the work than
-    after it."""
-    from .files import check_writable
-
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise InputError("--out", f"{path} is not a folder", "Name a new folder") from None
-    check_writable("--out", path / first)
-    return path

@@ -45,6 +45,17 @@ def check_writable(option: str, path: Path) -> None:
         raise InputError(option, f"{path} cannot be written", "Choose another place")
 
 
+def result_folder(path: Path, first: str) -> Path:
+    """Make the folder now, and see whether a file `first` can be written there: better to fail before the work than
+    after it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise InputError("--out", f"{path} is not a folder", "Name a new folder") from None
+    check_writable("--out", path / first)
+    return path
+
+
 def _takes_files(folder: Path) -> bool:
     """Whether a file can be made in a folder: to the superuser, all of them seem to let one."""
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .files import result_folder
 from .progress import ReportProgress
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ def paper(out: str | Path = "paper_out", progress: ReportProgress | None = None)
     Table 1 from a virtual load test by the paper's genetic algorithm and by ours, Figs 4 to 8, and Table 2 beside
     what is physically possible.
     """
-    from .demo import result_folder
     from .report.json import write_json
     from .report.paper import paper_json, write_paper
     from .wheelchair import done_again

@@ -1,11 +1,9 @@
-"""One run of one motor in SI: time, voltage, current, speed, load; reading and writing files."""
+"""One run of one motor in SI: time, voltage, current, speed, load, and why a run cannot be used."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Literal, NamedTuple
 
 import numpy as np
 from attrs import field, frozen
@@ -13,10 +11,8 @@ from attrs.converters import optional
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .columns import QUANTITIES, Column, looks_like, match_columns, mixed_axes
+from .columns import QUANTITIES
 from .errors import InputError
-from .files import replacing
-from .tables import Table, open_table
 
 Samples = Float[np.ndarray, " samples"]
 
@@ -83,7 +79,7 @@ class Recording:
 
     def __attrs_post_init__(self):
         # what was laid on an even clock was a sound record before
-        for fault in _faults(self.columns()) if self.uneven is None else ():
+        for fault in faults(self.columns()) if self.uneven is None else ():
             sample = "" if fault.row is None else f"sample {fault.row + 1}"
             column = fault.quantity and f"column {fault.quantity}"
             where = ", ".join(filter(None, (self.source or self.name, sample, column)))
@@ -117,7 +113,7 @@ class Recording:
     @property
     def tells(self) -> bool:
         """Whether anything was measured of what the motor does, so that it can be identified from it."""
-        return _tells(self.columns())
+        return is_identifiable_from(self.columns())
 
     @property
     def stands_still(self) -> bool:
@@ -135,82 +131,7 @@ class Recording:
         return {quantity: array for quantity, array in values if array is not None}
 
 
-def read_recording(
-    path: str | os.PathLike[str],
-    columns: Mapping[str, str] | None = None,
-    to_simulate: bool = False,
-) -> Recording:
-    """Read one run from a CSV, Parquet or MAT file.
-
-    **Arguments**: `path`; `columns`, what the headers do not say by themselves: quantity (time,
-    voltage, current, speed, load, angle, temperature, torque) to "header" or "header:unit"; `to_simulate`, whether it
-    is enough that something drives the motor.
-
-    **Returns**: the run in SI, named after the file.
-
-    **Raises**: `InputError` that names the file, the line or column, what is wrong and how to mend
-    it.
-    """
-    path = Path(path)
-    table = open_table(path)
-    found = match_columns(table.headers, columns, str(path))
-    _refuse_too_little(found, table, str(path), to_simulate)
-    numbers = table.read([column.header for column in found.values()])
-    values = {q: numbers[column.header] for q, column in found.items()}
-    values = {q: _to_si(column, values[q]) for q, column in found.items()}
-    empty = [q for q, v in values.items() if q != "time" and len(v) and np.isnan(v).all()]
-    present: dict[str, Any] = {q: v for q, v in values.items() if q not in empty}
-    _refuse_too_little(present, table, str(path), to_simulate)
-    for fault in _faults(present):
-        raise _in_file(fault, found, table, str(path))
-    used = {column.header for column in found.values()}
-    return Recording(
-        path.stem,
-        **present,
-        source=str(path),
-        ignored=tuple(header for header in table.headers if header and header not in used),
-        notes=tuple(_notes(path.stem, table.headers, found, empty)),
-    )
-
-
-# one run or several, each as it is or the file that holds it
-Run = Recording | str | os.PathLike[str]
-Runs = Run | Sequence[Run]
-
-
-def recordings_of(runs: Runs, to_simulate: bool = False) -> list[Recording]:
-    """Runs as they are, and files read; see `read_recording`.
-
-    **Raises**: `InputError` where a file cannot be read.
-    """
-    several = [runs] if isinstance(runs, Recording | str | os.PathLike) else runs
-    return [
-        run if isinstance(run, Recording) else read_recording(run, to_simulate=to_simulate)
-        for run in several
-    ]
-
-
-def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a run as CSV or Parquet, by suffix, under canonical headers and in full precision.
-
-    The file appears complete or not at all.
-
-    **Raises**: `InputError` on another suffix, or where the file cannot be written.
-    """
-    import polars as pl
-
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in (".csv", ".parquet"):
-        what = f"cannot write files of kind '{suffix}'"
-        raise InputError(str(path), what, "Name it .csv or .parquet")
-    data = recording.columns()
-    frame = pl.DataFrame({QUANTITIES[quantity].header: array for quantity, array in data.items()})
-    with replacing(path) as part, part.open("wb") as file:
-        frame.write_csv(file) if suffix == ".csv" else frame.write_parquet(file)
-
-
-class _Fault(NamedTuple):
+class Fault(NamedTuple):
     """Why a recording cannot be used; `row` counts from 0, None for the whole column."""
 
     quantity: str | None
@@ -219,31 +140,31 @@ class _Fault(NamedTuple):
     mend: str
 
 
-def _faults(columns: Mapping[str, np.ndarray]) -> Iterator[_Fault]:
+def faults(columns: Mapping[str, np.ndarray]) -> Iterator[Fault]:
     """All that makes these columns unusable, the most basic first."""
-    if not _is_driven(columns):
+    if not is_driven(columns):
         what = f"nothing drives the motor in {', '.join(columns)}"
-        yield _Fault(None, None, what, f"Needed beside time: {DRIVES}")
+        yield Fault(None, None, what, f"Needed beside time: {DRIVES}")
     time = columns["time"]
     for quantity, values in columns.items():
         if values.ndim != 1 or len(values) != len(time):
             what = f"shape {values.shape} where time has {time.shape}"
-            yield _Fault(quantity, None, what, "Give every column one value a sample")
+            yield Fault(quantity, None, what, "Give every column one value a sample")
             return
     if len(time) < MIN_SAMPLES:
         what = f"{len(time)} samples, at least {MIN_SAMPLES} are needed"
-        yield _Fault(None, None, what if len(time) else "it holds no rows", "Record a longer run")
+        yield Fault(None, None, what if len(time) else "it holds no rows", "Record a longer run")
         return
     for quantity, values in columns.items():
         yield from _not_finite(quantity, values, columns)
     yield from _time_order(time)
 
 
-def _is_driven(columns: Mapping[str, object]) -> bool:
+def is_driven(columns: Mapping[str, object]) -> bool:
     return any(drive in columns for drive in ("voltage", "current", "torque"))
 
 
-def _tells(columns: Mapping[str, object]) -> bool:
+def is_identifiable_from(columns: Mapping[str, object]) -> bool:
     moves = "speed" in columns or "angle" in columns
     if "voltage" in columns:
         return moves or "current" in columns
@@ -252,7 +173,7 @@ def _tells(columns: Mapping[str, object]) -> bool:
 
 def _not_finite(
     quantity: str, values: np.ndarray, columns: Mapping[str, np.ndarray]
-) -> Iterator[_Fault]:
+) -> Iterator[Fault]:
     bad = ~np.isfinite(values)
     if not bad.any():
         return
@@ -261,21 +182,21 @@ def _not_finite(
     if infinite.any():
         first = int(np.argmax(infinite))
         what = f"{infinite.sum()} infinite values, the first here"
-        yield _Fault(quantity, first, what, "Leave cells without a measurement empty")
+        yield Fault(quantity, first, what, "Leave cells without a measurement empty")
     # current is an input where nothing else drives the motor
     output = quantity in OUTPUTS and (
         quantity != "current" or "voltage" in columns or "torque" in columns
     )
     if not output and quantity != "temperature":
         what = f"{count} of {len(values)} values are missing (empty or NaN), the first here"
-        yield _Fault(quantity, first, what, "An input must be complete: fill it, or cut the run")
+        yield Fault(quantity, first, what, "An input must be complete: fill it, or cut the run")
     elif output and count > MAX_MISSING * len(values):
         what = f"{count} of {len(values)} values are missing (empty or NaN), the first here"
         mend = f"Up to {MAX_MISSING:.0%} may be missing: cut the run, or leave out the column"
-        yield _Fault(quantity, first, what, mend)
+        yield Fault(quantity, first, what, mend)
 
 
-def _time_order(time: np.ndarray) -> Iterator[_Fault]:
+def _time_order(time: np.ndarray) -> Iterator[Fault]:
     steps = np.diff(time)
     if (steps > 0).all():
         return
@@ -287,68 +208,4 @@ def _time_order(time: np.ndarray) -> Iterator[_Fault]:
     else:
         what = f"the time stamp {now} s is repeated ({(steps == 0).sum()} repetitions in all)"
         mend = "Export time with more digits, or delete repeated lines"
-    yield _Fault("time", row, what, mend)
-
-
-def _refuse_too_little(
-    found: Mapping[str, object], table: Table, where: str, to_simulate: bool
-) -> None:
-    headers = ", ".join(filter(None, table.headers[:20])) or "none"
-    seen = f"columns in the file: {headers}"
-    if len(table.headers) == 1:
-        seen += "; if these are several, separate them by comma, semicolon or tab"
-    if "time" not in found:
-        mend = f"Name it time_s, or map it by --column time=HEADER:UNIT; {seen}"
-        raise InputError(where, "there is no time column", mend)
-    if to_simulate and not _is_driven(found):
-        what, needed, lacking = "nothing drives the motor in", DRIVES, "voltage"
-    elif not to_simulate and not _tells(found):
-        what, needed, lacking = "nothing to identify from", OUTPUTS_TOO, "speed"
-    else:
-        return
-    mend = f"Needed beside time: {needed}. Map others by --column {lacking}=HEADER:UNIT; {seen}"
-    raise InputError(where, f"{what} {', '.join(found)}", mend)
-
-
-def _to_si(column: Column, values: np.ndarray) -> np.ndarray:
-    if (column.scale, column.offset) == (1.0, 0.0):
-        return values
-    return values * column.scale + column.offset
-
-
-def _in_file(fault: _Fault, found: Mapping[str, Column], table: Table, where: str) -> InputError:
-    places = [where]
-    if fault.row is not None:
-        places.append(table.place(fault.row))
-    if fault.quantity:
-        places.append(f"column {found[fault.quantity].header}")
-    return InputError(", ".join(places), fault.what, fault.mend)
-
-
-def _notes(
-    run: str, headers: tuple[str, ...], found: Mapping[str, Column], empty: list[str]
-) -> Iterator[Finding]:
-    def note(column: str, what: str, mend: str) -> Finding:
-        return Finding(run, column, "note", what, "header", mend)
-
-    for quantity, column in found.items():
-        if quantity in empty:
-            yield note(column.header, "the column is empty", "It is left out")
-        elif column.by_unit:
-            mend = f"If it is something else, say what is: --column {quantity}=HEADER:UNIT"
-            yield note(column.header, f"taken for the {quantity}, by its unit", mend)
-        elif column.unit is None:
-            mend = f"If it is not, write the unit into the header: {QUANTITIES[quantity].header}"
-            yield note(column.header, f"the header has no unit: taken as {column.base}", mend)
-    if mixed := mixed_axes(found):
-        shaft, axis = mixed
-        what = (
-            f"{shaft.base} belongs to a rotating shaft, the {axis.base} of {axis.header} does not"
-        )
-        mend = "Give all columns for the shaft (rad, N m) or all for the linear axis (m, N)"
-        yield Finding(run, shaft.header, "warning", what, "header", mend)
-    for header in headers:
-        quantity = looks_like(header)
-        if quantity and quantity not in found:
-            what = f"not used, though it looks like {quantity}"
-            yield note(header, what, f"Map it by --column {quantity}={header}:UNIT")
+    yield Fault("time", row, what, mend)

@@ -55,7 +55,7 @@ def faked(monkeypatch, tmp_path):
 
     replace_function(monkeypatch, "pmdc_jax.identify", "identify", identify)
     replace_function(monkeypatch, "pmdc_jax.diagnose", "diagnose", diagnose)
-    replace_function(monkeypatch, "pmdc_jax.recording", "read_recording", read_recording)
+    replace_function(monkeypatch, "pmdc_jax.recording_file", "read_recording", read_recording)
     replace_function(monkeypatch, "pmdc_jax.motor_file", "save_motor", save_motor)
     for variable in ("FORCE_COLOR", "TTY_COMPATIBLE"):  # rich takes these for a terminal
         monkeypatch.delenv(variable, raising=False)
@@ -279,7 +279,7 @@ def test_simulate_reads_simulates_and_writes(faked, monkeypatch, capsys):
     replace_function(monkeypatch, "pmdc_jax.simulate", "simulate", lambda motor, run: (motor, run))
     replace_function(
         monkeypatch,
-        "pmdc_jax.recording",
+        "pmdc_jax.recording_file",
         "write_recording",
         lambda run, path: written.append((run, path)),
     )

@@ -14,7 +14,7 @@ from benchmarks.naming.plant import Plant
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import diagnose
 from pmdc_jax.motor import PARAMETERS
-from pmdc_jax.recording import read_recording
+from pmdc_jax.recording_file import read_recording
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 QUANTITIES, LOAD = ("time_s", "voltage_V", "current_A", "speed_rad_s"), "load_torque_Nm"

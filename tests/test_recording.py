@@ -19,7 +19,8 @@ from scipy.io import savemat
 
 from pmdc_jax.columns import understand
 from pmdc_jax.errors import InputError
-from pmdc_jax.recording import Recording, read_recording, recordings_of, write_recording
+from pmdc_jax.recording import Recording
+from pmdc_jax.recording_file import read_recording, recordings_of, write_recording
 
 T = np.arange(12) * 0.01
 NUMBER = {"allow_nan": False, "allow_infinity": False, "width": 64}

@@ -22,7 +22,8 @@ from benchmarks import virtual_bench as vb
 from pmdc_jax.clock import is_even
 from pmdc_jax.effects import CoulombFriction, ResistanceHeating
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.recording import Recording, write_recording
+from pmdc_jax.recording import Recording
+from pmdc_jax.recording_file import write_recording
 from pmdc_jax.simulate import Tape, free_run, reference_solution, squared_errors, uniform
 from pmdc_jax.simulate.exponential import phi_functions
 from pmdc_jax.threads import side_by_side

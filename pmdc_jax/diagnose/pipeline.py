@@ -18,7 +18,7 @@ from ..identify.results import results_of
 from ..identify.solve import Solved, solve
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
-from ..recording import Runs
+from ..recording_file import Runs
 from .assessment import ALARM
 from .diagnosis import (
     Detectable,

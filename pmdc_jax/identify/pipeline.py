@@ -10,7 +10,7 @@ import attrs
 from ..compiled import make_room
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
-from ..recording import Runs
+from ..recording_file import Runs
 from .friction_test import missing_friction, of_friction
 from .generalised_least_squares import last_fit, residuals_of
 from .identification import Identification

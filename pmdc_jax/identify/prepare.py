@@ -17,7 +17,8 @@ from ..clock import evenly_stamped
 from ..effects import AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS
-from ..recording import OUTPUTS_TOO, Finding, Recording, Runs, recordings_of
+from ..recording import OUTPUTS_TOO, Finding, Recording
+from ..recording_file import Runs, recordings_of
 from ..simulate import Tape, uniform
 from ..unmeasured import without_unmeasured
 from .bounds import search_bounds

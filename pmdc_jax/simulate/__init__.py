@@ -9,7 +9,8 @@ import numpy as np
 
 from ..motor import Motor
 from ..precision import double_precision
-from ..recording import Recording, Run, recordings_of
+from ..recording import Recording
+from ..recording_file import Run, recordings_of
 from .population import squared_errors
 from .reference import reference_solution
 from .shooting import LOCAL, free_run, sensitivities

@@ -1,0 +1,163 @@
+"""Recordings in files: read from CSV, Parquet and MAT, written as CSV and Parquet."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .columns import QUANTITIES, Column, looks_like, match_columns, mixed_axes
+from .errors import InputError
+from .files import replacing
+from .recording import (
+    DRIVES,
+    OUTPUTS_TOO,
+    Fault,
+    Finding,
+    Recording,
+    faults,
+    is_driven,
+    is_identifiable_from,
+)
+from .tables import Table, open_table
+
+# one run or several, each as it is or the file that holds it
+Run = Recording | str | os.PathLike[str]
+Runs = Run | Sequence[Run]
+
+
+def read_recording(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, str] | None = None,
+    to_simulate: bool = False,
+) -> Recording:
+    """Read one run from a CSV, Parquet or MAT file.
+
+    **Arguments**: `path`; `columns`, what the headers do not say by themselves: quantity (time,
+    voltage, current, speed, load, angle, temperature, torque) to "header" or "header:unit"; `to_simulate`, whether it
+    is enough that something drives the motor.
+
+    **Returns**: the run in SI, named after the file.
+
+    **Raises**: `InputError` that names the file, the line or column, what is wrong and how to mend
+    it.
+    """
+    path = Path(path)
+    table = open_table(path)
+    found = match_columns(table.headers, columns, str(path))
+    _refuse_too_little(found, table, str(path), to_simulate)
+    numbers = table.read([column.header for column in found.values()])
+    values = {q: numbers[column.header] for q, column in found.items()}
+    values = {q: _to_si(column, values[q]) for q, column in found.items()}
+    empty = [q for q, v in values.items() if q != "time" and len(v) and np.isnan(v).all()]
+    present: dict[str, Any] = {q: v for q, v in values.items() if q not in empty}
+    _refuse_too_little(present, table, str(path), to_simulate)
+    for fault in faults(present):
+        raise _in_file(fault, found, table, str(path))
+    used = {column.header for column in found.values()}
+    return Recording(
+        path.stem,
+        **present,
+        source=str(path),
+        ignored=tuple(header for header in table.headers if header and header not in used),
+        notes=tuple(_notes(path.stem, table.headers, found, empty)),
+    )
+
+
+def recordings_of(runs: Runs, to_simulate: bool = False) -> list[Recording]:
+    """Runs as they are, and files read; see `read_recording`.
+
+    **Raises**: `InputError` where a file cannot be read.
+    """
+    several = [runs] if isinstance(runs, Recording | str | os.PathLike) else runs
+    return [
+        run if isinstance(run, Recording) else read_recording(run, to_simulate=to_simulate)
+        for run in several
+    ]
+
+
+def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a run as CSV or Parquet, by suffix, under canonical headers and in full precision.
+
+    The file appears complete or not at all.
+
+    **Raises**: `InputError` on another suffix, or where the file cannot be written.
+    """
+    import polars as pl
+
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".parquet"):
+        what = f"cannot write files of kind '{suffix}'"
+        raise InputError(str(path), what, "Name it .csv or .parquet")
+    data = recording.columns()
+    frame = pl.DataFrame({QUANTITIES[quantity].header: array for quantity, array in data.items()})
+    with replacing(path) as part, part.open("wb") as file:
+        frame.write_csv(file) if suffix == ".csv" else frame.write_parquet(file)
+
+
+def _refuse_too_little(
+    found: Mapping[str, object], table: Table, where: str, to_simulate: bool
+) -> None:
+    headers = ", ".join(filter(None, table.headers[:20])) or "none"
+    seen = f"columns in the file: {headers}"
+    if len(table.headers) == 1:
+        seen += "; if these are several, separate them by comma, semicolon or tab"
+    if "time" not in found:
+        mend = f"Name it time_s, or map it by --column time=HEADER:UNIT; {seen}"
+        raise InputError(where, "there is no time column", mend)
+    if to_simulate and not is_driven(found):
+        what, needed, lacking = "nothing drives the motor in", DRIVES, "voltage"
+    elif not to_simulate and not is_identifiable_from(found):
+        what, needed, lacking = "nothing to identify from", OUTPUTS_TOO, "speed"
+    else:
+        return
+    mend = f"Needed beside time: {needed}. Map others by --column {lacking}=HEADER:UNIT; {seen}"
+    raise InputError(where, f"{what} {', '.join(found)}", mend)
+
+
+def _to_si(column: Column, values: np.ndarray) -> np.ndarray:
+    if (column.scale, column.offset) == (1.0, 0.0):
+        return values
+    return values * column.scale + column.offset
+
+
+def _in_file(fault: Fault, found: Mapping[str, Column], table: Table, where: str) -> InputError:
+    places = [where]
+    if fault.row is not None:
+        places.append(table.place(fault.row))
+    if fault.quantity:
+        places.append(f"column {found[fault.quantity].header}")
+    return InputError(", ".join(places), fault.what, fault.mend)
+
+
+def _notes(
+    run: str, headers: tuple[str, ...], found: Mapping[str, Column], empty: list[str]
+) -> Iterator[Finding]:
+    def note(column: str, what: str, mend: str) -> Finding:
+        return Finding(run, column, "note", what, "header", mend)
+
+    for quantity, column in found.items():
+        if quantity in empty:
+            yield note(column.header, "the column is empty", "It is left out")
+        elif column.by_unit:
+            mend = f"If it is something else, say what is: --column {quantity}=HEADER:UNIT"
+            yield note(column.header, f"taken for the {quantity}, by its unit", mend)
+        elif column.unit is None:
+            mend = f"If it is not, write the unit into the header: {QUANTITIES[quantity].header}"
+            yield note(column.header, f"the header has no unit: taken as {column.base}", mend)
+    if mixed := mixed_axes(found):
+        shaft, axis = mixed
+        what = (
+            f"{shaft.base} belongs to a rotating shaft, the {axis.base} of {axis.header} does not"
+        )
+        mend = "Give all columns for the shaft (rad, N m) or all for the linear axis (m, N)"
+        yield Finding(run, shaft.header, "warning", what, "header", mend)
+    for header in headers:
+        quantity = looks_like(header)
+        if quantity and quantity not in found:
+            what = f"not used, though it looks like {quantity}"
+            yield note(header, what, f"Map it by --column {quantity}={header}:UNIT")

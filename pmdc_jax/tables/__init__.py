@@ -1,0 +1,58 @@
+"""Named columns of numbers in CSV, Parquet and MAT files, before anyone asks what they mean."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from ..errors import InputError
+from .csv import CsvTable
+from .mat import MatTable
+from .parquet import ParquetTable
+
+
+@runtime_checkable
+class Table(Protocol):
+    """A file with named columns."""
+
+    headers: tuple[str, ...]
+
+    def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
+        """These columns as float64 of shape (rows,); NaN where a cell is empty."""
+        ...
+
+    def place(self, row: int) -> str:
+        """Where an editor shows this row (counted from 0), such as "line 17"."""
+        ...
+
+
+def open_table(path: Path) -> Table:
+    """Open a CSV, Parquet or MAT file by its suffix.
+
+    **Raises**: `InputError` if it cannot be read as such.
+    """
+    kinds = dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm"), CsvTable)
+    kinds |= {".parquet": ParquetTable, ".pq": ParquetTable, ".mat": MatTable}
+    if path.is_dir():
+        raise InputError(str(path), "this is a folder", "Name the files in it, one run each")
+    if not path.exists():
+        raise InputError(str(path), "no such file", "Check the spelling and the folder")
+    if path.suffix.lower() not in kinds:
+        what = f"unknown kind of file '{path.suffix}'"
+        raise InputError(str(path), what, f"Export it as one of {', '.join(kinds)}")
+    try:
+        with path.open("rb") as file:
+            empty = not file.read(1)
+        if empty:
+            raise InputError(str(path), "the file is empty", "Export the recording again")
+        return kinds[path.suffix.lower()](path)
+    except PermissionError:
+        raise InputError(
+            str(path), "no permission to read it", "Ask its owner, or copy it to your folder"
+        ) from None
+    except OSError as error:
+        what = f"it cannot be read ({error.strerror or error})"
+        raise InputError(str(path), what, "Copy it to a local disk and try again") from None

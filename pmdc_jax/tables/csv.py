@@ -1,0 +1,152 @@
+"""Text with a header line, separated by comma, semicolon or tab."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InputError
+from .cells import NUMBERS_ONLY, as_dates, seconds_since_first, ungrouped
+from .csv_header import fields_of, find_header
+
+if TYPE_CHECKING:
+    import polars as pl
+
+MISSING = ["NA", "N/A", "n/a", "null", "NULL", "None"]
+
+
+class CsvTable:
+    """Text with a header line; separated by comma, semicolon or tab.
+
+    Lines that begin with # and empty ones are skipped, and what an instrument writes before the header. Numbers may
+    have a decimal comma unless the comma separates. A second line of units belongs to the header. Dates with times are
+    read as seconds since the first of them.
+    """
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._raw = _text(path)
+        self._header = find_header(self._raw, path)
+        self.headers = self._header.names
+        self._kept: np.ndarray | None = None
+
+    def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
+        """See `Table`."""
+        wanted = [str(self.headers.index(header)) for header in headers]
+        frame = self._frame(wanted)
+        if frame[str(len(self.headers) - 1)].null_count():
+            self._refuse_ragged()  # polars fills short lines without a word
+        if frame.height and all(frame[i].null_count() for i in wanted):
+            # a spreadsheet ends with lines of empty cells
+            self._kept = np.array([bool(line.strip(b" \t\r,;")) for _, line in self._lines()])
+            if len(self._kept) != frame.height:
+                what = "it breaks lines inside quotes"
+                raise InputError(str(self._path), what, "Export it as plain CSV")
+            frame = frame.filter(self._kept)
+        columns = (frame[i].to_numpy().astype(float) for i in wanted)
+        return dict(zip(headers, columns, strict=True))
+
+    def place(self, row: int) -> str:
+        """See `Table`."""
+        if self._kept is not None:
+            row = int(np.flatnonzero(self._kept)[row])
+        numbers = (number for number, _ in self._lines())
+        return f"line {next(islice(numbers, row, None), row + 1)}"
+
+    @cached_property
+    def _body(self) -> bytes:
+        return self._raw[self._header.end :].rstrip(b"\r\n")
+
+    def _frame(self, wanted: Sequence[str]) -> pl.DataFrame:
+        """Wanted columns as numbers and the last one of any kind, empty cells null."""
+        import polars as pl
+
+        last = str(len(self.headers) - 1)
+        if not self._body:
+            return pl.DataFrame(schema=dict.fromkeys({*wanted, last}, pl.Float64))
+        try:
+            return self._parse(dict.fromkeys(wanted, pl.Float64), last)
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
+            self._refuse_ragged()
+        try:  # padded numbers and other texts, more slowly
+            text = self._parse({}, last)
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+            what = f"it cannot be read as a table ({str(error).splitlines()[0]})"
+            raise InputError(str(self._path), what, "Export it as plain CSV") from None
+        return text.with_columns(self._numbers(text[i], self.headers[int(i)]) for i in wanted)
+
+    def _parse(self, kinds: Mapping[str, Any], last: str) -> pl.DataFrame:
+        import polars as pl
+
+        schema = {str(i): kinds.get(str(i), pl.String) for i in range(len(self.headers))}
+        frame = pl.read_csv(
+            self._body,
+            has_header=False,
+            schema=schema,
+            separator=self._header.separator,
+            comment_prefix="#",
+            null_values=MISSING,
+            decimal_comma=self._header.separator != "," and b"," in self._body,
+        )
+        return frame.select(i for i in schema if i in kinds or i == last or not kinds)
+
+    def _numbers(self, text: pl.Series, header: str) -> pl.Series:
+        """What the cells of a column say as numbers: those of a decimal comma, and dates, too."""
+        import polars as pl
+
+        text = text.str.strip_chars().replace("", None)
+        plain = ungrouped(text)
+        if self._header.separator != ",":
+            plain = plain.str.replace(",", ".", literal=True)
+        numbers = plain.cast(pl.Float64, strict=False)
+        wrong = (numbers.is_null() & text.is_not_null()).arg_true()
+        if not len(wrong):
+            return numbers
+        if numbers.null_count() == len(numbers) and (dates := as_dates(text)) is not None:
+            return seconds_since_first(dates)
+        row = int(wrong[0])
+        where = f"{self._path}, {self.place(row)}, column {header}"
+        raise InputError(where, f"'{text[row]}' is not a number", NUMBERS_ONLY)
+
+    def _lines(self) -> Iterator[tuple[int, bytes]]:
+        """Number and text of each line that polars makes a row of."""
+        first = self._raw.count(b"\n", 0, self._header.end) + 1
+        for number, line in enumerate(self._body.split(b"\n"), first):
+            if not line.startswith(b"#"):
+                yield number, line
+
+    def _refuse_ragged(self) -> None:
+        for number, line in self._lines():
+            fields = len(fields_of(line.decode(), self._header.separator)) if line.strip() else None
+            if fields not in (None, len(self.headers)):
+                raise InputError(
+                    f"{self._path}, line {number}",
+                    f"it has {fields} fields where the header (line {self._header.line}) "
+                    f"has {len(self.headers)}",
+                    "Mend or delete this line",
+                )
+
+
+def _text(path: Path) -> bytes:
+    """The bytes of a UTF-8 text, without byte order mark and with \\n somewhere."""
+    raw = path.read_bytes()
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError(str(path), "it is UTF-16 text", "Save it as UTF-8")
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    if b"\0" in raw:
+        what = f"this is no text (byte {raw.index(0)} is zero)"
+        raise InputError(str(path), what, "Export the recording as CSV")
+    if not raw.isascii():
+        try:
+            raw.decode()
+        except UnicodeDecodeError as error:
+            line = raw.count(b"\n", 0, error.start) + 1
+            byte = f"byte {error.start + 1} (0x{raw[error.start]:02x})"
+            where, mend = f"{path}, line {line}", "Save it as UTF-8"
+            raise InputError(where, f"{byte} is not UTF-8 text", mend) from None
+    return raw if b"\n" in raw else raw.replace(b"\r", b"\n")
