@@ -12,14 +12,16 @@ from ..compiled import compiled
 from ..motor import Motor
 from .gains import GainSpace
 from .law import Model
-from .objective import Task, exact_cost, score, smooth_cost
+from .objective import CHOICE, DESCENT, Task, cost, exact_score, smooth_score
 
-STARTS, SCREENED, ITERATIONS = 64, 512, 100
-FINALISTS = (
-    16  # go on with all the motors, after the starts have been followed on the first one alone
-)
-RATE = 0.06  # of the logarithms of the gains, falling to nothing
-WIDTHS = 0.5, 0.05  # of the smooth metrics, at the beginning and at the end
+SCREENED = 512  # gains drawn
+STARTS = 64  # the best of them, which are followed on the first motor alone
+FINALISTS = 16  # the best of those, which go on with all the motors
+ITERATIONS = 100  # of each descent
+RATE = 0.06  # first step in the logarithms of the gains; it falls to nothing
+FIRST_WIDTH = 0.5  # of the smooth metrics at the beginning, in bands
+LAST_WIDTH = 0.05  # from half of the iterations on
+OVERFLOWN = 1e6  # cost of gains with which the speed overflows
 
 Coordinates = Float[Array, "starts gains"]
 Costs = Float[Array, " starts"]
@@ -31,20 +33,17 @@ def tuned(
     motors: Motor,
     seed: int = 0,
     starts: int = STARTS,
-    also: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates of the gains that the starts led to, best first, and their exact costs.
 
-    Gains are drawn evenly over the logarithms of their ranges; the best of them, and those given, are followed
-    down the gradient by Adam, each keeping the best point it has seen.
+    Gains are drawn evenly over the logarithms of their ranges; the best of them are followed down the
+    gradient by Adam, each keeping the best point it has seen.
 
-    **Arguments**: `motors`, with a leading axis; all count, the worst of them more; `also`, starts of the caller's.
+    **Arguments**: `motors`, with a leading axis; all count, the worst of them more.
     """
     lower, upper = space.bounds()
     rng = np.random.default_rng(seed)
     drawn = rng.uniform(lower, upper, (SCREENED, len(lower)))
-    if also is not None:
-        drawn[: len(also)] = np.clip(also, lower, upper)
     model = Model.of(space.motor, task.hardware.sample_time)
     nominal = jax.tree.map(lambda leaf: leaf[:1], motors)
     costs = _screen(task, space, model, nominal, jnp.asarray(drawn))
@@ -61,24 +60,29 @@ def _best(coordinates: Coordinates, costs: Costs, count: int) -> Float[Array, "b
     return coordinates[jnp.argsort(costs)[:count]]
 
 
-def _costs(task, space, model, motors, coordinates, width):
-    def cost(x):
-        return smooth_cost(task, model, motors, space.controller(x), width)
+def _smooth_costs(task, space, model, motors, coordinates, width) -> Costs:
+    def of(x):
+        return cost(task, smooth_score(task, model, motors, space.controller(x), width), DESCENT)
 
-    return jnp.nan_to_num(jax.vmap(cost)(coordinates), nan=1e6, posinf=1e6)
+    return _finite(jax.vmap(of)(coordinates))
+
+
+def _finite(costs: Costs) -> Costs:
+    """So that gains with which the speed overflows come last."""
+    return jnp.nan_to_num(costs, nan=OVERFLOWN, posinf=OVERFLOWN)
 
 
 @compiled
-def _screen(task, space, model, motors, coordinates) -> Float[Array, " starts"]:
-    return _costs(task, space, model, motors, coordinates, WIDTHS[0])
+def _screen(task, space, model, motors, coordinates) -> Costs:
+    return _smooth_costs(task, space, model, motors, coordinates, FIRST_WIDTH)
 
 
 @compiled
-def _rank(task, space, model, motors, coordinates) -> Float[Array, " starts"]:
-    def cost(x):
-        return exact_cost(task, score(task, model, motors, space.controller(x)))
+def _rank(task, space, model, motors, coordinates) -> Costs:
+    def of(x):
+        return cost(task, exact_score(task, model, motors, space.controller(x)), CHOICE)
 
-    return jnp.nan_to_num(jax.vmap(cost)(coordinates), nan=1e6, posinf=1e6)
+    return _finite(jax.vmap(of)(coordinates))
 
 
 @compiled
@@ -89,12 +93,12 @@ def _descend(task, space, model, motors, start: Coordinates) -> tuple[Coordinate
     optimiser = optax.adam(schedule, b1=0.8, b2=0.95)
 
     def total(x, width):
-        costs = _costs(task, space, model, motors, x, width)
+        costs = _smooth_costs(task, space, model, motors, x, width)
         return jnp.sum(costs), costs
 
     def iteration(carry, k):
         x, state, best, lowest = carry
-        width = WIDTHS[0] * (WIDTHS[1] / WIDTHS[0]) ** jnp.minimum(2 * k / ITERATIONS, 1.0)
+        width = FIRST_WIDTH * (LAST_WIDTH / FIRST_WIDTH) ** jnp.minimum(2 * k / ITERATIONS, 1.0)
         (_, costs), gradient = jax.value_and_grad(total, has_aux=True)(x, width)
         # while the metrics still sharpen, costs of different iterations cannot be compared
         better = (costs < lowest) | (2 * k <= ITERATIONS)

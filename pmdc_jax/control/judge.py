@@ -19,7 +19,7 @@ from .law import Law, Model
 from .loop import Response, closed_loop
 from .margins import margins
 from .metrics import StepMetrics, load_metrics, step_metrics
-from .objective import LOWER, Score, Task, score
+from .objective import SECOND_SETPOINT, Score, Task, exact_score
 
 SUBSTEPS = 10  # instants a sample in what is reported
 SMALL = 0.05  # a small step, over the set point
@@ -61,13 +61,13 @@ def judged(
     robust = None
     if judges is not None:
         model = Model.of(motor, task.hardware.sample_time)
-        robust = _robustness(_score(task, model, judges, controller))
+        robust = _robustness(_exact_score(task, model, judges, controller))
     return Candidate(
         name=name,
         controller=controller,
         metrics=_by_name(step_metrics(*step, task.setpoint)),
         load=_by_name(load_metrics(*loaded, task.setpoint)),
-        second=_by_name(step_metrics(*second, LOWER * task.setpoint, task.setpoint)),
+        second=_by_name(step_metrics(*second, SECOND_SETPOINT * task.setpoint, task.setpoint)),
         small=_by_name(_small_step(task, motor, law)),
         robust=robust,
         stable=margins(motor, law).stable,
@@ -121,4 +121,4 @@ def _robustness(found: Score) -> Robustness:
     )
 
 
-_score = compiled(score)
+_exact_score = compiled(exact_score)

@@ -28,7 +28,7 @@ def check_reachable(
     current, voltage = abs(float(state.current)), abs(float(voltage))
     against = f" against {load:g} N m" if load else ""
     if voltage > voltage_limit:
-        most = _fastest(motor, setpoint, voltage_limit, load)
+        most = _highest_speed(motor, setpoint, voltage_limit, load)
         raise InputError(
             named,
             f"{setpoint:g} rad/s{against} is beyond what {voltage_limit:g} V reaches ({most:.1f})",
@@ -43,7 +43,7 @@ def check_reachable(
         )
 
 
-def _fastest(motor: Motor, setpoint: float, voltage_limit: float, load: float) -> float:
+def _highest_speed(motor: Motor, setpoint: float, voltage_limit: float, load: float) -> float:
     """The highest speed that the voltage holds, effects and all, by halving."""
     if not motor.effects:
         return max(0.0, reach(motor, voltage_limit, load))
@@ -55,22 +55,24 @@ def _fastest(motor: Motor, setpoint: float, voltage_limit: float, load: float) -
     return low
 
 
-def check_time(max_settling: float | None, fastest: float | None, setpoint: float) -> float:
+def check_settling(
+    max_settling: float | None, fastest_settling: float | None, setpoint: float
+) -> float:
     """The fastest settling, if there is one and the specification leaves time for it."""
-    if fastest is None:
+    if fastest_settling is None:
         raise InputError(
             "--setpoint",
             f"{setpoint:g} rad/s is never reached within the limits",
             "Raise --voltage-limit or --current-limit",
         )
-    if max_settling is not None and max_settling < fastest:
+    if max_settling is not None and max_settling < fastest_settling:
         raise InputError(
             "--max-settling",
             f"{max_settling:g} s is less than any controller needs within the limits"
-            f" ({fastest:.4f} s)",
+            f" ({fastest_settling:.4f} s)",
             "Allow more time, more voltage or more current",
         )
-    return fastest
+    return fastest_settling
 
 
 def spare_torque(

@@ -15,7 +15,7 @@ from .controllers import CONTROLLERS
 from .hardware import Hardware
 from .limit import fastest_settling
 from .loop import REMEMBERED
-from .requirements import check_reachable, check_time, reach, spare_torque
+from .requirements import check_reachable, check_settling, reach, spare_torque
 from .steady import steady_state
 
 NOMINAL_VOLTAGE = 24.0  # V, where neither limit nor set point is given
@@ -76,7 +76,7 @@ class LoopRequirements:
         check_reachable(*limits, 0.0)
         if self.load_torque:
             check_reachable(*limits, self.load_torque, "--load-torque")
-        fastest = check_time(self.max_settling, fastest_settling(*limits), setpoint)
+        fastest = check_settling(self.max_settling, fastest_settling(*limits), setpoint)
         sample_time, chosen_sampling = self._sampling(fastest)
         _check_sensor(motor, sample_time)
         return Specification(
@@ -85,7 +85,7 @@ class LoopRequirements:
             voltage_limit=voltage_limit,
             sample_time=sample_time,
             load_torque=spare_torque(*limits) if self.load_torque is None else self.load_torque,
-            fastest=fastest,
+            fastest_settling=fastest,
             samples=_samples(motor, fastest, sample_time, self.delay),
             notes=(*chosen_limits, *chosen_sampling),
         )
@@ -127,8 +127,9 @@ class LoopRequirements:
 class Specification:
     """What a loop is to do: as asked, and what stands for what was left open.
 
-    **Fields**: `setpoint`, rad/s; `voltage_limit`, V; `sample_time`, s; `load_torque`, N m; `fastest`, the shortest
-    settling time within the limits, s; `samples` of each part of the task; `notes`, what was chosen, in words.
+    **Fields**: `setpoint`, rad/s; `voltage_limit`, V; `sample_time`, s; `load_torque`, N m;
+    `fastest_settling`, of any controller within the limits, s; `samples` of each part of the task;
+    `notes`, what was chosen, in words.
     """
 
     asked: LoopRequirements
@@ -136,7 +137,7 @@ class Specification:
     voltage_limit: float
     sample_time: float
     load_torque: float
-    fastest: float
+    fastest_settling: float
     samples: int
     notes: tuple[str, ...]
 

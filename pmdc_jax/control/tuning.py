@@ -92,7 +92,7 @@ class Tuning:
     @property
     def fastest_possible_settling(self) -> float:
         """Of any controller within the limits, s."""
-        return float(self.task.limit)
+        return float(self.task.fastest_settling)
 
     @property
     def peak_current(self) -> float:
@@ -224,7 +224,7 @@ def _task(specification: Specification, motor: Motor, unit_noise: np.ndarray) ->
         hardware=specification.hardware(),
         setpoint=jnp.asarray(specification.setpoint),
         load=jnp.asarray(specification.load_torque),
-        limit=jnp.asarray(specification.fastest),
+        fastest_settling=jnp.asarray(specification.fastest_settling),
         max_overshoot=jnp.asarray(max(asked.max_overshoot, LEAST_OVERSHOOT)),
         max_sensitivity=None
         if asked.max_sensitivity is None
@@ -247,7 +247,7 @@ def _tuned(
     nominal = jax.tree.map(lambda leaf: leaf[0], motors)
     stiffness = jnp.asarray(specification.voltage_limit / abs(specification.setpoint))
     period, kind = task.hardware.sample_time, specification.asked.controller
-    space = GainSpace(kind, stiffness, task.limit, period, nominal, task.setpoint)
+    space = GainSpace(kind, stiffness, task.fastest_settling, period, nominal, task.setpoint)
     least = TUNING_NOISE * abs(specification.setpoint)
     shaken = jnp.asarray(max(specification.asked.speed_noise, least) * unit_noise)
     noisy = eqx.tree_at(lambda t: t.noise, task, shaken)

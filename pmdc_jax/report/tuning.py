@@ -13,7 +13,7 @@ from rich.text import Text
 from ..control.controller_file import gains_of, law_content
 from ..control.judge import SMALL, Candidate, Robustness
 from ..control.metrics import BAND
-from ..control.objective import LOWER
+from ..control.objective import SECOND_SETPOINT
 from ..control.tuning import Tuning
 from .notation import NARROW, UNKNOWN, percent, pretty_unit, significant
 
@@ -49,7 +49,10 @@ def tuning_json(tuning: Tuning) -> dict[str, Any]:
         "fastest_possible_settling_s": tuning.fastest_possible_settling,
         "robust": _robust_json(tuning.robust),
         "load": {"torque_Nm": tuning.load_torque, **tuning.load},
-        "second_step": {"to_rad_s": LOWER * tuning.setpoint, **tuning.candidates[0].second},
+        "second_step": {
+            "to_rad_s": SECOND_SETPOINT * tuning.setpoint,
+            **tuning.candidates[0].second,
+        },
         "small_step": {"to_rad_s": SMALL * tuning.setpoint, **tuning.candidates[0].small},
         "margins": {
             name: getattr(tuning.margins, name)
@@ -294,9 +297,14 @@ def loop_figure(tuning: Tuning):
         fill = {"fill": "tonexty", "fillcolor": "rgba(163,176,192,0.35)"}
         line(1, high, "90 % of the motors", MEASURED, True, x=per_sample, line=none, **fill)
     ends, down = np.array([0.0, time[-1]]), 2e3 * tuning.load_from
-    corners, target = np.array([0.0, down, down, time[-1]]), np.array([1.0, 1.0, LOWER, LOWER])
+    corners, target = (
+        np.array([0.0, down, down, time[-1]]),
+        np.array([1.0, 1.0, SECOND_SETPOINT, SECOND_SETPOINT]),
+    )
     for edge in (-BAND, BAND):
-        band = tuning.setpoint * (target + edge * np.array([1.0, 1.0, LOWER, LOWER]))
+        band = tuning.setpoint * (
+            target + edge * np.array([1.0, 1.0, SECOND_SETPOINT, SECOND_SETPOINT])
+        )
         line(1, band, "2 % band", RESIDUAL, x=corners, line={"width": 0.8, "dash": "dot"})
     wanted = tuning.setpoint * target
     line(1, wanted, "set point", INPUT, True, x=corners, line={"width": 1.0, "dash": "dash"})
