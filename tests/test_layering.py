@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
@@ -70,10 +71,37 @@ BELOW = {
         "recording",
         "recording_file",
         "simulate",
+        "threads",
         "unmeasured",
+    },
+    "diagnose": {
+        "compiled",
+        "effects",
+        "errors",
+        "identify",
+        "motor",
+        "precision",
+        "progress",
+        "recording",
+        "recording_file",
+        "simulate",
         "threads",
     },
+    "report": {
+        "control",
+        "diagnose",
+        "effects",
+        "files",
+        "identify",
+        "motor",
+        "progress",
+        "recording",
+        "wheelchair",
+    },
 }
+# where results are computed, and what of it holds results alone; those of a tuning lie beside their computation
+COMPUTING = {"diagnose", "identify", "simulate"}
+RESULTS = {"diagnose/diagnosis.py", "diagnose/effect_relations.py", "identify/identification.py"}
 
 
 def part_of(path: Path) -> str:
@@ -117,6 +145,15 @@ def modules_imported(path: Path) -> set[Path]:
             found |= {base / alias.name for alias in node.names} | {base}
     files = {base.with_suffix(".py") for base in found} | {base / "__init__.py" for base in found}
     return {file for file in files if file.exists()} - {path}
+
+
+def test_reports_read_results_and_compute_nothing():
+    for module in (PACKAGE / "report").rglob("*.py"):
+        computing = {path for path in modules_imported(module) if part_of(path) in COMPUTING}
+        assert {path.relative_to(PACKAGE).as_posix() for path in computing} <= RESULTS, module.name
+        assert not re.search(
+            r"^\s*(from|import) jax\b", module.read_text(encoding="utf-8"), re.MULTILINE
+        )
 
 
 def test_there_are_no_import_cycles():
