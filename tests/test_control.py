@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import control as ct
 import equinox as eqx
 import jax
@@ -14,6 +16,7 @@ from scipy.optimize import brentq
 from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError
 from pmdc_jax.control import (
+    CONTROLLERS,
     PI,
     PID,
     Course,
@@ -29,6 +32,7 @@ from pmdc_jax.control import (
 )
 from pmdc_jax.control.classical import ackermann, state_feedback, ultimate_gain, ziegler_nichols
 from pmdc_jax.control.continuous import continuous_loop
+from pmdc_jax.control.gains import RANGES
 from pmdc_jax.control.margins import linear_loop, loop_gain, margins, sensitivity_peak
 from pmdc_jax.control.metrics import smooth_overshoot, smooth_settling
 from pmdc_jax.control.spread import drawn_motors, even_spread
@@ -68,6 +72,12 @@ def matrices(step: float) -> tuple[np.ndarray, np.ndarray]:
     whole[:2] = [[-R / L, -Kb / L, 1 / L, 0.0], [Kt / J, -f / J, 0.0, -1 / J]]
     moved = expm(whole * step)
     return moved[:2, :2], moved[:2, 2:]
+
+
+@pytest.mark.parametrize("kind", CONTROLLERS.values(), ids=CONTROLLERS.keys())
+def test_every_gain_has_a_unit_and_every_coordinate_a_range(kind):
+    assert set(kind.units) == {gain.name for gain in fields(kind)}
+    assert set(kind.coordinates) <= set(RANGES)
 
 
 # ------------------------------------------------------------------------------------------ limit

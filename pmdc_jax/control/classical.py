@@ -17,6 +17,8 @@ from .hardware import Hardware
 from .law import Law, Model
 from .margins import linear_loop, loop_gain
 
+RULED = ("pi", "pid")  # controllers that Ziegler and Nichols have a rule for
+
 Poles = Sequence[complex | float] | np.ndarray
 
 
@@ -58,7 +60,7 @@ def ziegler_nichols(motor: Motor, hardware: Hardware | None, kind: str) -> PI | 
 
     **Source**: Ziegler, Nichols, Transactions of the ASME 64 (1942).
     """
-    if kind not in ("pi", "pid"):
+    if kind not in RULED:
         raise InputError("Ziegler-Nichols", f"there is no rule for {kind}", "Choose pi or pid")
     gain, period = ultimate_gain(motor, hardware)
     if kind == "pi":

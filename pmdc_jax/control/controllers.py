@@ -23,13 +23,23 @@ class AbstractController(eqx.Module):
     """A speed controller.
 
     One definition serves both worlds: in continuous time d(memory)/dt = rates(..., step=0), sampled
-    memory += step * rates(..., step), where the derivative filter comes out as backward Euler.
+    memory += step * rates(..., step), where the derivative filter comes out as backward Euler. What else is said of a
+    controller, in reports, in the search for its gains and in C, is said here, too.
     """
 
     name: ClassVar[str]
+    # in plain English, for reports
+    label: ClassVar[str]
+    # of every gain
+    units: ClassVar[dict[str, str]]
+    # what its gains are sought by, of `gains.RANGES`
+    coordinates: ClassVar[tuple[str, ...]]
+    # `command` in C, for `export`: `slope` is the filtered derivative, `ahead` the speed to feed back with the current
+    c_command: ClassVar[str]
     # the state it feeds back is then the estimate at the moment the voltage takes effect
     feeds_back_current: ClassVar[bool] = False
     integrates: ClassVar[bool] = True
+    filters_derivative: ClassVar[bool] = False
 
     def command(
         self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
@@ -78,6 +88,17 @@ class PI(AbstractController):
     """
 
     name: ClassVar = "pi"
+    label: ClassVar = "PI controller"
+    units: ClassVar = {
+        "proportional": "V s/rad",
+        "integral": "V/rad",
+        "setpoint_weight": "",
+        "tracking_time": "s",
+    }
+    coordinates: ClassVar = ("stiffness", "integral_time", "setpoint_weight", "tracking_time")
+    c_command: ClassVar = (
+        "PMDC_PROPORTIONAL * (PMDC_SETPOINT_WEIGHT * reference - speed) + state->integral"
+    )
 
     proportional: Number
     integral: Number
@@ -104,6 +125,18 @@ class PID(AbstractController):
     """
 
     name: ClassVar = "pid"
+    label: ClassVar = "PID controller"
+    units: ClassVar = PI.units | {"derivative": "V s^2/rad", "filter_time": "s"}
+    coordinates: ClassVar = (
+        "stiffness",
+        "integral_time",
+        "derivative_time",
+        "filter_time",
+        "setpoint_weight",
+        "tracking_time",
+    )
+    c_command: ClassVar = f"{PI.c_command} - PMDC_DERIVATIVE * slope"
+    filters_derivative: ClassVar = True
 
     proportional: Number
     integral: Number
@@ -134,6 +167,16 @@ class StateFeedback(AbstractController):
     """
 
     name: ClassVar = "state-feedback"
+    label: ClassVar = "State feedback"
+    units: ClassVar = {
+        "reference_gain": "V s/rad",
+        "current_gain": "V/A",
+        "speed_gain": "V s/rad",
+    }
+    coordinates: ClassVar = ("stiffness", "derivative_time")
+    c_command: ClassVar = (
+        "PMDC_REFERENCE_GAIN * reference - (PMDC_CURRENT_GAIN * current + PMDC_SPEED_GAIN * ahead)"
+    )
     feeds_back_current: ClassVar = True
     integrates: ClassVar = False
 
@@ -161,6 +204,10 @@ class StateFeedbackIntegral(AbstractController):
     """
 
     name: ClassVar = "state-feedback-integral"
+    label: ClassVar = "State feedback with integral action"
+    units: ClassVar = StateFeedback.units | {"integral": "V/rad", "tracking_time": "s"}
+    coordinates: ClassVar = ("stiffness", "derivative_time", "integral_time", "tracking_time")
+    c_command: ClassVar = f"{StateFeedback.c_command} + state->integral"
     feeds_back_current: ClassVar = True
 
     reference_gain: Number

@@ -9,19 +9,6 @@ from ..files import write_text
 from .controller_file import gains_of
 from .law import Law
 
-# What each controller asks for, and how fast its memory moves, as in controllers.py.
-COMMANDS = {
-    "pi": "PROPORTIONAL * (SETPOINT_WEIGHT * reference - speed) + state->integral",
-    "pid": (
-        "PROPORTIONAL * (SETPOINT_WEIGHT * reference - speed) + state->integral"
-        " - DERIVATIVE * slope"
-    ),
-    "state-feedback": "REFERENCE_GAIN * reference - (CURRENT_GAIN * current + SPEED_GAIN * ahead)",
-    "state-feedback-integral": (
-        "REFERENCE_GAIN * reference - (CURRENT_GAIN * current + SPEED_GAIN * ahead)"
-        " + state->integral"
-    ),
-}
 HEADER = Template("""\
 /* A $type speed controller for a brushed permanent-magnet DC motor.
  *
@@ -114,38 +101,66 @@ def _constants(law: Law) -> dict[str, float]:
 
 def _body(law: Law) -> list[str]:
     """The statements of one step, in the order of `Law.step`."""
-    hardware, controller = law.hardware, law.controller
-    names = sorted(gains_of(controller), key=len, reverse=True)
-    command = COMMANDS[controller.name]
-    for name in names:
-        command = command.replace(name.upper(), f"PMDC_{name.upper()}")
+    return [
+        *_state_ahead(law),
+        *_command(law),
+        *_within_limits(law),
+        *_memory(law),
+        *_estimated_current(law),
+        "state->voltage = applied;",
+        "return applied;",
+    ]
+
+
+def _state_ahead(law: Law) -> list[str]:
+    """Current and speed when the voltage takes effect; `here` is the current now."""
     lines = []
-    if not hardware.measures_current:
+    if not law.hardware.measures_current:
         lines += ["(void)current;", "current = state->current;"]
     lines += ["const pmdc_real here = current;", "pmdc_real ahead = speed;"]
-    if hardware.delay:
+    if law.hardware.delay:
         lines += [
             "/* the voltage decided last acts until this one does */",
-            "ahead = PMDC_MODEL_WI * here + PMDC_MODEL_WW * speed"
-            " + PMDC_MODEL_WV * state->voltage;",
-            "current = PMDC_MODEL_II * here + PMDC_MODEL_IW * speed"
-            " + PMDC_MODEL_IV * state->voltage;",
+            f"ahead = {_next_sample('W', 'state->voltage')};",
+            f"current = {_next_sample('I', 'state->voltage')};",
         ]
-    if controller.name == "pid":
+    return lines
+
+
+def _next_sample(row: str, voltage: str) -> str:
+    """Current (I) or speed (W) a sample later, by the law's model of the motor."""
+    model = f"PMDC_MODEL_{row}"
+    return f"{model}I * here + {model}W * speed + {model}V * {voltage}"
+
+
+def _command(law: Law) -> list[str]:
+    """The voltage asked for."""
+    lines = []
+    if law.controller.filters_derivative:
         lines += [
             "const pmdc_real slope = (speed - state->filtered)"
             " / (PMDC_FILTER_TIME + PMDC_SAMPLE_TIME);"
         ]
-    lines += [f"const pmdc_real asked = {command};", "pmdc_real applied = asked;"]
-    if hardware.current_limit is not None:
+    return [*lines, f"const pmdc_real asked = {law.controller.c_command};"]
+
+
+def _within_limits(law: Law) -> list[str]:
+    """The voltage applied."""
+    lines = ["pmdc_real applied = asked;"]
+    if law.hardware.current_limit is not None:
         lines += [
             "/* the voltage that ends the sample at the current limit */",
             "const pmdc_real drift = PMDC_MODEL_II * current + PMDC_MODEL_IW * ahead;",
             "applied = pmdc_clip(applied, (-PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_IV,",
             "                    (PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_IV);",
         ]
-    lines += ["applied = pmdc_clip(applied, -PMDC_VOLTAGE_LIMIT, PMDC_VOLTAGE_LIMIT);"]
-    if controller.integrates:
+    return [*lines, "applied = pmdc_clip(applied, -PMDC_VOLTAGE_LIMIT, PMDC_VOLTAGE_LIMIT);"]
+
+
+def _memory(law: Law) -> list[str]:
+    """What the controller remembers."""
+    lines = []
+    if law.controller.integrates:
         lines += [
             "/* the integral follows the voltage really applied */",
             "const pmdc_real tracking = PMDC_TRACKING_TIME > PMDC_SAMPLE_TIME"
@@ -153,14 +168,13 @@ def _body(law: Law) -> list[str]:
             "state->integral += PMDC_SAMPLE_TIME * (PMDC_INTEGRAL * (reference - speed)",
             "                                       + (applied - asked) / tracking);",
         ]
-    if controller.name == "pid":
+    if law.controller.filters_derivative:
         lines += ["state->filtered += PMDC_SAMPLE_TIME * slope;"]
-    acting = "state->voltage" if hardware.delay else "applied"
-    lines += [
-        "state->current = PMDC_MODEL_II * here + PMDC_MODEL_IW * speed"
-        f" + PMDC_MODEL_IV * {acting};",
-        "(void)ahead;",
-        "state->voltage = applied;",
-        "return applied;",
-    ]
     return lines
+
+
+def _estimated_current(law: Law) -> list[str]:
+    """The current at the next sample."""
+    acting = "state->voltage" if law.hardware.delay else "applied"
+    # not every law looks ahead, and compilers warn of what is set and not used
+    return [f"state->current = {_next_sample('I', acting)};", "(void)ahead;"]

@@ -10,15 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..motor import Motor
-from .controllers import (
-    CONTROLLERS,
-    PI,
-    PID,
-    AbstractController,
-    Number,
-    StateFeedback,
-    StateFeedbackIntegral,
-)
+from .controllers import CONTROLLERS, AbstractController, Number
 from .steady import steady_state
 
 # Each as (lower, upper), the first two of the voltage limit over the set point, times of the fastest settling time.
@@ -30,19 +22,6 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "filter_time": (0.001, 0.1),
     "tracking_time": (0.001, 30.0),
     "setpoint_weight": (0.2, 2.0),  # as it is
-}
-COORDINATES: Mapping[type[AbstractController], tuple[str, ...]] = {
-    PI: ("stiffness", "integral_time", "setpoint_weight", "tracking_time"),
-    PID: (
-        "stiffness",
-        "integral_time",
-        "derivative_time",
-        "filter_time",
-        "setpoint_weight",
-        "tracking_time",
-    ),
-    StateFeedback: ("stiffness", "derivative_time"),
-    StateFeedbackIntegral: ("stiffness", "derivative_time", "integral_time", "tracking_time"),
 }
 
 
@@ -59,7 +38,7 @@ class GainSpace(NamedTuple):
     @property
     def names(self) -> tuple[str, ...]:
         """Of the coordinates."""
-        return COORDINATES[CONTROLLERS[self.kind]]
+        return CONTROLLERS[self.kind].coordinates
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper limit of the coordinates."""
@@ -68,28 +47,26 @@ class GainSpace(NamedTuple):
 
     def controller(self, coordinates: Float[Array, " gains"]) -> AbstractController:
         """The controller at these coordinates."""
-        at = {name: jnp.exp(x) for name, x in zip(self.names, coordinates, strict=True)}
-        stiffness = self.stiffness * at["stiffness"]
-        times = {name: self.duration * at[name] for name in at if name.endswith("_time")}
-        shared = {}
-        if "integral_time" in at:
-            shared["integral"] = stiffness / times["integral_time"]
-            shared["tracking_time"] = jnp.maximum(times["tracking_time"], self.sample_time)
         kind = CONTROLLERS[self.kind]
-        if kind in (StateFeedback, StateFeedbackIntegral):
+        at = {name: jnp.exp(x) for name, x in zip(self.names, coordinates, strict=True)}
+        times = {name: self.duration * at[name] for name in at if name.endswith("_time")}
+        stiffness, gains = self.stiffness * at["stiffness"], {}
+        if kind.feeds_back_current:
             # K1 i is K2 times the speed that the current's torque gains in that time
             current_gain = stiffness * times["derivative_time"] * self.motor.Kt / self.motor.J
-            return kind(
-                reference_gain=reference_gain(self.motor, self.setpoint, current_gain, stiffness),
-                current_gain=current_gain,
-                speed_gain=stiffness,
-                **shared,
+            gains["reference_gain"] = reference_gain(
+                self.motor, self.setpoint, current_gain, stiffness
             )
-        shared |= {"proportional": stiffness, "setpoint_weight": at["setpoint_weight"]}
-        if kind is PID:
-            shared["derivative"] = stiffness * times["derivative_time"]
-            shared["filter_time"] = times["filter_time"]
-        return kind(**shared)
+            gains |= {"current_gain": current_gain, "speed_gain": stiffness}
+        else:
+            gains |= {"proportional": stiffness, "setpoint_weight": at["setpoint_weight"]}
+        if kind.integrates:
+            gains["integral"] = stiffness / times["integral_time"]
+            gains["tracking_time"] = jnp.maximum(times["tracking_time"], self.sample_time)
+        if kind.filters_derivative:
+            gains["derivative"] = stiffness * times["derivative_time"]
+            gains["filter_time"] = times["filter_time"]
+        return kind(**gains)
 
 
 def reference_gain(

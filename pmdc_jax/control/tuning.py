@@ -18,7 +18,7 @@ from ..motor_file import Uncertainty
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..simulate.solver import steps_within
-from .classical import ziegler_nichols
+from .classical import RULED, ziegler_nichols
 from .controllers import AbstractController
 from .descent import STARTS, tuned
 from .gains import GainSpace
@@ -298,7 +298,7 @@ def _motors(
 
 def _rivals(task: Task, motor: Motor, kind: str, judges: Motor | None) -> Iterator[Candidate]:
     """What the textbook would have chosen."""
-    if kind in ("pi", "pid"):
+    if kind in RULED:
         rule = ziegler_nichols(motor, task.hardware, kind)
         yield judged("Ziegler-Nichols", task, motor, rule, judges)
 

@@ -11,29 +11,14 @@ from rich.table import Table
 from rich.text import Text
 
 from ..control.controller_file import gains_of, law_content
+from ..control.controllers import CONTROLLERS
 from ..control.judge import SMALL, Candidate, Robustness
 from ..control.metrics import BAND
 from ..control.objective import SECOND_SETPOINT
 from ..control.tuning import Tuning
 from .notation import NARROW, UNKNOWN, percent, pretty_unit, significant
 
-TITLES = {
-    "pi": "PI controller",
-    "pid": "PID controller",
-    "state-feedback": "State feedback",
-    "state-feedback-integral": "State feedback with integral action",
-}
-GAIN_UNITS = {
-    "proportional": "V s/rad",
-    "integral": "V/rad",
-    "derivative": "V s^2/rad",
-    "filter_time": "s",
-    "setpoint_weight": "",
-    "tracking_time": "s",
-    "reference_gain": "V s/rad",
-    "current_gain": "V/A",
-    "speed_gain": "V s/rad",
-}
+TITLES = {name: kind.label for name, kind in CONTROLLERS.items()}
 
 
 def tuning_json(tuning: Tuning) -> dict[str, Any]:
@@ -169,7 +154,7 @@ def _time(seconds: float | None) -> str:
 
 def tuning_tables(tuning: Tuning) -> RenderableType:
     """Gains and the comparison, and what they mean."""
-    gains = _table(TITLES[tuning.controller.name], "Gain", "Value", "Unit")
+    gains = _table(tuning.controller.label, "Gain", "Value", "Unit")
     for name, value, unit in gain_rows(tuning):
         gains.add_row(name, value, unit)
     compared = _table("Step from rest", "", *HEADINGS)
@@ -182,7 +167,7 @@ def tuning_tables(tuning: Tuning) -> RenderableType:
 def gain_rows(tuning: Tuning) -> list[tuple[str, str, str]]:
     """Name, value and unit of every gain."""
     return [
-        (name.replace("_", " "), significant(value, 5), pretty_unit(GAIN_UNITS[name]))
+        (name.replace("_", " "), significant(value, 5), pretty_unit(tuning.controller.units[name]))
         for name, value in gains_of(tuning.controller).items()
     ]
 
@@ -249,7 +234,7 @@ def write_tuning_report(tuning: Tuning, path: str | Path) -> None:
     write_page(
         path,
         "tuning.html.jinja",
-        title=TITLES[tuning.controller.name],
+        title=tuning.controller.label,
         summary=summary(tuning),
         tiles=tiles,
         messages=tuning.messages,
