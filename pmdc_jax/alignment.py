@@ -10,15 +10,16 @@ import numpy as np
 from .plausibility import regress, speed_of
 from .recording import Finding, Recording
 
-REACH = 20  # samples, the largest shift between channels that is tried
-SHIFTS = sorted(range(-REACH, REACH + 1), key=abs)
-SHIFTED = 0.3  # a shift must leave less than this of the misfit
-BEFORE, AFTER = 40, 100  # samples about a voltage edge
+MAX_SHIFT = 20  # samples, between channels
+SHIFTS = sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs)
+MAX_MISFIT_RATIO = 0.3  # a shift must leave less than this share of the misfit without one
+BEFORE_EDGE = 40  # samples
+AFTER_EDGE = 100  # samples, that of the voltage edge among them
 
 
-def alignment(run: Recording) -> Iterator[Finding]:
+def shifted_channels(run: Recording) -> Iterator[Finding]:
     """Current or speed recorded later or earlier than the rest."""
-    edge = _edges(run)
+    edge = _average_edge(run)
     if edge is None:
         return
     electrical = {shift: _electrical_misfit(edge, shift) for shift in SHIFTS}
@@ -40,12 +41,12 @@ def alignment(run: Recording) -> Iterator[Finding]:
     yield Finding(run.name, column, "warning", what, "at voltage edges", mend)
 
 
-def sampling(run: Recording) -> Iterator[Finding]:
+def slow_sampling(run: Recording) -> Iterator[Finding]:
     """Sampling too slow to see the current rise."""
-    edge = _edges(run)
+    edge = _average_edge(run)
     if edge is None:
         return
-    current = edge.current[BEFORE:] - edge.current[BEFORE]
+    current = edge.current[BEFORE_EDGE:] - edge.current[BEFORE_EDGE]
     if abs(current[1]) > 0.9 * np.max(np.abs(current)):
         what = f"the current settles within one sample ({run.sample_time:.3g} s): L is hardly seen"
         mend = "Sample faster than L / R to identify the inductance"
@@ -61,7 +62,7 @@ class _Edge(NamedTuple):
     direction: np.ndarray
 
 
-def _edges(run: Recording) -> _Edge | None:
+def _average_edge(run: Recording) -> _Edge | None:
     """The average over edges, or None if there is none or a channel is absent.
 
     The motor's equations are linear, so that such averages obey them, with less noise.
@@ -71,12 +72,12 @@ def _edges(run: Recording) -> _Edge | None:
         return None
     jumps = np.diff(run.voltage)
     rows = np.flatnonzero(np.abs(jumps) > 0.1 * np.ptp(run.voltage)) + 1
-    rows = rows[(rows >= BEFORE) & (rows <= len(run) - AFTER)]
+    rows = rows[(rows >= BEFORE_EDGE) & (rows <= len(run) - AFTER_EDGE)]
     rows = rows[:: len(rows) // 2000 + 1]
-    about = rows[:, None] + np.arange(-BEFORE, AFTER)
+    about = rows[:, None] + np.arange(-BEFORE_EDGE, AFTER_EDGE)
     channels = [run.voltage[about], run.current[about], speed[about], np.sign(speed[about])]
-    spans = run.time[rows + AFTER - 1] - run.time[rows - BEFORE]
-    steady = spans < 1.1 * (BEFORE + AFTER - 1) * run.sample_time
+    spans = run.time[rows + AFTER_EDGE - 1] - run.time[rows - BEFORE_EDGE]
+    steady = spans < 1.1 * (BEFORE_EDGE + AFTER_EDGE - 1) * run.sample_time
     good = np.isfinite(channels).all((0, 2)) & steady
     if not good.any():
         return None
@@ -86,7 +87,7 @@ def _edges(run: Recording) -> _Edge | None:
 
 def _electrical_misfit(edge: _Edge, shift: int) -> float:
     """What v = R i + Kb w + L di/dt leaves with current and speed taken `shift` samples later."""
-    rows = np.arange(REACH, BEFORE + AFTER - REACH - 1)
+    rows = np.arange(MAX_SHIFT, BEFORE_EDGE + AFTER_EDGE - MAX_SHIFT - 1)
     later = rows + shift
     # two neighbouring currents span R i + L di/dt for any ratio of L / R to the step
     return _misfit(
@@ -96,7 +97,7 @@ def _electrical_misfit(edge: _Edge, shift: int) -> float:
 
 def _mechanical_misfit(edge: _Edge, shift: int) -> float:
     """What J dw/dt = Kt i - f w - T sign(w) leaves with the current taken `shift` samples later."""
-    rows = np.arange(REACH, BEFORE + AFTER - REACH - 1)
+    rows = np.arange(MAX_SHIFT, BEFORE_EDGE + AFTER_EDGE - MAX_SHIFT - 1)
     later = rows + shift
     # integrated once, so that the noise of the speed is not differentiated
     rates = (edge.current[later], edge.current[later + 1], edge.speed[rows], edge.direction[rows])
@@ -111,6 +112,6 @@ def _misfit(y: np.ndarray, *regressors: np.ndarray) -> float:
 def _best_shift(misfit: Mapping[int, float]) -> int:
     """The smallest shift with about the least misfit, if clearly better than none; else 0."""
     unshifted, least = min(misfit[-1], misfit[0], misfit[1]), min(misfit.values())
-    if unshifted < 0.01 or least > SHIFTED * unshifted:
+    if unshifted < 0.01 or least > MAX_MISFIT_RATIO * unshifted:
         return 0
     return next(shift for shift in SHIFTS if misfit[shift] <= 1.5 * least)

@@ -6,15 +6,21 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from .alignment import alignment, sampling
+from .alignment import shifted_channels, slow_sampling
 from .angle import unwrapped
-from .clock import GAP, came_evenly
-from .plausibility import angle_against_speed, lost_signs, plain_units, signs, speed_of
+from .clock import GAP, is_evenly_sampled
+from .plausibility import (
+    angle_against_speed,
+    implausible_units,
+    lost_signs,
+    reversed_signs,
+    speed_of,
+)
 from .recording import Finding, Recording
-from .unmeasured import flat_tops, noise_of
+from .unmeasured import clipped_extremes, noise_of
 
-JITTER = 0.02  # of a step, root mean square
-LEAP = 0.2  # of the range
+MAX_JITTER = 0.02  # of a step, root mean square
+MAX_JUMP = 0.2  # from sample to sample, of the range of a current that drives
 
 
 def check(recordings: Sequence[Recording]) -> tuple[Finding, ...]:
@@ -28,9 +34,9 @@ def check(recordings: Sequence[Recording]) -> tuple[Finding, ...]:
     findings: list[Finding] = []
     for recording in recordings:
         findings += recording.notes
-        for look in LOOKS:
-            findings += look(recording)
-    findings += plain_units(recordings)
+        for check_run in CHECKS_OF_A_RUN:
+            findings += check_run(recording)
+    findings += implausible_units(recordings)
     findings += excitation(recordings)
     return tuple(findings)
 
@@ -59,9 +65,9 @@ def jitter(run: Recording) -> Iterator[Finding]:
     # scatter from step to step, not of the stamps, so that a slowly drifting clock is no jitter
     scatter = steps / np.mean(steps) - 1
     deviation = float(np.sqrt(np.mean(scatter**2) / 2))
-    if deviation > JITTER:
+    if deviation > MAX_JITTER:
         samples = "are taken when they were stamped"
-        if came_evenly(run):
+        if is_evenly_sampled(run):
             samples = "came evenly all the same, by how they go on: they are taken as even"
         yield Finding(
             run.name,
@@ -73,7 +79,7 @@ def jitter(run: Recording) -> Iterator[Finding]:
         )
 
 
-def missing(run: Recording) -> Iterator[Finding]:
+def missing_samples(run: Recording) -> Iterator[Finding]:
     """Samples without a value."""
     for quantity, values in run.columns().items():
         absent = np.isnan(values)
@@ -88,14 +94,14 @@ def missing(run: Recording) -> Iterator[Finding]:
             )
 
 
-def clipped(run: Recording) -> Iterator[Finding]:
+def clipping(run: Recording) -> Iterator[Finding]:
     """A flat top: the extreme value many times in a row in a channel that is otherwise noisy.
 
     The voltage is left out: a controller may truly hold it at the limit of its supply.
     """
     for quantity in ("current", "speed"):
         values = getattr(run, quantity)
-        for extreme, start, length in [] if values is None else flat_tops(values):
+        for extreme, start, length in [] if values is None else clipped_extremes(values):
             yield Finding(
                 run.name,
                 quantity,
@@ -148,13 +154,13 @@ def unused_torque(run: Recording) -> Iterator[Finding]:
         )
 
 
-def leaps(run: Recording) -> Iterator[Finding]:
+def current_jumps(run: Recording) -> Iterator[Finding]:
     """A current that drives, and leaps from one sample to the next: half way between is but a guess."""
     if run.drive != "current" or run.current is None:
         return
     steps = np.abs(np.diff(run.current))
     row = int(np.argmax(steps))
-    if steps[row] > LEAP * np.ptp(run.current) and steps[row] > 10 * noise_of(run.current):
+    if steps[row] > MAX_JUMP * np.ptp(run.current) and steps[row] > 10 * noise_of(run.current):
         yield Finding(
             run.name,
             "current",
@@ -203,20 +209,20 @@ def excitation(runs: Sequence[Recording]) -> Iterator[Finding]:
             )
 
 
-LOOKS = (
+CHECKS_OF_A_RUN = (
     gaps,
     jitter,
-    missing,
-    clipped,
+    missing_samples,
+    clipping,
     wrapped_angle,
     constant_load,
-    leaps,
+    current_jumps,
     unused_torque,
-    signs,
+    reversed_signs,
     lost_signs,
     angle_against_speed,
-    alignment,
-    sampling,
+    shifted_channels,
+    slow_sampling,
 )
 
 

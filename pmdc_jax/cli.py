@@ -62,7 +62,10 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
+# exit statuses
+DONE = 0
+BAD_INPUT = 2
+INTERRUPTED = 130
 
 app = typer.Typer(
     name="pmdc",
@@ -110,16 +113,16 @@ def identify(
     options = fit_options(tie, known, unloaded, search, seed) | {"effects": tuple(effect)}
     from .identify import identify
 
-    identification = _work_on(identify, runs, holdout, columns, options)
+    identification = _read_and_work(identify, runs, holdout, columns, options)
     from .report.json import identification_json
     from .report.terminal import print_identification
 
-    _save(identification, save)
+    _print_findings_and_save(identification, save)
     if report:
         from .report.identification import write_report
 
         write_report(identification, report)
-    _tell(identification, json, identification_json, print_identification)
+    _write_and_print(identification, json, identification_json, print_identification)
 
 
 @app.command(
@@ -153,11 +156,11 @@ def diagnose(
     options = fit_options(tie, known, unloaded, search, seed)
     from .diagnose import diagnose
 
-    diagnosis = _work_on(diagnose, runs, holdout, columns, options)
+    diagnosis = _read_and_work(diagnose, runs, holdout, columns, options)
     from .report.diagnosis_tables import print_diagnosis
     from .report.json import diagnosis_json
 
-    _save(diagnosis.final, save)
+    _print_findings_and_save(diagnosis.final, save)
     if experiment:
         from .report.experiment import write_experiment
 
@@ -167,7 +170,7 @@ def diagnose(
         from .report.diagnosis import write_diagnosis
 
         write_diagnosis(diagnosis, report)
-    _tell(diagnosis, json, diagnosis_json, print_diagnosis)
+    _write_and_print(diagnosis, json, diagnosis_json, print_diagnosis)
 
 
 @app.command(epilog="Example: pmdc simulate motor.json --input drive.csv --out simulated.csv")
@@ -297,7 +300,7 @@ def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
 
     Four runs are fitted, a fifth tests the motor; results and reports go to a folder.
     """
-    from .demo import WRITTEN, demo
+    from .demo import FILES, demo
     from .report.diagnosis_tables import print_diagnosis
     from .report.terminal import print_findings, print_messages, print_tables, progress
     from .report.tuning import tuning_tables
@@ -308,11 +311,11 @@ def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
     print_diagnosis(diagnosis)
     print_messages(tuning.messages)
     print_tables(tuning_tables(tuning))
-    for name in WRITTEN:
+    for name in FILES:
         typer.echo(out / name)
 
 
-def _work_on(
+def _read_and_work(
     work: Callable[..., Result],
     runs: list[Path],
     holdout: list[Path],
@@ -329,7 +332,7 @@ def _work_on(
         return work(recordings, holdout=held_out, progress=on_progress, **options)
 
 
-def _save(identification: Identification, path: Path | None) -> None:
+def _print_findings_and_save(identification: Identification, path: Path | None) -> None:
     """Tell what was found about the recordings, and save the motor where that was asked for."""
     from .report.terminal import print_findings
 
@@ -340,7 +343,7 @@ def _save(identification: Identification, path: Path | None) -> None:
         save_motor(path, identification.motor, identification)
 
 
-def _tell(
+def _write_and_print(
     result: Result,
     json: str | None,
     as_json: Callable[[Result], dict[str, Any]],
@@ -363,14 +366,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if arguments is None:
         keep_compiled()
-        _collect_rarely()
+        _collect_garbage_rarely()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # an Ω must not fail on an old code page
     try:
         status = app(args=arguments, prog_name="pmdc", standalone_mode=False) or DONE
     except typer.TyperException as error:
-        return _refuse(_usage(error))
+        return _refuse(_usage_message(error))
     except InputError as error:
         return _refuse(str(error))
     except OSError as error:
@@ -383,7 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status
 
 
-def _collect_rarely() -> None:
+def _collect_garbage_rarely() -> None:
     """Spare a command an eighth of its time: what it imports and traces, millions of objects, lives as long as it does,
     and the garbage collector would look through it again and again, at last when it ends."""
     gc.set_threshold(100_000, 50, 50)
@@ -395,7 +398,7 @@ def _refuse(message: str) -> int:
     return BAD_INPUT
 
 
-def _usage(error: typer.TyperException) -> str:
+def _usage_message(error: typer.TyperException) -> str:
     context = getattr(error, "ctx", None)
     command = context.command_path if context else "pmdc"
     return f"{error.format_message().rstrip('.')}. See {command} --help"

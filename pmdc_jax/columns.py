@@ -93,12 +93,12 @@ QUANTITIES = {
 
 
 # Symbols that say whose they are, such as u_motor and Vmot, and need no unit
-OF_MOTOR = {
+MOTOR_SYMBOLS = {
     quantity: re.compile(rf"({symbol})_?(mot|motor|arm|armature)")
     for quantity, symbol in {"voltage": "u|v", "current": "i", "speed": "w|omega"}.items()
 }
 # Quantities that a unit tells, if one column has it: a torque may be the load or the motor's
-BY_UNIT = ("time", "voltage", "current", "speed", "angle")
+TOLD_BY_UNIT = ("time", "voltage", "current", "speed", "angle")
 # ... and words in the names of columns that hold something else than what was measured
 NOT_MEASURED = re.compile(
     r"(?i)(?<![a-z])(ref|set|soll|cmd|command|target|demand|desired|limit|max|min|supply|bat)"
@@ -153,28 +153,30 @@ def match_columns(
         if column is None or column.quantity in found or header in taken:
             continue
         if column.quantity in understood:
-            raise _twice(understood[column.quantity], column, where)
+            raise _ambiguous_headers(understood[column.quantity], column, where)
         understood[column.quantity] = column
     found |= understood
     for quantity, error in refused.items():
         if quantity not in found:
             raise error
-    return found | _less_surely(headers, found)
+    return found | _match_by_unit_or_symbol(headers, found)
 
 
-def _less_surely(headers: Sequence[str], found: Mapping[str, Column]) -> dict[str, Column]:
+def _match_by_unit_or_symbol(
+    headers: Sequence[str], found: Mapping[str, Column]
+) -> dict[str, Column]:
     """Quantities that no name tells of, where the unit or the symbol of one header alone does."""
     taken = {column.header for column in found.values()}
     free = [header for header in headers if header not in taken]
     known: dict[str, Column] = {}
-    for quantity in (q for q in BY_UNIT if q not in found):
+    for quantity in (q for q in TOLD_BY_UNIT if q not in found):
         alike = [
             evolve(_column(header, quantity, unit), by_unit=True)
             for header in free
             if (unit := _measured_unit(header, quantity))
         ]
-        if symbol := OF_MOTOR.get(quantity):
-            marked = (header for header in free if symbol.fullmatch(_key(header)))
+        if symbol := MOTOR_SYMBOLS.get(quantity):
+            marked = (header for header in free if symbol.fullmatch(_normalised(header)))
             alike += [_column(header, quantity, None) for header in marked]
         if len(alike) == 1:
             known[quantity] = alike[0]
@@ -194,10 +196,10 @@ def understand(header: str) -> Column | None:
 
     **Raises**: `UnitError` where the quantity is clear and the unit in brackets is not one of it.
     """
-    if _key(header) == "rpm":
+    if _normalised(header) == "rpm":
         return _column(header, "speed", "rpm")
     for name, unit, explicit in _readings(header):
-        key = _key(name)
+        key = _normalised(name)
         named = [q for q, known in QUANTITIES.items() if key in known.names]
         if unit is None and named:
             return _column(header, named[0], None)
@@ -216,13 +218,13 @@ def understand(header: str) -> Column | None:
     return column and evolve(column, header=header)
 
 
-def looks_like(header: str) -> str | None:
+def likely_quantity(header: str) -> str | None:
     """The quantity that an unused header may be, if any: the one that it begins with, such as speed for `speed_kg`;
     or the load for the unit of a torque, as in `M_Nm`."""
     readings = [(name, unit) for name, unit, _ in _readings(header) if unit is not None]
     for name, _ in readings:
         for quantity, known in QUANTITIES.items():
-            if _key(name) in known.names:
+            if _normalised(name) in known.names:
                 return quantity
     torque = QUANTITIES["load"].units[:1]
     return "load" if any(_is_unit_of(unit, "load", torque) for _, unit in readings) else None
@@ -255,13 +257,13 @@ def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column
         listed = ", ".join(headers[:20]) or "none"
         raise InputError(option, f"the file has no column '{header}'", f"Its columns are: {listed}")
     try:
-        return _column(header, quantity, unit or _own_unit(header, quantity))
+        return _column(header, quantity, unit or _unit_in_header(header, quantity))
     except UnitError as error:
         example = f"--column {name}={header}:{QUANTITIES[quantity].units[0]}"
         raise InputError(option, str(error), f"Write for example {example}") from None
 
 
-def _own_unit(header: str, quantity: str) -> str | None:
+def _unit_in_header(header: str, quantity: str) -> str | None:
     """The unit inside a header whose name need not be known."""
     for _, unit, explicit in _readings(header):
         if unit is not None and (explicit or _is_unit_of(unit, quantity)):
@@ -290,7 +292,7 @@ def _readings(header: str) -> Iterator[tuple[str, str | None, bool]]:
         yield header[:cut], header[cut + 1 :], False
 
 
-def _key(name: str) -> str:
+def _normalised(name: str) -> str:
     name = name.strip().casefold().replace("ω", "omega").replace("θ", "theta").replace("φ", "phi")
     return re.sub(r"\W+|_+", "_", name).strip("_")
 
@@ -312,7 +314,7 @@ def _refuse_shared(found: Mapping[str, Column], where: str) -> None:
             raise InputError(where, what, "Give each quantity a column of its own")
 
 
-def _twice(first: Column, second: Column, where: str) -> InputError:
+def _ambiguous_headers(first: Column, second: Column, where: str) -> InputError:
     return InputError(
         f"{where}, columns {first.header} and {second.header}",
         f"both mean {first.quantity}",

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 SAMPLE = Path(__file__).parent / "sample"
 TRAINING = ("staircase", "prbs", "triangle", "loaded")
 HOLDOUT = ("drive",)
-WRITTEN = ("report.html", "diagnosis.json", "motor.json", "tuning.html", "controller.json")
+FILES = ("report.html", "diagnosis.json", "motor.json", "tuning.html", "controller.json")
 
 
-class Tour(NamedTuple):
-    """What the tour came to."""
+class DemoResult(NamedTuple):
+    """What the demo found: the diagnosis of the sample, and the controller tuned for its motor."""
 
     diagnosis: Diagnosis
     tuning: Tuning
@@ -27,15 +27,15 @@ class Tour(NamedTuple):
 
 def demo(
     out: str | Path = "demo_out", seed: int = 0, progress: ReportProgress | None = None
-) -> Tour:
-    """Diagnose the packaged sample and tune a PID controller for the motor found; write the files `WRITTEN` to `out`.
+) -> DemoResult:
+    """Diagnose the packaged sample and tune a PID controller for the motor found; write `FILES` to `out`.
 
     **Arguments**: `out`, a folder, made where it does not exist; `seed` of the searches; `progress`,
     called now and then with what is being done.
 
     **Returns**: the diagnosis, whose `final` is the identification of the completed motor, and the tuning.
     """
-    folder = result_folder(Path(out), WRITTEN[0])
+    folder = result_folder(Path(out), FILES[0])
     from .control.controller_file import save_controller
     from .control.tuning import tune
     from .diagnose import diagnose
@@ -44,7 +44,7 @@ def demo(
     from .report.json import diagnosis_json, write_json
     from .report.tuning import write_tuning_report
 
-    report, found, motor, page, controller = (folder / name for name in WRITTEN)
+    report, found, motor, page, controller = (folder / name for name in FILES)
     training, held_out = (
         [SAMPLE / f"{name}.csv" for name in names] for names in (TRAINING, HOLDOUT)
     )
@@ -64,4 +64,4 @@ def demo(
     )
     save_controller(controller, tuning.law)
     write_tuning_report(tuning, page)
-    return Tour(diagnosis, tuning)
+    return DemoResult(diagnosis, tuning)

@@ -20,11 +20,11 @@ def paper(out: str | Path = "paper_out", progress: ReportProgress | None = None)
     """
     from .report.json import write_json
     from .report.paper import paper_json, write_paper
-    from .wheelchair import done_again
+    from .wheelchair import reproduce
 
     folder = result_folder(Path(out), "paper.html")
 
-    result = done_again(progress)
+    result = reproduce(progress)
     write_json(paper_json(result), folder / "paper.json")
     write_paper(result, folder / "paper.html")
     return result

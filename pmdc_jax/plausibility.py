@@ -19,12 +19,13 @@ from .recording import Finding, Recording
 
 MAX_WINDOWS = 4000
 MIN_WINDOWS = 20
-LONGER = (1, 4, 16)  # windows this many times as long are tried too: rates of noisy channels
+WINDOW_LENGTHS = (1, 4, 16)  # times the shortest: rates of noisy channels need long ones
 UNSIGNED = ("current", "speed")  # channels of which some sensors give no sign
-SIGNED = 0.2  # share of the voltage that these leave unexplained, if they are given its sign
-ONE_WAY = 0.02  # share of its range to which a channel that has no sign may be negative
-CLEAR = 3.0  # a term is seen when it moves the fit by this many residuals
-RPM, DEGREES = 30 / np.pi, 180 / np.pi  # numbers per rad/s or rad
+MAX_UNEXPLAINED = 0.2  # share of the voltage that these may leave, if they are given its sign
+MAX_NEGATIVE = 0.02  # share of its range to which a channel that has no sign may be negative
+MIN_CLARITY = 3.0  # a term is seen when it moves the fit by this many residuals
+RPM = 30 / np.pi  # in a rad/s
+DEGREES = 180 / np.pi  # in a rad
 TOP_SPEED = 6000.0  # rad/s, 57,000 rpm: no brushed motor turns faster
 KB_RANGE = (5e-5, 200.0)  # V s/rad, a factor of 20 beyond what is built
 
@@ -37,16 +38,16 @@ class Term(NamedTuple):
 
     @property
     def negative(self) -> bool:
-        return self.value < 0 and self.clarity > CLEAR
+        return self.value < 0 and self.clarity > MIN_CLARITY
 
     @property
     def positive(self) -> bool:
-        return self.value > 0 and self.clarity > CLEAR
+        return self.value > 0 and self.clarity > MIN_CLARITY
 
 
-def signs(run: Recording) -> Iterator[Finding]:
+def reversed_signs(run: Recording) -> Iterator[Finding]:
     """Channels wired or defined the other way round."""
-    for column, what in _reversed(run):
+    for column, what in _reversed_channels(run):
         mend = f"Turn the sign of the {column} column, or swap its wires"
         yield Finding(run.name, column, "warning", what, "whole run", mend)
 
@@ -65,29 +66,29 @@ def lost_signs(run: Recording) -> Iterator[Finding]:
         terms = {name: w[name] * (way if name in turned else 1.0) for name in UNSIGNED}
         return 1 - regress(w["voltage"], terms, intercept=False)[1]
 
-    one_way = [name for name in UNSIGNED if np.min(w[name]) > -ONE_WAY * np.max(w[name])]
+    one_way = [name for name in UNSIGNED if np.min(w[name]) > -MAX_NEGATIVE * np.max(w[name])]
     least, lost = min(
         ((missed(*some), some) for k in (1, 2) for some in combinations(one_way, k)),
         default=(1.0, ()),
     )
-    if least < min(SIGNED, missed() / 2) and missed() > SIGNED / 2:
+    if least < min(MAX_UNEXPLAINED, missed() / 2) and missed() > MAX_UNEXPLAINED / 2:
         for column in lost:
             what = "it is never negative, though the voltage is: it has lost its sign"
             mend = "Record which way it goes as well, or only one direction"
             yield Finding(run.name, column, "warning", what, "whole run", mend)
 
 
-def _reversed(run: Recording) -> Iterator[tuple[str, str]]:
+def _reversed_channels(run: Recording) -> Iterator[tuple[str, str]]:
     w = _windows(run)
     if run.drive == "voltage" and {"current", "speed"} <= set(w):
-        R, Kb = _electrical(w)
+        R, Kb = _electrical_balance(w)
         if R.negative and Kb.negative:
             yield "voltage", "its sign is opposite to that of current and speed"
         elif Kb.negative and R.value > 0:
             yield "speed", "its sign is opposite to that of the voltage"
         elif R.negative and Kb.value > 0:
             yield "current", "its sign is opposite to that of the voltage"
-    elif any(_falls_when_driven(run, longer) for longer in LONGER):
+    elif any(_falls_when_driven(run, longer) for longer in WINDOW_LENGTHS):
         yield "speed", f"it falls where the {run.drive} should make it rise: one has a wrong sign"
 
 
@@ -103,7 +104,7 @@ def _falls_when_driven(run: Recording, longer: int) -> bool:
     return explained > 0.7 and fit["speed_rate"].negative and drag
 
 
-def _electrical(w: Mapping[str, np.ndarray]) -> tuple[Term, Term]:
+def _electrical_balance(w: Mapping[str, np.ndarray]) -> tuple[Term, Term]:
     """R and Kb. No intercept: at a constant voltage a varying load shows them."""
     balance = {k: w[k] for k in ("current", "speed", "current_rate")}
     fit, _ = regress(w["voltage"], balance, intercept=False)
@@ -132,16 +133,18 @@ def angle_against_speed(run: Recording) -> Iterator[Finding]:
     yield Finding(run.name, "angle", "warning", what, "whole run", mend)
 
 
-def plain_units(runs: Sequence[Recording]) -> Iterator[Finding]:
+def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
     """Speeds in rpm or deg/s that pass as rad/s.
 
     In SI the torque constant equals that of the back-EMF. Kt shows where the load is known and
     varies, within a run or from run to run.
     """
     for run in runs:
-        yield from _too_fast(run)
+        yield from _implausible_speed(run)
     names = ", ".join(run.name for run in runs if run.load is not None)
-    constants = max((_constants(runs, longer) for longer in LONGER), key=lambda c: c.explained)
+    constants = max(
+        (_constants(runs, longer) for longer in WINDOW_LENGTHS), key=lambda c: c.explained
+    )
     Kb, Kt = constants.Kb, constants.Kt
     if constants.explained < 0.8 or not (constants.R.positive and Kb.positive):
         return
@@ -176,10 +179,10 @@ def _constants(runs: Sequence[Recording], longer: int) -> _Constants:
     w = {k: np.concatenate([one[k] for one in loaded]) for k in names}
     torques = {k: w[k] for k in ("current", "speed", "speed_rate", "direction")}
     mechanical, explained = regress(w["load"], torques)
-    return _Constants(*_electrical(w), mechanical["current"], explained)
+    return _Constants(*_electrical_balance(w), mechanical["current"], explained)
 
 
-def _too_fast(run: Recording) -> Iterator[Finding]:
+def _implausible_speed(run: Recording) -> Iterator[Finding]:
     mend = "Check the unit: write [rpm] or [deg/s] into the header, or map it by --column"
     w = _windows(run)
     if "speed" not in w:
@@ -189,7 +192,7 @@ def _too_fast(run: Recording) -> Iterator[Finding]:
         what = f"{top:.4g} rad/s is faster than brushed motors turn"
         yield Finding(run.name, "speed", "warning", what, "whole run", mend)
     elif {"voltage", "current"} <= set(w):
-        _, Kb = _electrical(w)
+        _, Kb = _electrical_balance(w)
         if Kb.positive and not KB_RANGE[0] < Kb.value < KB_RANGE[1]:
             what = f"with the voltage it makes Kb = {Kb.value:.3g} V s/rad, unlike any motor"
             yield Finding(run.name, "speed", "warning", what, "whole run", mend)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .columns import QUANTITIES, Column, looks_like, match_columns, mixed_axes
+from .columns import QUANTITIES, Column, likely_quantity, match_columns, mixed_axes
 from .errors import InputError
 from .files import replacing
 from .recording import (
@@ -157,7 +157,7 @@ def _notes(
         mend = "Give all columns for the shaft (rad, N m) or all for the linear axis (m, N)"
         yield Finding(run, shaft.header, "warning", what, "header", mend)
     for header in headers:
-        quantity = looks_like(header)
+        quantity = likely_quantity(header)
         if quantity and quantity not in found:
             what = f"not used, though it looks like {quantity}"
             yield note(header, what, f"Map it by --column {quantity}={header}:UNIT")

@@ -11,13 +11,18 @@ from jaxtyping import Bool, Float
 
 from .recording import MAX_MISSING, Finding, Recording
 
-# A spike is so many times what a signal usually bends from sample to sample, and this share of its range at least
-STANDS_OUT, LARGE = 50.0, 0.2
-# Its neighbours differ by no more than this share of it; a voltage is steady if it moves by no more of its range
-ALIKE = 0.2
+# A spike is so many times what a signal usually bends from sample to sample ...
+SPIKE_RATIO = 50.0
+# ... and this share of its range at least
+MIN_SPIKE = 0.2
+# Its neighbours differ by no more than this share of it
+MAX_STEP_ASIDE = 0.2
+# ... and what drives moves by no more of its range about it
+MAX_STEP_OF_DRIVE = 0.2
 # More than this share of all samples are no spikes
-RARE = 0.01
-FLAT_TOP = 1e-9  # probability that a run of equal extreme values is chance
+MAX_SPIKES = 0.01
+# Probability that a run of equal extreme values is chance
+CHANCE_OF_STAY = 1e-9
 
 
 def without_unmeasured(run: Recording) -> Recording:
@@ -28,10 +33,10 @@ def without_unmeasured(run: Recording) -> Recording:
         if signal is None:
             continue
         spikes = _spikes(signal) & _steady(run)
-        if 0 < spikes.sum() <= RARE * len(run):
+        if 0 < spikes.sum() <= MAX_SPIKES * len(run):
             run = _without(run, name, spikes, "leaps out and straight back")
         signal = getattr(run, name)
-        ends = [extreme for extreme, *_ in flat_tops(signal)]
+        ends = [extreme for extreme, *_ in clipped_extremes(signal)]
         clipped = np.isin(signal, ends)
         missing = np.mean(clipped | np.isnan(signal))
         if ends and missing <= MAX_MISSING:
@@ -60,23 +65,23 @@ def _spikes(signal: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples
     size = np.where(before * after > 0, np.minimum(np.abs(before), np.abs(after)), 0.0)
     apart = np.abs(signal[2:] - signal[:-2])
     low, high = np.nanquantile(signal, [0.02, 0.98])
-    least = max(STANDS_OUT * np.nanmedian(np.abs(np.diff(signal, 2))), LARGE * (high - low))
-    return np.pad((size > least) & (apart < ALIKE * size), 1)
+    least = max(SPIKE_RATIO * np.nanmedian(np.abs(np.diff(signal, 2))), MIN_SPIKE * (high - low))
+    return np.pad((size > least) & (apart < MAX_STEP_ASIDE * size), 1)
 
 
 def _steady(run: Recording) -> Bool[np.ndarray, " samples"]:
     """Where what drives cannot have made a spike, for it is as it was."""
     drive = np.asarray(getattr(run, run.drive))
-    leaps = np.abs(np.diff(drive, prepend=drive[0])) > ALIKE * np.ptp(drive)
+    leaps = np.abs(np.diff(drive, prepend=drive[0])) > MAX_STEP_OF_DRIVE * np.ptp(drive)
     return ~(leaps | np.roll(leaps, 1) | np.roll(leaps, -1))
 
 
-def flat_tops(
+def clipped_extremes(
     values: Float[np.ndarray, " samples"],
 ) -> Iterator[tuple[float, int, int]]:
     """Extremes at which a noisy signal stays as no chance makes it, and start and length of the longest stay there."""
     for extreme in (np.nanmax(values), np.nanmin(values)) if _is_noisy(values) else ():
-        start, length, expected = _flat_top(values, extreme)
+        start, length, expected = _longest_stay_at(values, extreme)
         if length > expected:
             yield float(extreme), start, length
 
@@ -98,7 +103,7 @@ def _is_noisy(values: np.ndarray) -> bool:
     return bool(np.mean(third[1:] * third[:-1] < 0) > 0.5)  # 0.77 for white noise, 0 for motion
 
 
-def _flat_top(values: np.ndarray, extreme: float) -> tuple[int, int, float]:
+def _longest_stay_at(values: np.ndarray, extreme: float) -> tuple[int, int, float]:
     """Start and length of the longest run of the extreme value, and the length chance may make."""
     if extreme == 0:  # a motor at rest, or a sensor that knows one direction
         return 0, 0, np.inf
@@ -111,7 +116,7 @@ def _flat_top(values: np.ndarray, extreme: float) -> tuple[int, int, float]:
     longest = int(np.argmax(ends - starts))
     inner = values[(values != extreme) & np.isfinite(values)]
     repeats = (np.count_nonzero(np.diff(inner) == 0) + 1) / len(inner)
-    expected = 1 + np.log(FLAT_TOP / len(values)) / np.log(min(repeats, 0.999))
+    expected = 1 + np.log(CHANCE_OF_STAY / len(values)) / np.log(min(repeats, 0.999))
     # a speed in counts stays wherever the motor turns steadily
     elsewhere = 2.0 * _second_longest_stay(inner[inner != 0])
     return (

@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 
 TABLE_1 = {"R": 0.157378, "L": 0.0003137, "Kb": 0.0492, "Kt": 0.0501, "J": 0.000466, "f": 0.0002546}
 PRINTED = Motor(**{name: np.asarray(TABLE_1[name]) for name in PARAMETERS}, effects=())
-VOLTAGE, SETPOINT, LOWER = 24.0, 481.0, 240.5
-# the printed 0.08 s needs this much
-ENOUGH = 25.0
+VOLTAGE = 24.0  # V
+SETPOINT = 481.0  # rad/s
+LOWER_SETPOINT = 240.5  # rad/s
+# V, what the printed settling of 0.08 s needs
+SUFFICIENT_VOLTAGE = 25.0
 LOADS = np.linspace(0.0, 1.0, 9)  # N m
 NOISE = {"current": 0.1, "speed": 0.5}  # A, rad/s
-
-
 # time constant of the derivative's filter over Kd / Kp; the paper prints none, and a tenth is the textbook's
-FILTER = 0.1
+FILTER_RATIO = 0.1
 
 
 @frozen
-class Printed:
+class PrintedRow:
     """A row of Table 2, % and s, and the gains Kp V s/rad, Ki V/rad, Kd V s^2/rad; None where none are printed."""
 
     overshoot: float
@@ -40,10 +40,10 @@ class Printed:
     gains: tuple[float, float, float] | None
 
 
-TABLE_2: Mapping[str, Printed] = {
-    "pi": Printed(37.83, 0.16, (0.042346, 3.69, 0.0)),
-    "pid": Printed(11.02, 0.18, (0.084618, 5.4121, 0.00022659)),
-    "state-feedback": Printed(0.06, 0.08, None),
+TABLE_2: Mapping[str, PrintedRow] = {
+    "pi": PrintedRow(37.83, 0.16, (0.042346, 3.69, 0.0)),
+    "pid": PrintedRow(11.02, 0.18, (0.084618, 5.4121, 0.00022659)),
+    "state-feedback": PrintedRow(0.06, 0.08, None),
 }
 
 
@@ -89,7 +89,7 @@ class Paper:
     as_printed: Mapping[str, AsPrinted]  # for the controllers whose gains are printed
 
 
-def done_again(progress: ReportProgress | None = None) -> Paper:
+def reproduce(progress: ReportProgress | None = None) -> Paper:
     """Everything that the paper does, once more."""
     from .control.limit import fastest_settling
     from .control.requirements import reach
@@ -97,7 +97,7 @@ def done_again(progress: ReportProgress | None = None) -> Paper:
 
     report = progress or silent
     report("recovering Table 1", fraction=0.0)
-    recovered = (by_the_papers_ga(), by_ours())
+    recovered = (recovered_by_paper_ga(), recovered_by_identify())
     tunings = {}
     for k, kind in enumerate(TABLE_2):
         report(f"tuning {kind}", fraction=0.4 + 0.15 * k)
@@ -105,7 +105,7 @@ def done_again(progress: ReportProgress | None = None) -> Paper:
             PRINTED,
             kind,
             setpoint=SETPOINT,
-            voltage_limit=ENOUGH,
+            voltage_limit=SUFFICIENT_VOLTAGE,
             sample_time=1e-3,
             max_overshoot=0.5,
         )
@@ -114,7 +114,7 @@ def done_again(progress: ReportProgress | None = None) -> Paper:
         for volts in (24.0, 25.0, 26.0, 28.0, 30.0, 36.0, 48.0)
     }
     report("simulating Figs 7 and 8", fraction=0.9)
-    steps = {kind: both_steps(tuning) for kind, tuning in tunings.items()}
+    steps = {kind: step_up_and_down(tuning) for kind, tuning in tunings.items()}
     gains = {kind: row.gains for kind, row in TABLE_2.items() if row.gains}
     as_printed = {kind: simulated_as_printed(*found) for kind, found in gains.items()}
     return Paper(recovered, reach(PRINTED, VOLTAGE), tunings, fastest, steps, as_printed)
@@ -140,7 +140,7 @@ def load_test(seed: int = 0):
     )
 
 
-def by_the_papers_ga(seed: int = 0) -> Recovered:
+def recovered_by_paper_ga(seed: int = 0) -> Recovered:
     """The binary genetic algorithm alone: 20 chromosomes of 60 bits, 80 generations."""
     from .identify.bounds import search_bounds
     from .identify.parameters import Parameters
@@ -159,7 +159,7 @@ def by_the_papers_ga(seed: int = 0) -> Recovered:
     return Recovered("the paper's GA", motor, found.evaluations, seconds, found.best)
 
 
-def by_ours(seed: int = 0) -> Recovered:
+def recovered_by_identify(seed: int = 0) -> Recovered:
     """`identify`: evolution strategy, then least squares."""
     from .identify import identify
 
@@ -175,23 +175,23 @@ def by_ours(seed: int = 0) -> Recovered:
 
 def load_errors(motor: Motor) -> tuple[np.ndarray, np.ndarray]:
     """Figs 5 and 6: error of the steady speed and current on 24 V against the load torques, %."""
-    (speed, current), (found_speed, found_current) = _steady(PRINTED), _steady(motor)
+    (speed, current), (found_speed, found_current) = _steady_state(PRINTED), _steady_state(motor)
     return 100 * (found_speed / speed - 1), 100 * (found_current / current - 1)
 
 
-def _steady(motor: Motor) -> tuple[np.ndarray, np.ndarray]:
+def _steady_state(motor: Motor) -> tuple[np.ndarray, np.ndarray]:
     R, Kb, Kt, f = (float(getattr(motor, name)) for name in ("R", "Kb", "Kt", "f"))
     speed = (Kt * VOLTAGE - R * LOADS) / (R * f + Kt * Kb)
     return speed, (f * speed + LOADS) / Kt
 
 
-def both_steps(tuning: Tuning) -> Response:
+def step_up_and_down(tuning: Tuning) -> Response:
     """0 to 481 rad/s, and a fifth of a second later on to 240.5."""
     from .control.loop import Course, Response, closed_loop_jit
 
     with jax.enable_x64(True):
         samples = 200
-        reference = jax.numpy.repeat(jax.numpy.asarray([SETPOINT, LOWER]), samples)
+        reference = jax.numpy.repeat(jax.numpy.asarray([SETPOINT, LOWER_SETPOINT]), samples)
         course = Course(reference, 0.0 * reference, 0.0 * reference)
         response = closed_loop_jit(tuning.motor, tuning.law, course, 4)
         return Response(*(np.asarray(x) for x in response))
@@ -203,7 +203,7 @@ def simulated_as_printed(proportional: float, integral: float, derivative: float
 
     from .control.metrics import step_metrics
 
-    s, lag = np.poly1d([1.0, 0.0]), FILTER * derivative / proportional
+    s, lag = np.poly1d([1.0, 0.0]), FILTER_RATIO * derivative / proportional
     above = (proportional * s + integral) * (lag * s + 1) + derivative * s * s
     below = s * (lag * s + 1)
     with jax.enable_x64(True):
@@ -213,7 +213,7 @@ def simulated_as_printed(proportional: float, integral: float, derivative: float
     closed = below * poles + above * plant
     samples, step = 4000, 1e-4
     time = step * np.arange(samples)
-    reference = np.where(time < 0.5 * samples * step, SETPOINT, LOWER)
+    reference = np.where(time < 0.5 * samples * step, SETPOINT, LOWER_SETPOINT)
     _, speed, _ = lsim(((above * plant).coeffs, closed.coeffs), reference, time, interp=False)
     _, voltage, _ = lsim(((above * poles).coeffs, closed.coeffs), reference, time, interp=False)
     first = slice(0, samples // 2)

@@ -29,7 +29,7 @@ from pmdc_jax.report.diagnosis_figures import averages
 from pmdc_jax.report.diagnosis_tables import diagnosis_tables
 from pmdc_jax.report.experiment import write_experiment
 from pmdc_jax.report.json import diagnosis_json
-from pmdc_jax.report.verdict import drifts, stretch, verdict_sentences
+from pmdc_jax.report.verdict import drifts, intervals_in_words, verdict_sentences
 
 STRIBECK = {
     "coulomb_Nm": Estimate(0.0612, 4e-4, (0.0604, 0.0620), "N m", "identified"),
@@ -199,7 +199,7 @@ def test_hold_outs_tell_what_fitted_runs_do_not(after, beyond):
     ],
 )
 def test_stretches_in_words(variable, intervals, reach, told):
-    assert stretch(variable, intervals, reach).replace(notation.NARROW, " ") == told
+    assert intervals_in_words(variable, intervals, reach).replace(notation.NARROW, " ") == told
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
@@ -208,8 +208,8 @@ def test_every_effect_has_words_without_units(effect):
         told = notation.parameter_words(effect, field)
         assert "_" not in told
         assert not re.search(r"\d|Nm\b|\bper\b|\brad\b|\bs$|\bV$|\bA$", told), told
-        assert notation.amount(0.00123, about.unit)
-        assert "m1" not in notation.amount(0.00123, about.unit)
+        assert notation.value_with_unit(0.00123, about.unit)
+        assert "m1" not in notation.value_with_unit(0.00123, about.unit)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from pmdc_jax.paper import paper
-from pmdc_jax.wheelchair import FILTER, SETPOINT, TABLE_1, TABLE_2, simulated_as_printed
+from pmdc_jax.wheelchair import FILTER_RATIO, SETPOINT, TABLE_1, TABLE_2, simulated_as_printed
 
 
 @pytest.mark.parametrize("kind", ["pi", "pid"])
 def test_printed_gains_do_what_python_control_says(kind):
     R, L, Kb, Kt, J, f = TABLE_1.values()
     proportional, integral, derivative = TABLE_2[kind].gains
-    s, lag = control.tf("s"), FILTER * derivative / proportional
+    s, lag = control.tf("s"), FILTER_RATIO * derivative / proportional
     motor = Kt / ((L * s + R) * (J * s + f) + Kt * Kb)
     law = proportional + integral / s + derivative * s / (lag * s + 1)
     loop = control.feedback(law * motor)

@@ -8,42 +8,43 @@ from typing import Any
 from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, LearnedCurve, NextExperiment, Region
 from ..effects import EFFECTS
 from .diagnosis_figures import (
-    AXES,
-    against_figure,
+    AXIS_TITLES,
     curve_figure,
     experiment_figure,
     gap_figure,
     residual_figure,
+    residual_over_variable_figure,
     where_figure,
 )
 from .figures import points_per_trace
 from .identification import identification_content
 from .notation import (
-    amount,
-    chance,
+    effect_words,
     enumerate_words,
     field_words,
     fixed,
+    p_value_words,
     parameter_words,
     percent,
     significant,
-    words_of,
+    value_with_unit,
     write_estimate,
 )
 from .page import figure_json, write_page
 from .summary import role_word, runs_in_order
 from .verdict import (
     VERDICTS,
+    detectable_others,
+    drift_words,
     drifts,
-    moved,
-    role_that_counts,
-    stretch,
+    intervals_in_words,
+    judged_role,
     verdict_sentences,
-    would_be_seen,
 )
 
 # traces that a run has in the picture of its residuals, and in that of its simulation
-OF_RESIDUALS, OF_SIMULATION = 4, 7
+TRACES_OF_RESIDUALS = 4
+TRACES_OF_SIMULATION = 7
 
 
 def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
@@ -62,24 +63,23 @@ def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
         gaps=_gaps(diagnosis),
         gap_figure=figure_json(gap_figure(_gap_by_run(diagnosis))),
         residuals=_residuals(diagnosis),
-        against=_against(diagnosis),
+        against=_residual_over_variable(diagnosis),
         curves=[_curve(curve) for curve in diagnosis.curves],
         drifts=_drifts(diagnosis),
         detectable=_detectable(diagnosis),
-        **identification_content(diagnosis.final, OF_RESIDUALS * len(diagnosis.final.fit)),
+        **identification_content(diagnosis.final, TRACES_OF_RESIDUALS * len(diagnosis.final.fit)),
     )
 
 
 def _tiles(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     """Label, number and small print of the figures worth knowing first."""
-    role = role_that_counts(diagnosis)
+    role = judged_role(diagnosis)
     gap = diagnosis.gap[role]
     error = significant(gap.before)
     if diagnosis.effects:
         error += f" → {significant(gap.after)}"
-    tiles = [
-        ("Verdict", VERDICTS[diagnosis.verdict], f"nothing missing: {chance(diagnosis.p_nothing)}")
-    ]
+    chance = p_value_words(diagnosis.p_nothing)
+    tiles = [("Verdict", VERDICTS[diagnosis.verdict], f"nothing missing: {chance}")]
     tiles.append((f"{role_word(role).capitalize()} error", error, "times the noise"))
     if diagnosis.effects and diagnosis.closed_fraction is not None:
         tiles.append(("Gap closed", percent(100 * diagnosis.closed_fraction), ""))
@@ -98,14 +98,14 @@ def _effect(effect: EffectFound) -> dict[str, Any]:
         "formula": kind.formula,
         "equation": effect.equation,
         "parameters": parameters,
-        "chance": chance(effect.p_value),
+        "chance": p_value_words(effect.p_value),
     }
 
 
 def _rivals(diagnosis: Diagnosis) -> list[str]:
     """The other sets that would do as well, in words."""
     rivals = dict.fromkeys(r for effect in diagnosis.effects for r in effect.also_possible)
-    return [enumerate_words([words_of(name) for name in one.split(" + ")]) for one in rivals]
+    return [enumerate_words([effect_words(name) for name in one.split(" + ")]) for one in rivals]
 
 
 def _experiment(experiment: NextExperiment | None) -> dict[str, Any] | None:
@@ -129,7 +129,7 @@ def _region(region: Region) -> dict[str, str]:
     return {
         "equation": region.equation,
         "variable": region.variable,
-        "where": stretch(region.variable, [region.region]),
+        "where": intervals_in_words(region.variable, [region.region]),
         "z": fixed(region.z, 1),
     }
 
@@ -157,7 +157,7 @@ def _residuals(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     if not diagnosis.effects:
         return []
     runs = runs_in_order(diagnosis.final)
-    points = points_per_trace((OF_RESIDUALS + OF_SIMULATION) * len(runs))
+    points = points_per_trace((TRACES_OF_RESIDUALS + TRACES_OF_SIMULATION) * len(runs))
     figures = {
         name: residual_figure(diagnosis.base.fit[name], fit, diagnosis.final.noise, points)
         for name, fit in runs
@@ -165,13 +165,13 @@ def _residuals(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     return [{"run": name, "figure": figure_json(one)} for name, one in figures.items() if one]
 
 
-def _against(diagnosis: Diagnosis) -> dict[str, Any] | None:
+def _residual_over_variable(diagnosis: Diagnosis) -> dict[str, Any] | None:
     """The residual over the variable in which the plain motor was most clearly off."""
-    equation, variable = _gave_away(diagnosis)
+    equation, variable = _clearest_misfit(diagnosis)
     wanted = "current" if equation == "electrical" else "speed"
     for channel in (wanted, "speed", "current"):
         fits = diagnosis.base.fit, diagnosis.final.fit
-        figure = against_figure(*fits, variable, channel)
+        figure = residual_over_variable_figure(*fits, variable, channel)
         if figure:
             return {
                 "variable": variable,
@@ -181,7 +181,7 @@ def _against(diagnosis: Diagnosis) -> dict[str, Any] | None:
     return None
 
 
-def _gave_away(diagnosis: Diagnosis) -> tuple[str, str]:
+def _clearest_misfit(diagnosis: Diagnosis) -> tuple[str, str]:
     """The equation and the variable of the clearest misfit."""
     if diagnosis.where:
         return diagnosis.where[0].equation, diagnosis.where[0].variable
@@ -192,8 +192,8 @@ def _gave_away(diagnosis: Diagnosis) -> tuple[str, str]:
 def _curve(curve: LearnedCurve) -> dict[str, Any]:
     return {
         "title": f"{'friction' if curve.reverses else curve.equation + ' equation'} over"
-        f" {AXES.get(curve.variable, curve.variable)}",
-        "chance": chance(curve.p_value),
+        f" {AXIS_TITLES.get(curve.variable, curve.variable)}",
+        "chance": p_value_words(curve.p_value),
         "figure": figure_json(curve_figure(curve)),
     }
 
@@ -204,7 +204,7 @@ def _drifts(diagnosis: Diagnosis) -> list[dict[str, Any]]:
             "name": one.name,
             "before": write_estimate(one.before),
             "after": write_estimate(one.after),
-            "moved": moved(one),
+            "moved": drift_words(one),
         }
         for one in (drifts(diagnosis) if diagnosis.effects else ())
     ]
@@ -212,6 +212,6 @@ def _drifts(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 def _detectable(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     return [
-        (parameter_words(one.effect, one.parameter), amount(one.amplitude, one.unit, 2))
-        for one in would_be_seen(diagnosis)
+        (parameter_words(one.effect, one.parameter), value_with_unit(one.amplitude, one.unit, 2))
+        for one in detectable_others(diagnosis)
     ]

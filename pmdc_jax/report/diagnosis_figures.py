@@ -22,17 +22,20 @@ from .figures import (
     style,
 )
 
-BEFORE, AFTER = RESIDUAL, SIMULATED
-AXES = {
+# colours: without the effects, and with them
+BEFORE = RESIDUAL
+AFTER = SIMULATED
+AXIS_TITLES = {
     "speed": "speed [rad/s]",
     "current": "current [A]",
     "voltage": "voltage [V]",
     "angle": "angle [rad]",
     "time": "share of a run",
 }
+# of equally many samples, over which residuals are averaged
 BINS = 30
-# ratio of the gaps from which on bars need a logarithmic axis
-FAR = 20.0
+# gap, in times the noise, from which on the bars need a logarithmic axis
+LOGARITHMIC_FROM = 20.0
 
 
 def where_figure(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> go.Figure:
@@ -58,7 +61,7 @@ def where_figure(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> go.Fi
                 name=f"z = {one.z:.1f}",
             )
             figure.add_trace(block, row=row, col=1)
-        axis = {"title_text": AXES.get(kind[1], kind[1]), "range": _range(fits, kind[1])}
+        axis = {"title_text": AXIS_TITLES.get(kind[1], kind[1]), "range": _range(fits, kind[1])}
         figure.update_xaxes(**axis, row=row, col=1)
         figure.update_yaxes(title_text="z", row=row, col=1)
     style(figure, height=60 + 210 * len(kinds))
@@ -83,8 +86,8 @@ def gap_figure(gaps: Mapping[str, Gap]) -> go.Figure:
     )
     figure.add_trace(floor)
     style(figure, height=340)
-    far = max(gap.before for gap in gaps.values()) > FAR
-    figure.update_yaxes(title_text="error over the noise", type="log" if far else "linear")
+    wide = max(gap.before for gap in gaps.values()) > LOGARITHMIC_FROM
+    figure.update_yaxes(title_text="error over the noise", type="log" if wide else "linear")
     figure.update_xaxes(type="category")
     return figure
 
@@ -116,7 +119,7 @@ def residual_figure(
     return figure
 
 
-def against_figure(
+def residual_over_variable_figure(
     before: Mapping[str, RunFit], after: Mapping[str, RunFit], variable: str, channel: str
 ) -> go.Figure | None:
     """The residual of all runs, averaged over stretches of a variable, before and after."""
@@ -129,7 +132,7 @@ def against_figure(
         trace = go.Scatter(x=averaged[0], y=averaged[1], name=name, mode="lines+markers", line=line)
         figure.add_trace(trace)
     style(figure, height=320)
-    figure.update_xaxes(title_text=AXES.get(variable, variable))
+    figure.update_xaxes(title_text=AXIS_TITLES.get(variable, variable))
     figure.update_yaxes(
         title_text=f"mean {RESIDUALS[channel][0]}", zeroline=True, zerolinecolor=INK
     )
@@ -171,7 +174,7 @@ def curve_figure(curve: LearnedCurve) -> go.Figure:
         go.Scatter(x=curve.x, y=curve.value, mode="lines+markers", line=line, name="learned")
     )
     style(figure, height=300)
-    figure.update_xaxes(title_text=AXES.get(curve.variable, curve.variable))
+    figure.update_xaxes(title_text=AXIS_TITLES.get(curve.variable, curve.variable))
     torque = "friction [N·m]" if curve.reverses else "torque [N·m]"
     kind = torque if curve.unit == "N m" else f"voltage [{curve.unit}]"
     figure.update_yaxes(title_text=kind, zeroline=True, zerolinecolor=INK)

@@ -7,10 +7,17 @@ from rich.table import Table
 from rich.text import Text
 
 from ..diagnose.diagnosis import Diagnosis
-from .notation import amount, chance, field_words, significant, words_of, write_estimate
+from .notation import (
+    effect_words,
+    field_words,
+    p_value_words,
+    significant,
+    value_with_unit,
+    write_estimate,
+)
 from .summary import role_word, runs_in_order
 from .terminal import parameter_table, plain_table, print_tables, status_text
-from .verdict import drifts, moved, verdict_sentences, would_be_seen
+from .verdict import detectable_others, drift_words, drifts, verdict_sentences
 
 
 def print_diagnosis(diagnosis: Diagnosis) -> None:
@@ -35,9 +42,9 @@ def _effects(diagnosis: Diagnosis) -> Table:
         for number, (field, estimate) in enumerate(effect.parameters.items()):
             first = number == 0
             written = write_estimate(estimate)
-            name = words_of(effect.name) if first else ""
+            name = effect_words(effect.name) if first else ""
             numbers = (written.value, written.unit, written.stderr, written.interval)
-            probability = chance(effect.p_value).removeprefix("p ").removeprefix("= ")
+            probability = p_value_words(effect.p_value).removeprefix("p ").removeprefix("= ")
             end = probability if first else ""
             rows.append((name, field_words(effect.name, field), *numbers, end))
     return plain_table("Missing", headings, rows, left=(0, 1, 3), first_wraps="ellipsis")
@@ -51,7 +58,7 @@ def _parameters(diagnosis: Diagnosis) -> Table:
     for one in drifts(diagnosis):
         before, after = write_estimate(one.before), write_estimate(one.after)
         numbers = (before.value, before.unit, after.value, after.unit, after.stderr)
-        rows.append((one.name, *numbers, moved(one), status_text(one.after)))
+        rows.append((one.name, *numbers, drift_words(one), status_text(one.after)))
     return plain_table("Parameters", headings, rows, left=(0, 2, 4, 7), first_wraps="ellipsis")
 
 
@@ -69,9 +76,9 @@ def _gaps(diagnosis: Diagnosis) -> Table:
 
 def _detectable(diagnosis: Diagnosis) -> Table:
     rows = []
-    for one in would_be_seen(diagnosis):
-        names = (words_of(one.effect), field_words(one.effect, one.parameter))
-        rows.append((*names, amount(one.amplitude, one.unit, 2)))
+    for one in detectable_others(diagnosis):
+        names = (effect_words(one.effect), field_words(one.effect, one.parameter))
+        rows.append((*names, value_with_unit(one.amplitude, one.unit, 2)))
     headings = ("Effect", "Parameter", "From")
     return plain_table(
         "Would have been seen nine times of ten",

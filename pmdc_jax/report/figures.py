@@ -12,8 +12,14 @@ from plotly.subplots import make_subplots
 from ..identify.identification import RunFit, Search
 from .notation import fixed
 
-MEASURED, SIMULATED, RESIDUAL, INPUT = "#a3b0c0", "#0b5fcc", "#c9702b", "#4b5563"
-INK, GRID, EDGE = "#27313f", "#e6e9ee", "#c3cad4"
+# colours
+MEASURED = "#a3b0c0"
+SIMULATED = "#0b5fcc"
+RESIDUAL = "#c9702b"
+INPUT = "#4b5563"
+INK = "#27313f"
+GRID = "#e6e9ee"
+EDGE = "#c3cad4"
 DASHED = {"color": INK, "width": 1, "dash": "4px 3px"}
 FONT = "Inter, system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 # axis title of a residual, and the key of its noise
@@ -21,7 +27,7 @@ RESIDUALS = {
     "speed": ("Δ speed<br>[rad/s]", "speed_rad_s"),
     "current": ("Δ current<br>[A]", "current_A"),
 }
-BUTTONS = ["toImage", "zoom2d", "pan2d", "resetScale2d"]
+MODEBAR_BUTTONS = ["toImage", "zoom2d", "pan2d", "resetScale2d"]
 POINTS_PER_TRACE = 4000
 POINTS_PER_PAGE = 90_000  # about one megabyte as base64: the page stays under 6 MB with plotly.js
 
@@ -118,7 +124,7 @@ def correlation_figure(correlation: np.ndarray, names: Sequence[str]) -> go.Figu
     style(figure, height=60 + 52 * len(names))
     figure.update_yaxes(autorange="reversed", showgrid=False, showline=False, ticks="")
     figure.update_xaxes(showgrid=False, showline=False, ticks="", side="top")
-    figure.update_layout(margin={"t": 30, "l": 40, "b": 10}, modebar={"remove": BUTTONS})
+    figure.update_layout(margin={"t": 30, "l": 40, "b": 10}, modebar={"remove": MODEBAR_BUTTONS})
     return figure
 
 
@@ -229,7 +235,7 @@ def _positive(values: np.ndarray) -> np.ndarray:
 
 AXIS = {"gridcolor": GRID, "zeroline": False, "linecolor": EDGE, "title": {"font": {"size": 12}}}
 # in place of plotly's own, which would add 7 kB to every figure
-LOOK = go.layout.Template(
+TEMPLATE = go.layout.Template(
     layout={
         "margin": {"l": 62, "r": 12, "t": 34, "b": 44},
         "paper_bgcolor": "rgba(0,0,0,0)",
@@ -246,4 +252,4 @@ LOOK = go.layout.Template(
 
 def style(figure: go.Figure, height: int) -> None:
     """The look that every figure has."""
-    figure.update_layout(template=LOOK, height=height)
+    figure.update_layout(template=TEMPLATE, height=height)

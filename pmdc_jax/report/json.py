@@ -139,7 +139,7 @@ def _plain(value: Any) -> Any:
     """
     if isinstance(value, dict):
         return {
-            str(key): None if key == "ci95" and _open(item) else _plain(item)
+            str(key): None if key == "ci95" and _has_unknown_end(item) else _plain(item)
             for key, item in value.items()
         }
     if hasattr(value, "tolist"):
@@ -153,5 +153,5 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
-def _open(interval: Any) -> bool:
+def _has_unknown_end(interval: Any) -> bool:
     return interval is not None and not all(isfinite(float(end)) for end in interval)

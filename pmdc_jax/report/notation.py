@@ -63,7 +63,7 @@ def significant(value: float | None, digits: int = 3) -> str:
     return fixed(value, max(0, digits - 1 - _magnitude(value)))
 
 
-def amount(value: float, unit: str, digits: int = 3) -> str:
+def value_with_unit(value: float, unit: str, digits: int = 3) -> str:
     """A number with its unit, (0.00321, "N m") as "3.21 mN·m"."""
     exponent = engineering_exponent(value, unit)
     scaled = significant(value / 10.0**exponent, digits)
@@ -116,7 +116,7 @@ def fixed(value: float | None, decimals: int) -> str:
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
-def words_of(effect: str) -> str:
+def effect_words(effect: str) -> str:
     """An effect in running text: "Coulomb friction", "dead zone of the input"."""
     label = EFFECTS[effect].label
     named_after_someone = label.startswith(("Coulomb", "Stribeck"))
@@ -134,10 +134,10 @@ def field_words(effect: str, field: str) -> str:
 
 def parameter_words(effect: str, field: str) -> str:
     """ "Stribeck friction, static"."""
-    return f"{words_of(effect)}, {field_words(effect, field)}"
+    return f"{effect_words(effect)}, {field_words(effect, field)}"
 
 
-def chance(p_value: float) -> str:
+def p_value_words(p_value: float) -> str:
     """ "p < 0.001" or "p = 0.21"."""
     return "p < 0.001" if p_value < 1e-3 else f"p = {significant(p_value, 2)}"
 

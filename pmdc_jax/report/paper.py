@@ -13,11 +13,11 @@ from rich.text import Text
 
 from ..motor import PARAMETERS
 from ..wheelchair import (
-    ENOUGH,
     LOADS,
-    LOWER,
+    LOWER_SETPOINT,
     PRINTED,
     SETPOINT,
+    SUFFICIENT_VOLTAGE,
     TABLE_2,
     VOLTAGE,
     Paper,
@@ -47,12 +47,12 @@ def table_1(paper: Paper) -> tuple[list[str], list[list[str]]]:
                 significant(one.errors[name], 2),
             ]
         rows.append(row)
-    rows.append(_effort("evaluations", paper, lambda one: thousands(one.evaluations)))
-    rows.append(_effort("seconds", paper, lambda one: f"{one.seconds:.1f}"))
+    rows.append(_effort_row("evaluations", paper, lambda one: thousands(one.evaluations)))
+    rows.append(_effort_row("seconds", paper, lambda one: f"{one.seconds:.1f}"))
     return headings, rows
 
 
-def _effort(name: str, paper: Paper, shown) -> list[str]:
+def _effort_row(name: str, paper: Paper, shown) -> list[str]:
     row = [name, ""]
     for one in paper.recovered:
         row += [shown(one), ""]
@@ -65,14 +65,14 @@ def table_2(paper: Paper) -> tuple[list[str], list[list[str]]]:
         "",
         "Printed",
         "Simulated\nas printed",
-        f"Ours,\n{ENOUGH:g} V",
-        f"Limit,\n{ENOUGH:g} V",
+        f"Ours,\n{SUFFICIENT_VOLTAGE:g} V",
+        f"Limit,\n{SUFFICIENT_VOLTAGE:g} V",
         f"Limit,\n{VOLTAGE:g} V",
     ]
     rows = []
     for kind, printed in TABLE_2.items():
         ours, simulated = paper.tunings[kind].metrics, paper.as_printed.get(kind)
-        limits = (paper.fastest[ENOUGH], paper.fastest[VOLTAGE])
+        limits = (paper.fastest[SUFFICIENT_VOLTAGE], paper.fastest[VOLTAGE])
         rows.append(
             [
                 f"{TITLES[kind]}, settling [s]",
@@ -101,7 +101,7 @@ def remarks(paper: Paper) -> list[str]:
         f"{VOLTAGE:g} V holds {paper.reach:.1f} rad/s: the set point of {SETPOINT:g} rad/s is beyond it, for any"
         " controller.",
         f"From rest, flat out, {VOLTAGE:g} V enters the 2 % band after {paper.fastest[VOLTAGE]:.4f} s; the printed"
-        f" 0.08 s takes {ENOUGH:g} V ({paper.fastest[ENOUGH]:.4f} s).",
+        f" 0.08 s takes {SUFFICIENT_VOLTAGE:g} V ({paper.fastest[SUFFICIENT_VOLTAGE]:.4f} s).",
         *_printed_remarks(paper),
         "Equation (8) prints +R/L where equation (5) gives -R/L, and multiplies the load column by u.",
         "Kt and Kb are one constant in SI; the paper has 0.0501 and 0.0492.",
@@ -167,11 +167,12 @@ def _as_printed(paper: Paper, kind: str) -> dict[str, float] | None:
 
 def write_paper(paper: Paper, path: str | Path) -> None:
     """Write everything to one self-contained HTML file."""
+    steps = f"0 to {SETPOINT:g}, then to {LOWER_SETPOINT:g} rad/s"
     figures = [
         ("Fig. 4", "Best fitness against generations", fitness_figure(paper.recovered)),
         ("Fig. 5", "Error of the steady speed against load torque", errors_figure(paper, 0)),
         ("Fig. 6", "Error of the steady current against load torque", errors_figure(paper, 1)),
-        ("Figs 7 and 8", f"0 to {SETPOINT:g}, then to {LOWER:g} rad/s", steps_figure(paper)),
+        ("Figs 7 and 8", steps, steps_figure(paper)),
     ]
     tables = [
         ("Table 1", "The motor, from a virtual load test", *table_1(paper)),
@@ -234,7 +235,7 @@ def steps_figure(paper: Paper) -> go.Figure:
             thin = {"color": colour, "width": 1.2, "dash": "dot"}
             shared |= {"x": 1e3 * printed.time, "name": f"{TITLES[kind]}, printed gains"}
             figure.add_trace(go.Scatter(**shared, y=printed.speed, line=thin), row=1, col=1)
-    for level in (SETPOINT, LOWER):
+    for level in (SETPOINT, LOWER_SETPOINT):
         line = {"color": MEASURED, "width": 1, "dash": "dash"}
         # plotly's annotation of `row` knows only "all"
         figure.add_hline(y=level, line=line, row=1)  # pyright: ignore[reportArgumentType]

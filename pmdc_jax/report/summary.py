@@ -15,9 +15,9 @@ STATUS_WORDS = {
     "known": "known",
     "not_identifiable": "not identifiable",
 }
-PRESUMED = "All errors presume that the motor has nothing that the model lacks: `pmdc diagnose` tests that."
+MODEL_ASSUMPTION = "All errors presume that the motor has nothing that the model lacks: `pmdc diagnose` tests that."
 # a residual up to this multiple of the noise is called noise: RMS of few samples scatter as much
-NOISE_LEVEL = 1.25
+MAX_NOISE_RATIO = 1.25
 
 
 def status_word(status: str) -> str:
@@ -32,11 +32,12 @@ def role_word(role: Role) -> str:
 
 def summary(identification: Identification) -> list[str]:
     """The sentences at the top of the report, the most important first."""
-    sentences = [_found(identification), _held_out(identification), *cautions(identification)]
+    sentences = [_identified_sentence(identification), _holdout_sentence(identification)]
+    sentences += cautions(identification)
     # where the fit misses much, a message has said so already
     told = any("pmdc diagnose" in message for message in identification.messages)
     if _with_status(identification, "identified") and not told:
-        sentences.append(PRESUMED)
+        sentences.append(MODEL_ASSUMPTION)
     return sentences
 
 
@@ -62,7 +63,7 @@ def runs_in_order(identification: Identification) -> list[tuple[str, RunFit]]:
     return sorted(identification.fit.items(), key=lambda item: item[1].role != "holdout")
 
 
-def _found(identification: Identification) -> str:
+def _identified_sentence(identification: Identification) -> str:
     parameters = identification.parameters
     identified = _with_status(identification, "identified")
     open_ones = _with_status(identification, "not_identifiable")
@@ -75,11 +76,11 @@ def _found(identification: Identification) -> str:
     else:
         verb = "were" if len(identified) > 1 else "was"
         found = f"{enumerate_words(identified)} {verb} identified {source}"
-    found += _precision({name: parameters[name] for name in identified})
+    found += _precision_clause({name: parameters[name] for name in identified})
     return f"{found}; {enumerate_words(open_ones)} could not be." if open_ones else f"{found}."
 
 
-def _precision(estimates: dict[str, Estimate]) -> str:
+def _precision_clause(estimates: dict[str, Estimate]) -> str:
     errors = {
         name: 100 * estimate.stderr / abs(estimate.value)
         for name, estimate in estimates.items()
@@ -96,7 +97,7 @@ def _precision(estimates: dict[str, Estimate]) -> str:
     )
 
 
-def _held_out(identification: Identification) -> str:
+def _holdout_sentence(identification: Identification) -> str:
     held_out = {name: fit for name, fit in runs_in_order(identification) if fit.role == "holdout"}
     if not held_out:
         return (
@@ -116,7 +117,7 @@ def _held_out(identification: Identification) -> str:
     excess = [
         f"the {one.quantity} misses by {one.rmse / one.noise:.1f} times the measurement noise"
         for one in channels
-        if one.noise and one.rmse > NOISE_LEVEL * one.noise
+        if one.noise and one.rmse > MAX_NOISE_RATIO * one.noise
     ]
     sentence = f"{who} is reproduced in free-run simulation, {enumerate_words(reproduced)}"
     if not any(one.noise for one in channels):

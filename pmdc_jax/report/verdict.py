@@ -18,13 +18,13 @@ from ..diagnose.diagnosis import (
 from ..diagnose.effect_relations import CONTAINS
 from ..identify.identification import Estimate, Role, RunFit
 from .notation import (
-    amount,
-    chance,
+    effect_words,
     enumerate_words,
     field_words,
+    p_value_words,
     percent,
     significant,
-    words_of,
+    value_with_unit,
     write_estimate,
 )
 from .summary import as_sentence, cautions, role_word
@@ -42,10 +42,10 @@ VARIABLE_UNITS = {
     "angle": "rad",
     "frequency": "Hz",
 }
-# a parameter that moved by less is not worth a sentence, in per cent
-NOTEWORTHY = 1.0
+# %, a parameter that moved by less is not worth a sentence
+MIN_DRIFT = 1.0
 # ends of both directions closer than this ratio are told as one
-ALIKE = 2.0
+MAX_END_RATIO = 2.0
 
 Interval = tuple[float, float]
 
@@ -60,45 +60,46 @@ def verdict_sentences(diagnosis: Diagnosis) -> list[str]:
     }
     sentences = tell[diagnosis.verdict](diagnosis)
     if diagnosis.effects:
-        sentences += [_gap(diagnosis), _moved(diagnosis)]
+        sentences += [_gap_sentence(diagnosis), _drift_sentence(diagnosis)]
     return [sentence for sentence in sentences if sentence] + cautions(diagnosis.final)
 
 
 def _none_detected(diagnosis: Diagnosis) -> list[str]:
     return [
         "No missing effect was detected: what simulation and measurement differ by is no more than"
-        f" noise may do ({chance(diagnosis.p_nothing)}).",
-        _would_have_been_seen("", diagnosis),
+        f" noise may do ({p_value_words(diagnosis.p_nothing)}).",
+        _detectable_sentence("", diagnosis),
     ]
 
 
 def _named(diagnosis: Diagnosis) -> list[str]:
     return [
-        _disagreement(diagnosis),
-        f"Missing: {_found(diagnosis)}. Added.",
-        _would_have_been_seen("These runs call for nothing else in the library: ", diagnosis),
+        _disagreement_sentence(diagnosis),
+        f"Missing: {_effects_in_words(diagnosis)}. Added.",
+        _detectable_sentence("These runs call for nothing else in the library: ", diagnosis),
     ]
 
 
 def _ambiguous(diagnosis: Diagnosis) -> list[str]:
     names = [effect.name for effect in diagnosis.effects]
     sets = [names, *(rival.split(" + ") for rival in _rivals(diagnosis))]
-    either = " or ".join(enumerate_words([words_of(name) for name in one]) for one in sets)
+    either = " or ".join(enumerate_words([effect_words(name) for name in one]) for one in sets)
     return [
-        _disagreement(diagnosis),
+        _disagreement_sentence(diagnosis),
         f"These runs cannot tell what is missing: {either} would explain them equally well.",
-        f"Added, as the one that fits best: {_found(diagnosis)}.",
-        _next(diagnosis),
+        f"Added, as the one that fits best: {_effects_in_words(diagnosis)}.",
+        _experiment_sentence(diagnosis),
     ]
 
 
 def _not_in_library(diagnosis: Diagnosis) -> list[str]:
-    sentences = [_disagreement(diagnosis)]
+    sentences = [_disagreement_sentence(diagnosis)]
     if diagnosis.effects:
         rest = (
             "" if unlike_held_out(diagnosis.gap) else "; what is left is no effect of the library"
         )
-        sentences.append(f"{_capital(_found(diagnosis))} explains part of it and was added{rest}.")
+        found = _capitalised(_effects_in_words(diagnosis))
+        sentences.append(f"{found} explains part of it and was added{rest}.")
     else:
         sentences.append("Something is missing that no effect of the library explains.")
     if diagnosis.curves:
@@ -107,10 +108,11 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
         peak = int(np.argmax(np.abs(curve.value) / np.where(known, curve.stderr, np.inf)))
         torque = "friction" if curve.reverses else "torque opposing motion"
         kind = torque if curve.unit == "N m" else "voltage at the terminals"
+        value = value_with_unit(curve.value[peak], curve.unit)
         sentences.append(
-            f"Drawn by the data it looks most like a {kind} over {curve.variable}, clearest"
-            f" with {amount(curve.value[peak], curve.unit)} {place(curve.variable, curve.x[peak])}"
-            f" ({chance(curve.p_value)})."
+            f"Drawn by the data it looks most like a {kind} over {curve.variable}, clearest with"
+            f" {value} {place_in_words(curve.variable, curve.x[peak])}"
+            f" ({p_value_words(curve.p_value)})."
         )
     if beyond := diagnosis.beyond_fitted:
         sentences.append(
@@ -130,14 +132,18 @@ def disagreement(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> str:
     if not regions:
         return "by more than noise"
     clearest = regions[0]
-    alike = [r.region for r in regions if _kind(r) == _kind(clearest)]
-    reach = _reach(clearest.variable, fits)
-    return f"in the {clearest.equation} equation, {stretch(clearest.variable, alike, reach)}"
+    kind = _equation_and_variable(clearest)
+    alike = [region.region for region in regions if _equation_and_variable(region) == kind]
+    largest = _largest_size(clearest.variable, fits)
+    where = intervals_in_words(clearest.variable, alike, largest)
+    return f"in the {clearest.equation} equation, {where}"
 
 
-def stretch(variable: str, intervals: Sequence[Interval], reach: float | None = None) -> str:
-    """Intervals of one variable in words; `reach` is the largest size the runs have of it, but for a few samples."""
-    joined = _joined(intervals)
+def intervals_in_words(
+    variable: str, intervals: Sequence[Interval], largest: float | None = None
+) -> str:
+    """Intervals of one variable in words; `largest` is the largest size the runs have of it, but for a few samples."""
+    joined = _merged(intervals)
     if variable == "time":
         parts = [f"{percent(100 * low)} to {percent(100 * high)}" for low, high in joined]
         return f"from {enumerate_words(parts)} of a run"
@@ -151,13 +157,13 @@ def stretch(variable: str, intervals: Sequence[Interval], reach: float | None = 
     size = f"from {significant(low)} to {significant(high)} {unit}"
     if low == 0:
         size = f"below {significant(high)} {unit}"
-    if reach is not None and low == 0 and high > 0.95 * reach:
+    if largest is not None and low == 0 and high > 0.95 * largest:
         return f"at every {variable}, in both directions"
     named = "" if variable == "speed" else f"at a {variable} "
     return f"{named}{size}, in both directions"
 
 
-def _joined(intervals: Sequence[Interval]) -> list[Interval]:
+def _merged(intervals: Sequence[Interval]) -> list[Interval]:
     """Intervals in order, those that touch made one."""
     joined: list[Interval] = []
     for low, high in sorted(intervals):
@@ -174,55 +180,56 @@ def _symmetric(intervals: Sequence[Interval]) -> Interval | None:
     backward = [(max(-high, 0.0), -low) for low, high in intervals if low < 0]
     if not (forward and backward):
         return None
-    (nearest, farthest) = zip(*(_hull(side) for side in (forward, backward)), strict=True)
-    if max(farthest) > ALIKE * min(farthest):
+    (nearest, farthest) = zip(*(_ends(side) for side in (forward, backward)), strict=True)
+    if max(farthest) > MAX_END_RATIO * min(farthest):
         return None
     return min(nearest), max(farthest)
 
 
-def _hull(intervals: Sequence[Interval]) -> Interval:
+def _ends(intervals: Sequence[Interval]) -> Interval:
     lows, highs = zip(*intervals, strict=True)
     return min(lows), max(highs)
 
 
-def _reach(variable: str, fits: Mapping[str, RunFit]) -> float | None:
+def _largest_size(variable: str, fits: Mapping[str, RunFit]) -> float | None:
     values = [getattr(fit, variable, None) for fit in fits.values()]
     # the knots of the curves reach as far
     sizes = [np.nanquantile(np.abs(one), 0.999) for one in values if one is not None and len(one)]
     return float(max(sizes)) if sizes else None
 
 
-def _kind(region: Region) -> tuple[str, str]:
+def _equation_and_variable(region: Region) -> tuple[str, str]:
     return region.equation, region.variable
 
 
-def _disagreement(diagnosis: Diagnosis) -> str:
+def _disagreement_sentence(diagnosis: Diagnosis) -> str:
     where = disagreement(diagnosis.where, diagnosis.base.fit)
     return f"Simulation and measurement disagree {where}."
 
 
-def _found(diagnosis: Diagnosis) -> str:
-    return enumerate_words([_effect(effect) for effect in diagnosis.effects])
+def _effects_in_words(diagnosis: Diagnosis) -> str:
+    return enumerate_words([_effect_in_words(effect) for effect in diagnosis.effects])
 
 
-def _effect(effect: EffectFound) -> str:
+def _effect_in_words(effect: EffectFound) -> str:
     """ "Stribeck friction (coulomb 61 mN·m, static 148 mN·m, speed 11 rad/s; p < 0.001)"."""
     values = [
-        f"{field_words(effect.name, field)} {_value(estimate)}"
+        f"{field_words(effect.name, field)} {_value_in_words(estimate)}"
         for field, estimate in effect.parameters.items()
     ]
+    name, chance = effect_words(effect.name), p_value_words(effect.p_value)
     if len(values) == 1:
         (only,) = effect.parameters.values()
-        return f"{words_of(effect.name)} of {_value(only)} ({chance(effect.p_value)})"
-    return f"{words_of(effect.name)} ({', '.join(values)}; {chance(effect.p_value)})"
+        return f"{name} of {_value_in_words(only)} ({chance})"
+    return f"{name} ({', '.join(values)}; {chance})"
 
 
-def _value(estimate: Estimate) -> str:
+def _value_in_words(estimate: Estimate) -> str:
     written = write_estimate(estimate)
     return f"{written.value} {written.unit}".strip()
 
 
-def place(variable: str, value: float) -> str:
+def place_in_words(variable: str, value: float) -> str:
     """Where on the axis of a variable."""
     if variable == "time":
         return f"at {percent(100 * float(value))} of a run"
@@ -233,7 +240,7 @@ def _rivals(diagnosis: Diagnosis) -> list[str]:
     return list(dict.fromkeys(r for effect in diagnosis.effects for r in effect.also_possible))
 
 
-def _next(diagnosis: Diagnosis) -> str:
+def _experiment_sentence(diagnosis: Diagnosis) -> str:
     experiment = diagnosis.next_experiment
     if experiment is None:
         return "No run within the recorded voltage was found that would tell them apart."
@@ -243,7 +250,7 @@ def _next(diagnosis: Diagnosis) -> str:
     )
 
 
-def would_be_seen(diagnosis: Diagnosis) -> list[Detectable]:
+def detectable_others(diagnosis: Diagnosis) -> list[Detectable]:
     """The smallest amplitudes of the effects that were not found, nor are part of one that was."""
     found = {effect.name for effect in diagnosis.effects}
     found |= {part for name in found for part in CONTAINS.get(name, set())}
@@ -251,25 +258,25 @@ def would_be_seen(diagnosis: Diagnosis) -> list[Detectable]:
 
 
 # the three that drives most often have, for a sentence; the table has them all
-TOLD = ("coulomb_friction", "constant_load", "brush_voltage_drop")
+COMMON_EFFECTS = ("coulomb_friction", "constant_load", "brush_voltage_drop")
 
 
-def _would_have_been_seen(begin: str, diagnosis: Diagnosis) -> str:
-    told = [one for one in would_be_seen(diagnosis) if one.effect in TOLD]
-    parts = [f"{words_of(x.effect)} above {amount(x.amplitude, x.unit)}" for x in told]
+def _detectable_sentence(begin: str, diagnosis: Diagnosis) -> str:
+    told = [one for one in detectable_others(diagnosis) if one.effect in COMMON_EFFECTS]
+    parts = [f"{effect_words(x.effect)} above {value_with_unit(x.amplitude, x.unit)}" for x in told]
     if not parts:
         return ""
     sentence = f"{begin}{enumerate_words(parts)} would have shown, nine times of ten."
     return sentence[0].upper() + sentence[1:]
 
 
-def role_that_counts(diagnosis: Diagnosis) -> Role:
+def judged_role(diagnosis: Diagnosis) -> Role:
     """Hold-outs are the test where there are any."""
     return "holdout" if "holdout" in diagnosis.gap else "train"
 
 
-def _gap(diagnosis: Diagnosis) -> str:
-    role = role_that_counts(diagnosis)
+def _gap_sentence(diagnosis: Diagnosis) -> str:
+    role = judged_role(diagnosis)
     gap = diagnosis.gap[role]
     what = role_word(role).capitalize()
     sentence = f"{what} error {significant(gap.before)} to {significant(gap.after)} times the noise"
@@ -303,20 +310,21 @@ def drifts(diagnosis: Diagnosis) -> list[Drift]:
     ]
 
 
-def moved(one: Drift) -> str:
+def drift_words(one: Drift) -> str:
     """The change in per cent with its sign."""
     if one.percent is None:
         return percent(None)
     return ("+" if one.percent > 0 else "") + percent(one.percent)
 
 
-def _moved(diagnosis: Diagnosis) -> str:
-    far = [one for one in drifts(diagnosis) if abs(one.percent or 0.0) > NOTEWORTHY]
+def _drift_sentence(diagnosis: Diagnosis) -> str:
+    far = [one for one in drifts(diagnosis) if abs(one.percent or 0.0) > MIN_DRIFT]
     far = sorted(far, key=lambda one: -abs(one.percent or 0.0))[:3]
     if not far:
-        return f"No parameter of the motor moved by more than {NOTEWORTHY:g} %."
-    return f"Adding it moved {enumerate_words([f'{one.name} by {moved(one)}' for one in far])}."
+        return f"No parameter of the motor moved by more than {MIN_DRIFT:g} %."
+    drifted = enumerate_words([f"{one.name} by {drift_words(one)}" for one in far])
+    return f"Adding it moved {drifted}."
 
 
-def _capital(text: str) -> str:
+def _capitalised(text: str) -> str:
     return text[:1].upper() + text[1:]
