@@ -17,11 +17,15 @@ from benchmarks import virtual_bench as vb
 from benchmarks.peers import closed_loop as peers
 from benchmarks.timing import Row, interleaved, machine
 from pmdc_jax.control import PID, Course, Hardware, Law, closed_loop
-from pmdc_jax.control.law import Model
+from pmdc_jax.control.law import SampledMotor
 from pmdc_jax.motor import PARAMETERS, Motor
 
-LOOPS, SAMPLES, STEP = 1024, 200, 1e-3
-SETPOINT, VOLTS, UNLIMITED = 481.0, 30.0, 1e6
+LOOPS = 1024  # simulated in one call
+SAMPLES = 200  # of each
+STEP = 1e-3  # sample time, s
+SETPOINT = 481.0  # rad/s
+VOLTS = 30.0  # limit of the voltage, V
+UNLIMITED = 1e6  # V, which no loop asks for
 MOTOR = Motor(**{name: getattr(vb.paper_motor(), name) for name in PARAMETERS})
 ONE_CONSTANT = eqx.tree_at(lambda motor: motor.Kt, MOTOR, MOTOR.Kb)
 
@@ -36,13 +40,13 @@ def gains(count: int = LOOPS) -> np.ndarray:
 def motion() -> np.ndarray:
     """The exact step of the motor, (2, 3)."""
     with jax.enable_x64(True):
-        model = Model.of(jax.tree.map(jnp.asarray, MOTOR), STEP)
+        model = SampledMotor.of(jax.tree.map(jnp.asarray, MOTOR), STEP)
         return np.array([[model.ii, model.iw, model.iv], [model.wi, model.ww, model.wv]], float)
 
 
 @jax.jit
 def _ours(motor, table, volts):
-    model = Model.of(motor, STEP)
+    model = SampledMotor.of(motor, STEP)
     course = Course(jnp.full(SAMPLES, SETPOINT), jnp.zeros(SAMPLES), jnp.zeros(SAMPLES))
 
     def one(row):

@@ -22,7 +22,9 @@ from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.simulate import Tape, free_run, uniform
 
 RUNS = ("prbs", "loaded")
-SETPOINT, VOLTS, SAMPLES = 200.0, 18.0, 200
+SETPOINT = 200.0  # rad/s
+VOLTS = 18.0  # limit of the voltage, V
+SAMPLES = 200  # of the step, 1 ms each
 GAINS = PID(0.3, 25.0, 0.0003, 0.001, 1.0, 0.2)
 
 

@@ -20,7 +20,7 @@ from pmdc_jax.control import fastest_settling, step_metrics
 from pmdc_jax.control.continuous import continuous_loop
 from pmdc_jax.control.judge import Robustness
 from pmdc_jax.control.spread import drawn_motors, even_spread
-from pmdc_jax.control.tuning import JUDGED_ON, Tuning, robustness, tune
+from pmdc_jax.control.tuning import VALIDATION_MOTORS, Tuning, robustness, tune
 from pmdc_jax.wheelchair import PRINTED, SETPOINT
 
 KINDS = ("pi", "pid", "state-feedback")
@@ -61,7 +61,7 @@ def nominal_table(volts: list[float], options: dict, continuous: bool) -> Table:
 
 def _cells(volts: float, kind: str, found: Tuning, continuous: bool) -> list[str]:
     limit, settling = found.fastest_possible_settling, found.metrics["SettlingTime"]
-    second = found.candidates[0].second
+    second = found.candidates[0].second_step
     cells = [
         f"{volts:g}",
         kind,
@@ -82,8 +82,8 @@ def _cells(volts: float, kind: str, found: Tuning, continuous: bool) -> list[str
 def own_limits(volts: float, seed: int) -> np.ndarray:
     """The fastest settling of each of the drawn motors, s; infinite where 481 rad/s is out of reach."""
     with jax.enable_x64(True):
-        motors = drawn_motors(PRINTED, even_spread(0.1), JUDGED_ON, seed)
-        each = [jax.tree.map(lambda leaf: leaf[k], motors) for k in range(JUDGED_ON)]  # noqa: B023
+        motors = drawn_motors(PRINTED, even_spread(0.1), VALIDATION_MOTORS, seed)
+        each = [jax.tree.map(lambda leaf: leaf[k], motors) for k in range(VALIDATION_MOTORS)]  # noqa: B023
     return np.array([fastest_settling(m, SETPOINT, volts) or np.inf for m in each])
 
 

@@ -40,10 +40,10 @@ def test_the_tuned_loop_comes_close_to_the_limit():
     assert found.margins.sensitivity_peak < 2.1
     assert found.peak_current < 150 * 1.01
     assert abs(found.load["SteadyStateError"]) < 0.1
-    second = found.candidates[0].second
+    second = found.candidates[0].second_step
     assert second["Overshoot"] < 3
     assert second["SettlingTime"] < found.fastest_possible_settling
-    small = found.candidates[0].small
+    small = found.candidates[0].small_step
     assert 0.9 * 24.05 < small["Peak"] < 1.2 * 24.05
     told = any("24.1 rad/s, which no limit slows down" in message for message in found.messages)
     assert told == (small["Overshoot"] > 1.2)

@@ -14,7 +14,7 @@ from ..precision import double_precision
 from .controllers import PI, PID, StateFeedback, StateFeedbackIntegral
 from .gains import reference_gain
 from .hardware import Hardware
-from .law import Law, Model
+from .law import Law, SampledMotor
 from .margins import linear_loop, loop_gain
 
 RULED = ("pi", "pid")  # controllers that Ziegler and Nichols have a rule for
@@ -95,19 +95,12 @@ def state_feedback(
     `sample_time`, s, for which exp(pole sample_time) are the poles of the sampled loop; None for continuous time.
     """
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
-    if sample_time is None:
-        A, B = (np.asarray(x) for x in motor.state_space())
-        period, wanted = 1.0, np.asarray(poles)
-    else:
-        model = Model.of(motor, sample_time)
-        A = np.array([[model.ii, model.iw], [model.wi, model.ww]], float)
-        B = np.array([[model.iv, 0.0], [model.wv, 0.0]], float)
-        period, wanted = sample_time, np.exp(np.asarray(poles) * sample_time)
-    A, B = np.asarray(A), np.asarray(B)[:, 0]
-    if len(wanted) == 3:  # the integral of the error is a third state
-        corner = 0.0 if sample_time is None else 1.0
-        A = np.block([[A, np.zeros((2, 1))], [np.array([[0.0, -period, corner]])]])
-        B = np.append(B, 0.0)
+    wanted = np.asarray(poles)
+    if sample_time is not None:
+        wanted = np.exp(wanted * sample_time)
+    A, B = _state_space(motor, sample_time)
+    if len(wanted) == 3:
+        A, B = _with_error_integral(A, B, sample_time)
     K = ackermann(A, B, wanted)
     shared = {
         "reference_gain": float(reference_gain(motor, setpoint, K[0], K[1])),
@@ -118,3 +111,22 @@ def state_feedback(
         return StateFeedback(**shared)
     slowest = float(1 / np.min(np.abs(np.real(np.asarray(poles)))))
     return StateFeedbackIntegral(**shared, integral=float(-K[2]), tracking_time=slowest)
+
+
+def _state_space(motor: Motor, sample_time: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """A (2, 2) and B (2,) from voltage to current and speed, per second or per sample."""
+    if sample_time is None:
+        A, B = (np.asarray(matrix) for matrix in motor.state_space())
+        return A, B[:, 0]
+    model = SampledMotor.of(motor, sample_time)
+    A = np.array([[model.ii, model.iw], [model.wi, model.ww]], float)
+    return A, np.array([model.iv, model.wv], float)
+
+
+def _with_error_integral(
+    A: np.ndarray, B: np.ndarray, sample_time: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """With a third state, the integral of set point less speed."""
+    step, kept = (1.0, 0.0) if sample_time is None else (sample_time, 1.0)
+    A = np.block([[A, np.zeros((2, 1))], [np.array([[0.0, -step, kept]])]])
+    return A, np.append(B, 0.0)

@@ -13,8 +13,8 @@ from .controllers import AbstractController, Memory, Number
 from .loop import Response
 from .steady import steady_state
 
-# The current limit is a current loop this many times faster than the winding.
-CURRENT_LOOP = 50.0
+# The current limit is a current loop so many times faster than the winding.
+CURRENT_LOOP_GAIN = 50.0
 
 
 @compiled
@@ -42,15 +42,7 @@ def continuous_loop(
     def voltages(state: State, memory: Memory) -> tuple[Number, Number]:
         current, speed = motor.sensors(state)
         asked = controller.command(memory, reference, speed, current, 0.0)
-        applied = asked
-        if current_limit is not None:
-            held = motor.R * state.current + motor.Kb * state.speed
-            lowest, highest = (
-                held + CURRENT_LOOP * motor.R * (sign * current_limit - state.current)
-                for sign in (-1, 1)
-            )
-            applied = jnp.clip(applied, lowest, highest)
-        return asked, jnp.clip(applied, -voltage_limit, voltage_limit)
+        return asked, _within_limits(motor, state, asked, voltage_limit, current_limit)
 
     def rate(t, y, args):
         state, memory = y
@@ -60,7 +52,7 @@ def continuous_loop(
         return motor.derivative(state, jnp.asarray(applied), jnp.asarray(load, float)), moved
 
     at, held_by = steady_state(motor, initial)
-    memory = controller.settled(initial, at.speed, at.current, held_by, 0.0)
+    memory = controller.equilibrium(initial, at.speed, at.current, held_by, 0.0)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(rate),
         diffrax.Tsit5(),
@@ -76,3 +68,21 @@ def continuous_loop(
     states, memories = solution.ys
     voltage = jnp.asarray(voltages(states, memories)[1])
     return Response(times, states.current, states.speed, voltage)
+
+
+def _within_limits(
+    motor: Motor,
+    state: State,
+    voltage: Number,
+    voltage_limit: Number,
+    current_limit: Number | None,
+) -> Number:
+    """The voltage that the current loop leaves, within the voltage there is."""
+    if current_limit is not None:
+        holding = motor.R * state.current + motor.Kb * state.speed
+        lowest, highest = (
+            holding + CURRENT_LOOP_GAIN * motor.R * (sign * current_limit - state.current)
+            for sign in (-1, 1)
+        )
+        voltage = jnp.clip(voltage, lowest, highest)
+    return jnp.clip(voltage, -voltage_limit, voltage_limit)

@@ -13,7 +13,7 @@ from ..files import write_text
 from ..json_file import finite_number, read_object
 from .controllers import CONTROLLERS, AbstractController, Number
 from .hardware import Hardware
-from .law import Law, Model
+from .law import Law, SampledMotor
 
 FORMAT = "pmdc controller 1"
 MEND = "Write it with pmdc tune --save"
@@ -72,7 +72,7 @@ def load_controller(path: str | Path) -> Law:
             delay=int(delay),
             measures_current=bool(content.get("measures_current", True)),
         ),
-        Model(**_numbers(where, content.get("model"), Model._fields)),
+        SampledMotor(**_numbers(where, content.get("model"), SampledMotor._fields)),
     )
 
 

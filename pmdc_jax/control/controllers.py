@@ -57,7 +57,7 @@ class AbstractController(eqx.Module):
         """Rates of the memory, per second; `excess` is the voltage really applied less the one asked for."""
         raise NotImplementedError
 
-    def settled(
+    def equilibrium(
         self, reference: Number, speed: Number, current: Number, voltage: Number, step: Number
     ) -> Memory:
         """The memory in equilibrium: the command is `voltage` and stays there."""

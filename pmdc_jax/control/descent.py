@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ..compiled import compiled
 from ..motor import Motor
 from .gains import GainSpace
-from .law import Model
+from .law import SampledMotor
 from .objective import CHOICE, DESCENT, Task, cost, exact_score, smooth_score
 
 SCREENED = 512  # gains drawn
@@ -27,14 +27,14 @@ Coordinates = Float[Array, "starts gains"]
 Costs = Float[Array, " starts"]
 
 
-def tuned(
+def best_coordinates(
     task: Task,
     space: GainSpace,
     motors: Motor,
     seed: int = 0,
     starts: int = STARTS,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates of the gains that the starts led to, best first, and their exact costs.
+) -> np.ndarray:
+    """Coordinates of the best gains that any of the starts led to, (gains,).
 
     Gains are drawn evenly over the logarithms of their ranges; the best of them are followed down the
     gradient by Adam, each keeping the best point it has seen.
@@ -44,7 +44,7 @@ def tuned(
     lower, upper = space.bounds()
     rng = np.random.default_rng(seed)
     drawn = rng.uniform(lower, upper, (SCREENED, len(lower)))
-    model = Model.of(space.motor, task.hardware.sample_time)
+    model = SampledMotor.of(space.motor, task.hardware.sample_time)
     nominal = jax.tree.map(lambda leaf: leaf[:1], motors)
     costs = _screen(task, space, model, nominal, jnp.asarray(drawn))
     coordinates = _best(jnp.asarray(drawn), costs, starts)
@@ -53,7 +53,7 @@ def tuned(
         finalists = _best(coordinates, costs, FINALISTS)
         coordinates, _ = _descend(task, space, model, motors, finalists)
     costs = _rank(task, space, model, motors, coordinates)
-    return np.asarray(_best(coordinates, costs, starts)), np.sort(np.asarray(costs))
+    return np.asarray(coordinates[jnp.argmin(costs)])
 
 
 def _best(coordinates: Coordinates, costs: Costs, count: int) -> Float[Array, "best gains"]:

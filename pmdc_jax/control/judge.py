@@ -15,14 +15,14 @@ from jaxtyping import Array, Float
 from ..compiled import compiled
 from ..motor import Motor
 from .controllers import AbstractController
-from .law import Law, Model
+from .law import Law, SampledMotor
 from .loop import Response, closed_loop
 from .margins import margins
 from .metrics import StepMetrics, load_metrics, step_metrics
 from .objective import SECOND_SETPOINT, Score, Task, exact_score
 
-SUBSTEPS = 10  # instants a sample in what is reported
-SMALL = 0.05  # a small step, over the set point
+REPORTED_SUBSTEPS = 10  # instants a sample in what is reported
+SMALL_STEP = 0.05  # set point of the small step, over that of the task
 
 
 @frozen
@@ -37,59 +37,63 @@ class Robustness:
 
 
 @frozen
-class Candidate:
-    """One way of choosing the gains, and what comes of it."""
+class JudgedController:
+    """One way of choosing the gains, and what comes of it. Metrics are None where something never happens."""
 
     name: str
     controller: AbstractController
     metrics: Mapping[str, float | None]
     load: Mapping[str, float | None]
-    second: Mapping[str, float | None]  # of the step from the set point to half of it
-    small: Mapping[str, float | None]  # of a step so small that no limit binds
+    second_step: Mapping[str, float | None]  # of the step from the set point to half of it
+    small_step: Mapping[str, float | None]  # of a step so small that no limit binds
     robust: Robustness | None
     stable: bool
 
 
 def judged(
-    name: str, task: Task, motor: Motor, controller: AbstractController, judges: Motor | None
-) -> Candidate:
-    """A controller by its exact metrics; `judges`, motors along a leading axis, give the percentiles."""
+    name: str,
+    task: Task,
+    motor: Motor,
+    controller: AbstractController,
+    validation_motors: Motor | None,
+) -> JudgedController:
+    """A controller by its exact metrics; `validation_motors`, motors along a leading axis, give the percentiles."""
     controller = jax.tree.map(jnp.asarray, controller)
     law = Law.of(controller, task.hardware, motor)
     response = simulated(task, motor, law)
-    step, loaded, second = task.parts(response, SUBSTEPS * task.substeps)
+    step, loaded, second = task.parts(response, REPORTED_SUBSTEPS * task.substeps)
     robust = None
-    if judges is not None:
-        model = Model.of(motor, task.hardware.sample_time)
-        robust = _robustness(_exact_score(task, model, judges, controller))
-    return Candidate(
+    if validation_motors is not None:
+        model = SampledMotor.of(motor, task.hardware.sample_time)
+        robust = _robustness(_exact_score(task, model, validation_motors, controller))
+    return JudgedController(
         name=name,
         controller=controller,
         metrics=_by_name(step_metrics(*step, task.setpoint)),
         load=_by_name(load_metrics(*loaded, task.setpoint)),
-        second=_by_name(step_metrics(*second, SECOND_SETPOINT * task.setpoint, task.setpoint)),
-        small=_by_name(_small_step(task, motor, law)),
+        second_step=_by_name(step_metrics(*second, SECOND_SETPOINT * task.setpoint, task.setpoint)),
+        small_step=_by_name(_small_step_metrics(task, motor, law)),
         robust=robust,
         stable=margins(motor, law).stable,
     )
 
 
-def _small_step(task: Task, motor: Motor, law: Law) -> StepMetrics:
+def _small_step_metrics(task: Task, motor: Motor, law: Law) -> StepMetrics:
     """The set point's own step, twenty times smaller. Gains that never overshoot where the voltage is at its limit may
     do so here."""
     small = eqx.tree_at(
         lambda t: (t.setpoint, t.load, t.noise),
         task,
-        (SMALL * task.setpoint, 0 * task.load, 0 * task.noise),
+        (SMALL_STEP * task.setpoint, 0 * task.load, 0 * task.noise),
     )
-    (time, speed), *_ = small.parts(simulated(small, motor, law), SUBSTEPS * task.substeps)
+    (time, speed), *_ = small.parts(simulated(small, motor, law), REPORTED_SUBSTEPS * task.substeps)
     return step_metrics(time, speed, small.setpoint)
 
 
 @compiled
 def simulated(task: Task, motor: Motor, law: Law) -> Response:
     """The whole course, ten instants a sample."""
-    return closed_loop(motor, law, task.course(), SUBSTEPS * task.substeps)
+    return closed_loop(motor, law, task.course(), REPORTED_SUBSTEPS * task.substeps)
 
 
 @compiled

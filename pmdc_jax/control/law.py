@@ -14,8 +14,8 @@ from .controllers import AbstractController, Memory, Number
 from .hardware import Hardware
 
 
-class Model(NamedTuple):
-    """The linear motor over one sample, as the law knows it: i' = ii i + iw w + iv v, and w' likewise."""
+class SampledMotor(NamedTuple):
+    """The linear motor over one sample, as the law knows it: i[k+1] = ii i[k] + iw w[k] + iv v[k], and w likewise."""
 
     ii: Number
     iw: Number
@@ -25,7 +25,7 @@ class Model(NamedTuple):
     wv: Number
 
     @classmethod
-    def of(cls, motor: Motor, sample_time: Number) -> Model:
+    def of(cls, motor: Motor, sample_time: Number) -> SampledMotor:
         """The exact discretisation of the motor, whose effects the law does not know."""
         whole, inputs, *_ = propagator(
             motor.with_effects(()), jnp.asarray(sample_time, float), Drive()
@@ -58,17 +58,17 @@ class Law(eqx.Module):
 
     controller: AbstractController
     hardware: Hardware
-    model: Model
+    model: SampledMotor
 
     @classmethod
     def of(cls, controller: AbstractController, hardware: Hardware, motor: Motor) -> Law:
         """The law for a motor."""
-        return cls(controller, hardware, Model.of(motor, hardware.sample_time))
+        return cls(controller, hardware, SampledMotor.of(motor, hardware.sample_time))
 
     def start(self, reference: Number, at: State, voltage: Number) -> LawState:
         """The state of a law that has long held the motor where it is."""
         step = self.hardware.sample_time
-        memory = self.controller.settled(reference, at.speed, at.current, voltage, step)
+        memory = self.controller.equilibrium(reference, at.speed, at.current, voltage, step)
         return LawState(memory, at.current, voltage)
 
     def step(

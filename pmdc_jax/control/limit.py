@@ -15,7 +15,8 @@ from .controllers import Number
 from .metrics import BAND
 from .steady import steady_state
 
-INSTANTS = 20_000
+INSTANTS = 20_000  # of a simulated dash
+DOUBLINGS = 12  # of its duration, before the band counts as out of reach
 
 
 @double_precision
@@ -45,7 +46,7 @@ def fastest_settling(
     bounds = jax.tree.map(
         jnp.asarray, (setpoint, voltage_limit, current_limit, float(initial), float(load))
     )
-    for _ in range(12):
+    for _ in range(DOUBLINGS):
         reached = float(_dash(motor, jnp.asarray(duration), jnp.asarray(INSTANTS), *bounds)[0])
         if reached == reached:  # not NaN: once more, on instants as close as they can be
             return _with_one_switch(motor, 1.2 * reached, *bounds)
@@ -55,7 +56,7 @@ def fastest_settling(
 
 def _with_one_switch(motor: Motor, duration: float, *bounds) -> float:
     """Settling time with the latest switch to full reverse that keeps the speed in the band."""
-    settled, stays = _dash(motor, jnp.asarray(duration), jnp.asarray(INSTANTS), *bounds)
+    settling, stays = _dash(motor, jnp.asarray(duration), jnp.asarray(INSTANTS), *bounds)
     early, late = 0, INSTANTS
     while not stays and late - early > 1:
         switch = (early + late) // 2
@@ -65,8 +66,8 @@ def _with_one_switch(motor: Motor, duration: float, *bounds) -> float:
             continue
         early = switch
         if float(trial) == float(trial):
-            settled = trial
-    return float(settled)
+            settling = trial
+    return float(settling)
 
 
 @compiled

@@ -16,8 +16,7 @@ from .controllers import Number
 from .law import Law
 from .steady import steady_state
 
-# Samples that a slow speed sensor can be late.
-REMEMBERED = 32
+REMEMBERED_SAMPLES = 32  # of the speed, for a sensor that is late
 
 
 class Course(NamedTuple):
@@ -56,7 +55,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
     at, voltage = steady_state(motor, course.initial)
     late = motor.speed_delay()
     memory = law.start(course.initial, at, voltage)
-    start = (at, memory, voltage, jnp.full(REMEMBERED, motor.sensors(at)[1]))
+    start = (at, memory, voltage, jnp.full(REMEMBERED_SAMPLES, motor.sensors(at)[1]))
 
     def sample(carry, now):
         state, memory, acting, past = carry
@@ -90,7 +89,7 @@ closed_loop_jit = compiled(closed_loop)
 
 def _earlier(past: Float[Array, " remembered"], samples: Number) -> Float[Array, ""]:
     """What was so many samples ago, latest first; interpolated linearly."""
-    place = jnp.clip(samples, 0.0, REMEMBERED - 1.001)
+    place = jnp.clip(samples, 0.0, REMEMBERED_SAMPLES - 1.001)
     k = jnp.floor(place).astype(int)
     return past[k] + (place - k) * (past[k + 1] - past[k])
 

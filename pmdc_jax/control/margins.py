@@ -12,10 +12,9 @@ from jaxtyping import Array, Float
 
 from ..effects.base import State
 from ..motor import Motor
-from .law import Law, LawState, Model
+from .law import Law, LawState, SampledMotor
 
-FREQUENCIES = 48
-
+FREQUENCIES = 48  # at which a tuning looks for the peak of the sensitivity
 
 Matrix = Float[Array | np.ndarray, "n n"]
 Vector = Float[Array | np.ndarray, " n"]
@@ -40,7 +39,7 @@ class Loop(NamedTuple):
 def linear_loop(motor: Motor, law: Law) -> Loop:
     """The loop at rest. A law is linear until its limits bind, so the derivatives there are the whole truth; of
     the motor its linear part is taken."""
-    model = Model.of(motor, law.hardware.sample_time)
+    model = SampledMotor.of(motor, law.hardware.sample_time)
     zero = State(jnp.zeros(()), jnp.zeros(()), {})
     start = law.start(0.0, zero, jnp.zeros(()))
     leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, start))

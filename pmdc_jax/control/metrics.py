@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 
 from .controllers import Number
 
-BAND = 0.02
+BAND = 0.02  # within which a response has settled, either side, over the step
+TAIL_PARTS = 20  # the steady error is the mean over the last of so many equal parts
 Samples = Float[Array | np.ndarray, " instants"]
 One = Float[Array | np.ndarray, ""]
 
@@ -46,7 +47,7 @@ def step_metrics(
     rise = _first_reached(time, share, 0.9) - _first_reached(time, share, 0.1)
     peak_time, peak = _peak(time, share)
     _, trough = _peak(time, -share)
-    tail = max(1, speed.size // 20)
+    tail = max(1, speed.size // TAIL_PARTS)
     return StepMetrics(
         RiseTime=rise,
         SettlingTime=_last_inside(time, jnp.abs(share - 1) - BAND),
@@ -70,7 +71,7 @@ class LoadMetrics(NamedTuple):
 def load_metrics(time: Samples, speed: Samples, reference: Number) -> LoadMetrics:
     """Exact metrics of a response to a load that sets in at the first instant."""
     error = jnp.abs(speed - reference)
-    tail = max(1, speed.size // 20)
+    tail = max(1, speed.size // TAIL_PARTS)
     return LoadMetrics(
         Deviation=_peak(time, error)[1],
         RecoveryTime=_last_inside(time, error - BAND * jnp.abs(reference)),
@@ -123,8 +124,8 @@ def _last_inside(time: Samples, outside: Samples) -> One:
     after = jnp.minimum(last + 1, count - 1)
     fall = jnp.where(last < count - 1, outside[last] - outside[after], 1.0)
     crossing = time[last] + (time[after] - time[last]) * outside[last] / fall - time[0]
-    settled = jnp.where(last < count - 1, crossing, jnp.nan)
-    return jnp.where(jnp.any(out), settled, 0.0)
+    last_exit = jnp.where(last < count - 1, crossing, jnp.nan)
+    return jnp.where(jnp.any(out), last_exit, 0.0)
 
 
 def _peak(time: Samples, values: Samples) -> tuple[One, One]:

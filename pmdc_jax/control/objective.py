@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ..motor import Motor
 from .controllers import AbstractController, Number
 from .hardware import Hardware
-from .law import Law, Model
+from .law import Law, SampledMotor
 from .loop import Course, Response, closed_loop
 from .margins import linear_loop, sensitivity_peak
 from .metrics import (
@@ -141,7 +141,9 @@ class Score(NamedTuple):
     sensitivity: One
 
 
-def exact_score(task: Task, model: Model, motors: Motor, controller: AbstractController) -> Score:
+def exact_score(
+    task: Task, model: SampledMotor, motors: Motor, controller: AbstractController
+) -> Score:
     """The exact metrics of a controller on every motor, between samples too. `motors` has a leading axis."""
     setpoint, lower = task.setpoint, SECOND_SETPOINT * task.setpoint
 
@@ -159,7 +161,7 @@ def exact_score(task: Task, model: Model, motors: Motor, controller: AbstractCon
 
 
 def smooth_score(
-    task: Task, model: Model, motors: Motor, controller: AbstractController, width: Number
+    task: Task, model: SampledMotor, motors: Motor, controller: AbstractController, width: Number
 ) -> Score:
     """The metrics with a derivative everywhere, at the samples; `width` softens them, in bands."""
     setpoint, lower = task.setpoint, SECOND_SETPOINT * task.setpoint
@@ -179,7 +181,7 @@ def smooth_score(
 
 def _score(
     task: Task,
-    model: Model,
+    model: SampledMotor,
     motors: Motor,
     controller: AbstractController,
     substeps: int,

@@ -14,7 +14,7 @@ from ..motor import Motor
 from .controllers import CONTROLLERS
 from .hardware import Hardware
 from .limit import fastest_settling
-from .loop import REMEMBERED
+from .loop import REMEMBERED_SAMPLES
 from .requirements import check_reachable, check_settling, reach, spare_torque
 from .steady import steady_state
 
@@ -179,10 +179,10 @@ def _samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> in
 def _check_sensor(motor: Motor, sample_time: float) -> None:
     """Refuse a speed sensor that is later than the simulated loop can remember."""
     late = motor.speed_delay()
-    if late is not None and float(late) > (REMEMBERED - 2) * sample_time:
+    if late is not None and float(late) > (REMEMBERED_SAMPLES - 2) * sample_time:
         raise InputError(
             "--sample-time",
-            f"the speed sensor is {float(late):g} s late, more than {REMEMBERED - 2} samples",
+            f"the speed sensor is {float(late):g} s late, more than {REMEMBERED_SAMPLES - 2} samples",
             "Choose a longer sample time",
         )
 

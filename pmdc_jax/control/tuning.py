@@ -20,10 +20,10 @@ from ..progress import ReportProgress, silent
 from ..simulate.solver import steps_within
 from .classical import RULED, ziegler_nichols
 from .controllers import AbstractController
-from .descent import STARTS, tuned
+from .descent import STARTS, best_coordinates
 from .gains import GainSpace
 from .hardware import Hardware
-from .judge import SMALL, Candidate, Robustness, judged, simulated, speeds
+from .judge import SMALL_STEP, JudgedController, Robustness, judged, simulated, speeds
 from .law import Law
 from .loop import Response
 from .margins import Margins, margins
@@ -31,8 +31,8 @@ from .objective import PARTS, Task
 from .specification import MAX_SENSITIVITY, LoopRequirements, Specification
 from .spread import drawn_motors, even_spread
 
-TUNED_ON = 32  # drawn motors that take part in the tuning
-JUDGED_ON = 256  # others, that judge it afterwards
+TUNING_MOTORS = 32  # drawn from the uncertainty, that take part in the tuning
+VALIDATION_MOTORS = 256  # drawn apart from these, that judge it afterwards
 # Noise of the speed that a loop is tuned with at least, over the set point: gains that never saw any would shake.
 TUNING_NOISE = 2e-4
 # Overshoot allowed at least in the cost, %: its excess is weighed over what is allowed.
@@ -52,7 +52,7 @@ class Tuning:
     task: Task
     asked: LoopRequirements
     margins: Margins
-    candidates: tuple[Candidate, ...]  # ours first
+    candidates: tuple[JudgedController, ...]  # ours first
     response: Response = field(repr=False, converter=lambda r: Response(*map(np.asarray, r)))
     bundle: np.ndarray | None = field(repr=False)  # (motors, samples) rad/s, of the drawn motors
     seed: int
@@ -194,13 +194,15 @@ def design(
     report = progress or silent
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
     specification = requirements.completed(motor)
-    motors, judges = _motors(motor, uncertainty, requirements.spread, seed)
+    tuning_motors, validation_motors = _tuning_and_validation_motors(
+        motor, uncertainty, requirements.spread, seed
+    )
     report("tuning from many starts")
     unit_noise = np.random.default_rng(seed).standard_normal(PARTS * specification.samples)
     task = _task(specification, motor, unit_noise)
-    controller = _tuned(specification, task, motors, unit_noise, seed, starts)
+    controller = _tuned(specification, task, tuning_motors, unit_noise, seed, starts)
     report("judging the loop", fraction=0.8)
-    result = _judged(specification, task, motor, controller, judges, seed)
+    result = _judged(specification, task, motor, controller, validation_motors, seed)
     return attrs.evolve(
         result,
         messages=(*specification.notes, *_undetermined(uncertainty), *_verdicts(result)),
@@ -208,11 +210,11 @@ def design(
     )
 
 
+@double_precision
 def robustness(tuning: Tuning, spread: float, seed: int) -> Robustness | None:
     """How a tuning does on motors it was not tuned for; see `tune` for `spread`."""
-    with jax.enable_x64(True):
-        _, judges = _motors(tuning.motor, None, spread, seed)
-        return judged("tuned", tuning.task, tuning.motor, tuning.controller, judges).robust
+    _, motors = _tuning_and_validation_motors(tuning.motor, None, spread, seed)
+    return judged("tuned", tuning.task, tuning.motor, tuning.controller, motors).robust
 
 
 def _task(specification: Specification, motor: Motor, unit_noise: np.ndarray) -> Task:
@@ -251,8 +253,7 @@ def _tuned(
     least = TUNING_NOISE * abs(specification.setpoint)
     shaken = jnp.asarray(max(specification.asked.speed_noise, least) * unit_noise)
     noisy = eqx.tree_at(lambda t: t.noise, task, shaken)
-    coordinates, _ = tuned(noisy, space, motors, seed, starts)
-    return space.controller(jnp.asarray(coordinates[0]))
+    return space.controller(jnp.asarray(best_coordinates(noisy, space, motors, seed, starts)))
 
 
 def _judged(
@@ -260,7 +261,7 @@ def _judged(
     task: Task,
     motor: Motor,
     controller: AbstractController,
-    judges: Motor | None,
+    validation_motors: Motor | None,
     seed: int,
 ) -> Tuning:
     """The tuned controller and what the textbook would have chosen, by exact metrics."""
@@ -273,34 +274,38 @@ def _judged(
         asked=asked,
         margins=margins(motor, law),
         candidates=(
-            judged("tuned", task, motor, controller, judges),
-            *_rivals(task, motor, asked.controller, judges),
+            judged("tuned", task, motor, controller, validation_motors),
+            *_rivals(task, motor, asked.controller, validation_motors),
         ),
         response=simulated(task, motor, law),
-        bundle=None if judges is None else np.asarray(speeds(task, judges, law)),
+        bundle=None
+        if validation_motors is None
+        else np.asarray(speeds(task, validation_motors, law)),
         seed=seed,
     )
 
 
-def _motors(
+def _tuning_and_validation_motors(
     motor: Motor, uncertainty: Uncertainty | None, spread: float | None, seed: int
 ) -> tuple[Motor, Motor | None]:
-    """Those to tune on, the nominal one first, and those that judge; stacked."""
+    """Those to tune on, the nominal one first, and others to judge by; along a leading axis."""
     nominal = jax.tree.map(lambda leaf: leaf[None], motor)
     if spread is not None:
         uncertainty = even_spread(spread)
     if uncertainty is None:
         return nominal, None
-    others = drawn_motors(motor, uncertainty, TUNED_ON, seed)
-    motors = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), nominal, others)
-    return motors, drawn_motors(motor, uncertainty, JUDGED_ON, seed + 1)
+    others = drawn_motors(motor, uncertainty, TUNING_MOTORS, seed)
+    tuning_motors = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), nominal, others)
+    return tuning_motors, drawn_motors(motor, uncertainty, VALIDATION_MOTORS, seed + 1)
 
 
-def _rivals(task: Task, motor: Motor, kind: str, judges: Motor | None) -> Iterator[Candidate]:
+def _rivals(
+    task: Task, motor: Motor, kind: str, validation_motors: Motor | None
+) -> Iterator[JudgedController]:
     """What the textbook would have chosen."""
     if kind in RULED:
         rule = ziegler_nichols(motor, task.hardware, kind)
-        yield judged("Ziegler-Nichols", task, motor, rule, judges)
+        yield judged("Ziegler-Nichols", task, motor, rule, validation_motors)
 
 
 def _undetermined(uncertainty: Uncertainty | None) -> Iterator[str]:
@@ -336,8 +341,8 @@ def _unmet(result: Tuning) -> Iterator[str]:
 def _small_step_remark(result: Tuning) -> Iterator[str]:
     """Whether a small step overshoots notably more than the step to the set point, and by more than the sensor's
     quantum alone explains."""
-    overshoot = result.candidates[0].small["Overshoot"] or 0.0
-    step = SMALL * result.setpoint
+    overshoot = result.candidates[0].small_step["Overshoot"] or 0.0
+    step = SMALL_STEP * result.setpoint
     allowed = NOTABLE_OVERSHOOT * max(
         result.asked.max_overshoot, result.metrics["Overshoot"] or 0.0
     )

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from ..control.controller_file import gains_of, law_content
 from ..control.controllers import CONTROLLERS
-from ..control.judge import SMALL, Candidate, Robustness
+from ..control.judge import SMALL_STEP, JudgedController, Robustness
 from ..control.metrics import BAND
 from ..control.objective import SECOND_SETPOINT
 from ..control.tuning import Tuning
@@ -36,9 +36,9 @@ def tuning_json(tuning: Tuning) -> dict[str, Any]:
         "load": {"torque_Nm": tuning.load_torque, **tuning.load},
         "second_step": {
             "to_rad_s": SECOND_SETPOINT * tuning.setpoint,
-            **tuning.candidates[0].second,
+            **tuning.candidates[0].second_step,
         },
-        "small_step": {"to_rad_s": SMALL * tuning.setpoint, **tuning.candidates[0].small},
+        "small_step": {"to_rad_s": SMALL_STEP * tuning.setpoint, **tuning.candidates[0].small_step},
         "margins": {
             name: getattr(tuning.margins, name)
             for name in (
@@ -189,7 +189,7 @@ def comparison(tuning: Tuning) -> list[tuple[str, ...]]:
     return [*(_row(one, limit) for one in tuning.candidates), last]
 
 
-def _row(one: Candidate, limit: float) -> tuple[str, ...]:
+def _row(one: JudgedController, limit: float) -> tuple[str, ...]:
     settling, rise, robust = one.metrics["SettlingTime"], one.metrics["RiseTime"], one.robust
     return (
         one.name,
@@ -326,11 +326,11 @@ def robust_figure(tuning: Tuning):
     for one, colour in zip(tuning.candidates, (SIMULATED, RESIDUAL), strict=False):
         if one.robust is None:
             continue
-        settled = np.isfinite(one.robust.settling)
+        settles = np.isfinite(one.robust.settling)
         figure.add_trace(
             go.Scatter(
-                x=1e3 * one.robust.settling[settled],
-                y=one.robust.overshoot[settled],
+                x=1e3 * one.robust.settling[settles],
+                y=one.robust.overshoot[settles],
                 mode="markers",
                 name=one.name,
                 marker={"color": colour, "size": 5, "opacity": 0.6},
