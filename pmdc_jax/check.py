@@ -16,7 +16,7 @@ from .plausibility import (
     reversed_signs,
     speed_of,
 )
-from .recording import Finding, Recording
+from .recording import Finding, Recording, place_of_sample
 from .unmeasured import clipped_extremes, noise_of
 
 MAX_JITTER = 0.02  # of a step, root mean square
@@ -53,7 +53,7 @@ def gaps(run: Recording) -> Iterator[Finding]:
             "warning",
             f"{_count(len(rows), 'gap')} in time, the longest {steps[longest]:.4g} s "
             f"where the step is {np.median(steps):.4g} s",
-            place(run, int(longest)),
+            place_of_sample(run, int(longest)),
             "The voltage is taken to have been held meanwhile. If it was not, split the run at its gaps",
         )
 
@@ -69,12 +69,13 @@ def jitter(run: Recording) -> Iterator[Finding]:
         samples = "are taken when they were stamped"
         if is_evenly_sampled(run):
             samples = "came evenly all the same, by how they go on: they are taken as even"
+        worst = int(np.argmax(np.abs(np.diff(run.time) - np.mean(steps))))
         yield Finding(
             run.name,
             "time",
             "note",
             f"time stamps jitter by {deviation:.1%} of a step of {np.mean(steps):.4g} s, and the samples {samples}",
-            f"worst near {place(run, int(np.argmax(np.abs(np.diff(run.time) - np.mean(steps)))))}",
+            f"worst near {place_of_sample(run, worst)}",
             "If these are not the times of sampling, export those of the sampling clock",
         )
 
@@ -89,7 +90,7 @@ def missing_samples(run: Recording) -> Iterator[Finding]:
                 quantity,
                 "warning" if absent.mean() > 0.05 else "note",
                 f"{absent.sum()} of {len(values)} values are missing",
-                f"first at {place(run, int(np.argmax(absent)))}",
+                f"first at {place_of_sample(run, int(np.argmax(absent)))}",
                 "They are left out of the fit",
             )
 
@@ -107,7 +108,7 @@ def clipping(run: Recording) -> Iterator[Finding]:
                 quantity,
                 "warning",
                 f"it looks clipped at {extreme:.6g}: {length} equal values in a row",
-                f"from {place(run, start)}",
+                f"from {place_of_sample(run, start)}",
                 "Record with a larger range, or cut these samples out (leave the cells empty)",
             )
 
@@ -123,7 +124,7 @@ def wrapped_angle(run: Recording) -> Iterator[Finding]:
             "angle",
             "note",
             f"it starts again after each turn, {_count(len(wraps), 'time')}: it is taken as going on",
-            f"first at {place(run, int(wraps[0]))}",
+            f"first at {place_of_sample(run, int(wraps[0]))}",
             "If it does not, unwrap it yourself, for example by numpy.unwrap",
         )
 
@@ -167,7 +168,7 @@ def current_jumps(run: Recording) -> Iterator[Finding]:
             "note",
             f"it leaps by up to {steps[row]:.3g} A between samples: what it did there is not known, and may look like a"
             " missing effect",
-            place(run, row),
+            place_of_sample(run, row),
             "Sample faster, or record the voltage as well",
         )
 
@@ -224,11 +225,6 @@ CHECKS_OF_A_RUN = (
     shifted_channels,
     slow_sampling,
 )
-
-
-def place(run: Recording, row: int) -> str:
-    """Where a sample is, for people."""
-    return f"sample {row + 1} ({run.time[row]:.6g} s)"
 
 
 def _count(number: int, thing: str) -> str:

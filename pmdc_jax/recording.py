@@ -131,6 +131,11 @@ class Recording:
         return {quantity: array for quantity, array in values if array is not None}
 
 
+def place_of_sample(run: Recording, row: int | np.integer) -> str:
+    """Where a sample is, for people: `row` counts from 0, and people from 1."""
+    return f"sample {row + 1} ({run.time[row]:.6g} s)"
+
+
 class Fault(NamedTuple):
     """Why a recording cannot be used; `row` counts from 0, None for the whole column."""
 

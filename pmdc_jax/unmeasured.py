@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .recording import MAX_MISSING, Finding, Recording
+from .recording import MAX_MISSING, Finding, Recording, place_of_sample
 
 # A spike is so many times what a signal usually bends from sample to sample ...
 SPIKE_RATIO = 50.0
@@ -53,7 +53,7 @@ def _without(run: Recording, name: str, lost: Bool[np.ndarray, " samples"], how:
         name,
         "note",
         f"it {how}, at {signal[rows[0]]:.6g}: taken as missing",
-        f"sample {rows[0] + 1} ({run.time[rows[0]]:.6g} s){others}",
+        f"{place_of_sample(run, rows[0])}{others}",
         "If the motor did so, sample faster, and with a larger range",
     )
     missing = np.where(lost, np.nan, signal)
