@@ -1,0 +1,142 @@
+"""Plotly figures of a tuning: the loop over time, and the motors it might be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from ..control.metrics import BAND
+from ..control.objective import SECOND_SETPOINT
+from ..control.tuning import Tuning
+from .figures import INPUT, MEASURED, RESIDUAL, SIMULATED, style
+
+# rows of the figure of the loop
+SPEED = 1
+VOLTAGE = 2
+CURRENT = 3
+AXIS_TITLES = {SPEED: "speed<br>[rad/s]", VOLTAGE: "voltage<br>[V]", CURRENT: "current<br>[A]"}
+HEIGHTS = [1.0, 0.6, 0.6]
+
+SPREAD_COLOUR = "rgba(163,176,192,0.35)"  # MEASURED, seen through
+DOTTED = {"color": RESIDUAL, "width": 0.8, "dash": "dot"}
+DASHED = {"color": RESIDUAL, "width": 1, "dash": "dash"}
+
+Traces = Iterator[tuple[int, go.Scatter]]  # each with its row
+
+
+def loop_figure(tuning: Tuning) -> go.Figure:
+    """Speed, voltage and current over time: the step, then the load, then the second step."""
+    figure = make_subplots(
+        rows=len(HEIGHTS), cols=1, shared_xaxes=True, vertical_spacing=0.04, row_heights=HEIGHTS
+    )
+    for traces in (_spread_traces, _setpoint_traces, _response_traces, _limit_traces):
+        for row, trace in traces(tuning):
+            figure.add_trace(trace, row=row, col=1)
+    _mark(figure, tuning.fastest_possible_settling, "fastest possible")
+    _mark(figure, tuning.load_from, "load")
+    for row, title in AXIS_TITLES.items():
+        figure.update_yaxes(title_text=title, row=row, col=1)
+    figure.update_xaxes(title_text="time [ms]", row=len(HEIGHTS), col=1)
+    style(figure, height=560)
+    figure.update_layout(hovermode="x unified")
+    return figure
+
+
+def _spread_traces(tuning: Tuning) -> Traces:
+    """Between which speeds nine of ten of the drawn motors run."""
+    if tuning.bundle is None:
+        return
+    instants = _milliseconds(tuning)
+    samples = instants[:: max(1, len(instants) // tuning.bundle.shape[1])]
+    low, high = np.quantile(tuning.bundle, [0.05, 0.95], axis=0)
+    edge = {"color": MEASURED, "width": 0}
+    yield SPEED, _line("5 %", samples, low, edge)
+    fill = {"fill": "tonexty", "fillcolor": SPREAD_COLOUR}
+    yield SPEED, _line("90 % of the motors", samples, high, edge, in_legend=True, **fill)
+
+
+def _setpoint_traces(tuning: Tuning) -> Traces:
+    """The set point and the band about it, which is as wide as the step was."""
+    end, second = _milliseconds(tuning)[-1], 2e3 * tuning.load_from
+    corners = np.array([0.0, second, second, end])
+    share = np.array([1.0, 1.0, SECOND_SETPOINT, SECOND_SETPOINT])
+    for edge in (-BAND, BAND):
+        yield SPEED, _line("2 % band", corners, tuning.setpoint * (share + edge * share), DOTTED)
+    dashed = {"color": INPUT, "width": 1.0, "dash": "dash"}
+    yield SPEED, _line("set point", corners, tuning.setpoint * share, dashed, in_legend=True)
+
+
+def _response_traces(tuning: Tuning) -> Traces:
+    """The nominal motor."""
+    time, response = _milliseconds(tuning).astype(np.float32), tuning.response
+    line = {"color": SIMULATED, "width": 1.6}
+    yield SPEED, _line("speed", time, response.speed, line, in_legend=True)
+    # held from one sample to the next
+    yield VOLTAGE, _line("voltage", time, response.voltage, line | {"shape": "hv"})
+    yield CURRENT, _line("current", time, response.current, line)
+
+
+def _limit_traces(tuning: Tuning) -> Traces:
+    """The largest voltage and current there may be."""
+    ends, hardware = np.array([0.0, _milliseconds(tuning)[-1]]), tuning.hardware
+    for row, limit in ((VOLTAGE, hardware.voltage_limit), (CURRENT, hardware.current_limit)):
+        if limit is not None:
+            yield row, _line("limit", ends, np.full(2, float(limit)), DOTTED)
+
+
+def _mark(figure: go.Figure, moment: float, label: str) -> None:
+    """A vertical line at a moment, s, and what it is."""
+    at = 1e3 * moment
+    figure.add_vline(x=at, line=DASHED)
+    figure.add_annotation(
+        x=at, y=0.03, yref="y domain", text=label, showarrow=False, xanchor="left", xshift=4
+    )
+
+
+def _milliseconds(tuning: Tuning) -> np.ndarray:
+    """The instants of the response."""
+    return 1e3 * np.asarray(tuning.response.time)
+
+
+def _line(
+    name: str,
+    time: np.ndarray,
+    values: Any,
+    line: dict[str, Any],
+    in_legend: bool = False,
+    **options: Any,
+) -> go.Scatter:
+    return go.Scatter(
+        x=time,
+        y=np.asarray(values, np.float32),
+        mode="lines",
+        name=name,
+        line=line,
+        showlegend=in_legend,
+        **options,
+    )
+
+
+def robust_figure(tuning: Tuning) -> go.Figure:
+    """Overshoot against settling time of every drawn motor, ours beside the textbook's."""
+    figure = go.Figure()
+    for one, colour in zip(tuning.candidates, (SIMULATED, RESIDUAL), strict=False):
+        if one.robust is None:
+            continue
+        settles = np.isfinite(one.robust.settling)
+        trace = go.Scatter(
+            x=1e3 * one.robust.settling[settles],
+            y=one.robust.overshoot[settles],
+            mode="markers",
+            name=one.name,
+            marker={"color": colour, "size": 5, "opacity": 0.6},
+        )
+        figure.add_trace(trace)
+    figure.update_xaxes(title_text="settling [ms]")
+    figure.update_yaxes(title_text="overshoot [%]", rangemode="tozero")
+    style(figure, height=340)
+    return figure
