@@ -10,13 +10,14 @@ from ..compiled import compiled
 from ..effects.base import State
 from ..motor import Drive, Motor
 from ..precision import double_precision
-from ..simulate.solver import held_step, propagator
+from ..simulate.solver import Propagator, held_step, propagator
 from .controllers import Number
 from .metrics import BAND
 from .steady import steady_state
 
 INSTANTS = 20_000  # of a simulated dash
 DOUBLINGS = 12  # of its duration, before the band counts as out of reach
+DRIVE = Drive()  # by the voltage
 
 
 @double_precision
@@ -85,29 +86,18 @@ def _dash(
 
     **Returns**: when the band is reached (NaN if it is not), and whether its far side is respected.
     """
-    drive, step = Drive(), duration / INSTANTS
-    along = propagator(motor, jnp.asarray(step), drive)
+    step = duration / INSTANTS
+    along = propagator(motor, jnp.asarray(step), DRIVE)
     ahead = jnp.sign(setpoint - initial)
     band = BAND * jnp.abs(setpoint - initial)
     load = jnp.asarray(load, float)
-
-    def limited(state: State, voltage):
-        """The next state at this voltage, or at the one that ends the step at the current limit."""
-        flat_out = held_step(motor, along, drive, state, voltage, load)
-        if current_limit is None:
-            return flat_out
-        idle = held_step(motor, along, drive, state, jnp.zeros_like(voltage), load)
-        gain = flat_out.current - idle.current
-        most = jnp.sign(voltage) * current_limit
-        share = (most - idle.current) / jnp.where(gain == 0, 1.0, gain)
-        applied = voltage * jnp.clip(share, -1.0, 1.0)
-        return held_step(motor, along, drive, state, applied, load)
 
     def instant(carry, k):
         state, braking, turned = carry
         short = ahead * (setpoint - state.speed) - band
         braking = braking | (k >= switch) | (short <= 0)
-        new = limited(state, jnp.where(braking, -ahead, ahead) * voltage_limit)
+        voltage = jnp.where(braking, -ahead, ahead) * voltage_limit
+        new = _next_state(motor, along, state, voltage, current_limit, load)
         turned = turned | (braking & (ahead * (new.speed - state.speed) <= 0))
         # what comes after the turn does not count
         state = jax.tree.map(lambda now, then: jnp.where(turned, now, then), state, new)
@@ -120,3 +110,23 @@ def _dash(
     k = jnp.argmax(short <= 0)
     crossing = step * (k - 1 + short[k - 1] / (short[k - 1] - short[k]))
     return jnp.where(jnp.any(short <= 0), crossing, jnp.nan), jnp.min(short) >= -2 * band
+
+
+def _next_state(
+    motor: Motor,
+    along: Propagator,
+    state: State,
+    voltage: Float[Array, ""],
+    current_limit: Number | None,
+    load: Float[Array, ""],
+) -> State:
+    """The next state at this voltage, or at the one that ends the step at the current limit."""
+    flat_out = held_step(motor, along, DRIVE, state, voltage, load)
+    if current_limit is None:
+        return flat_out
+    idle = held_step(motor, along, DRIVE, state, jnp.zeros_like(voltage), load)
+    gain = flat_out.current - idle.current
+    most = jnp.sign(voltage) * current_limit
+    share = (most - idle.current) / jnp.where(gain == 0, 1.0, gain)
+    applied = voltage * jnp.clip(share, -1.0, 1.0)
+    return held_step(motor, along, DRIVE, state, applied, load)

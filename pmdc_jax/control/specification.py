@@ -25,7 +25,12 @@ MAX_SENSITIVITY = 2.0  # of the loop by default, over any frequency
 LONGEST_SAMPLE_TIME = 1e-3  # s, of those chosen by default
 SAMPLES_PER_SETTLING = 40  # samples by default in the fastest settling, at least
 FEW_SAMPLES = 10  # samples in the fastest settling; with fewer the loop loses much
-MOST_SAMPLES = 20_000  # samples of one step
+# How long each part of the task takes: so many times the fastest settling, or beyond it so many times what no loop is
+# faster than.
+PART_SETTLINGS = 2.5
+PART_DEAD_TIMES = 20
+LEAST_SAMPLES = 32  # of each part of the task
+MOST_SAMPLES = 20_000  # of each part of the task
 
 
 @frozen
@@ -164,8 +169,9 @@ def _check(name: str, value: float | None, wanted: str, is_right: Callable[[floa
 def _samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> int:
     """How many show one step, rounded up so that few shapes are ever compiled."""
     # what no loop is much faster than: electrical time constant, hold and delay
-    dead = float(motor.L / motor.R) / 4 + (1 + delay) * sample_time
-    needed = max(32, math.ceil(max(2.5 * fastest, fastest + 20 * dead) / sample_time))
+    dead_time = float(motor.L / motor.R) / 4 + (1 + delay) * sample_time
+    duration = max(PART_SETTLINGS * fastest, fastest + PART_DEAD_TIMES * dead_time)
+    needed = max(LEAST_SAMPLES, math.ceil(duration / sample_time))
     if needed > MOST_SAMPLES:
         raise InputError(
             "--sample-time",

@@ -185,7 +185,10 @@ def design(
     seed: int = 0,
     progress: ReportProgress | None = None,
 ) -> Tuning:
-    """`tune` for requirements that stand together; the other arguments are those of `tune`.
+    """`tune`, with what is asked of the loop in one object.
+
+    **Arguments**: `motor`, of scalars; `requirements`; `uncertainty` of the motor, which the spread of the requirements
+    takes the place of; `starts`, how many are followed; `seed`; `progress`.
 
     **Raises**: `InputError` for requirements that no controller can meet, with the limit.
     """
