@@ -37,6 +37,7 @@ STEADY_SHARE = 0.25
 
 # Weights in the cost. Settling, over the fastest settling, counts 1, and so does the mean change of voltage from sample
 # to sample, over the voltage limit.
+
 # Of the recovery from the load, over the fastest settling: the step itself comes first.
 RECOVERY = 0.1
 # Of a relative steady error: one that fills the band costs as much as half the fastest settling.
