@@ -67,6 +67,7 @@ def named(**changes) -> Diagnosis:
         "base": base,
         "final": evolve(base, parameters=parameters),
         "p_nothing": 1e-30,
+        "electrical_misfit": 1.02,
         "seconds": {"total": 12.0},
     }
     return Diagnosis(**(fields | changes))
@@ -134,6 +135,12 @@ def test_nothing_found_says_what_would_have_been_seen():
     assert "Constant load above 4.00 mN·m would have shown" in told
     assert "gap" not in told
     assert "--tie Kt=Kb" in told  # what identification warns of is not lost
+
+
+def test_what_no_torque_can_leave_in_words():
+    left = "41.0 times what the noise of the sensors explains, and no torque can be why"
+    assert left in words(evolve(not_in_library(), electrical_misfit=41.0))
+    assert "times what the noise" not in words(not_in_library())
 
 
 def test_rivals_and_the_run_that_decides_in_words():

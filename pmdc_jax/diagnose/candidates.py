@@ -7,11 +7,18 @@ grid that the recordings set. Effects that are no small change (a lag, a shaft) 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..effects import EFFECTS, CoulombFriction, ShaftCompliance
+from ..effects import (
+    EFFECTS,
+    AsymmetricFriction,
+    CoulombFriction,
+    ShaftCompliance,
+    StribeckFriction,
+)
 
 Values = dict[str, float]
 
@@ -254,6 +261,19 @@ def _thermal(scales: Scales) -> list[float]:
     return [scales.duration * x for x in (0.03, 0.1, 0.3, 1.0)]
 
 
+def _without_peak(friction: StribeckFriction) -> Values:
+    """Of a size in between: a peak as wide as the speeds that occur leaves nothing beside it."""
+    return {"torque_Nm": float(friction.coulomb_Nm + friction.static_Nm) / 2}
+
+
+def _mean_friction(friction: AsymmetricFriction) -> Values:
+    return {"torque_Nm": float(friction.forward_Nm + friction.backward_Nm) / 2}
+
+
+def _offset(friction: AsymmetricFriction) -> Values:
+    return {"torque_Nm": float(friction.forward_Nm - friction.backward_Nm) / 2}
+
+
 class Fuller(NamedTuple):
     """A fuller form of an effect."""
 
@@ -271,8 +291,8 @@ class Trial(NamedTuple):
     starts: Callable[[Scales], list[Values]] | None = None
     # what else to try from where its refit ended, if it has many optima
     around: Callable[[Values], list[Values]] | None = None
-    # effects that it contains, and replaces
-    contains: frozenset[str] = frozenset()
+    # effects that it contains, and replaces, each with what of the fitted effect is it
+    contains: Mapping[str, Callable[[Any], Values]] = MappingProxyType({})
     # a fuller form of it, which the runs must rule out
     fuller: Fuller | None = None
 
@@ -282,9 +302,9 @@ TRIALS: Mapping[str, Trial] = {
         _amplitude("torque_Nm", lambda s: s.torque),
         fuller=Fuller("stribeck_friction", _with_peak, ("static_Nm", "speed_rad_s")),
     ),
-    "stribeck_friction": Trial(_stribeck, contains=frozenset({"coulomb_friction"})),
+    "stribeck_friction": Trial(_stribeck, contains={"coulomb_friction": _without_peak}),
     "asymmetric_friction": Trial(
-        _asymmetric, contains=frozenset({"coulomb_friction", "constant_load"})
+        _asymmetric, contains={"coulomb_friction": _mean_friction, "constant_load": _offset}
     ),
     "quadratic_drag": Trial(_amplitude("drag_Nms2_rad2", lambda s: s.torque / s.speed**2)),
     "cogging_torque": Trial(_periodic("amplitude_Nm", lambda s: s.torque)),

@@ -13,6 +13,9 @@ from ..identify.identification import Estimate, Identification, Role
 Verdict = Literal["none_detected", "named", "ambiguous", "not_in_library"]
 
 
+# Sensors' own ways, and formulas that are not quite nature's, leave up to 1.4 times the noise in the electrical
+# equation; what is not in the library, such as a filter of the current, three times and more
+MAX_ELECTRICAL = 3.0
 # Hold-outs that are missed by so many times what the fitted runs are show what those do not
 BEYOND = 2.5
 # ... or the effects that were added make them worse by this factor
@@ -100,7 +103,14 @@ class Diagnosis:
     base: Identification  # without effects
     final: Identification  # with the effects that were found
     p_nothing: float  # of the data if nothing were missing
+    # what the electrical equation leaves over what the sensors' white noise would; see `balance.electrical_misfit`
+    electrical_misfit: float
     seconds: Mapping[str, float]
+
+    @property
+    def breaks_electrical_equation(self) -> bool:
+        """Whether what is left cannot come from any torque."""
+        return self.electrical_misfit > MAX_ELECTRICAL
 
     @property
     def beyond_fitted(self) -> float | None:

@@ -25,6 +25,9 @@ from ..identify.solve import polish_with_angle
 from ..motor import Motor
 from .response import Path, path_of
 
+# What is missed by a smaller share of what is measured is nothing
+CLOSE = 1e-4
+
 
 @attrs.frozen(eq=False)
 class Model:
@@ -79,6 +82,11 @@ class Model:
         sizes = self.given.problem.sizes
         there = sizes > 0
         return float(np.max(self.fit.noise[there] / sizes[there], initial=0.0))
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it misses nothing: one simulation meets another no closer."""
+        return self.misses < CLOSE
 
     @property
     def training(self) -> list[int]:

@@ -31,8 +31,6 @@ from .shortlist import (
     shortlist,
 )
 
-# What is missed by a smaller share of what is measured is nothing: one simulation meets another no closer
-CLOSE = 1e-4
 # At most so many effects are named
 MOST = 3
 # What the clearest signal would take away after one more effect, over what that effect takes away, at most; the larger
@@ -298,7 +296,7 @@ class StepwiseSelection:
         of_candidates, of_curves = signals(found)
         count = len(found.candidates) + len(found.curves)
         count *= MOST if model.effects else 1
-        left = 1.0 if model.misses < CLOSE else chance_of_nothing(of_candidates, of_curves, count)
+        left = 1.0 if model.is_exact else chance_of_nothing(of_candidates, of_curves, count)
         explained = 0.0
         if model.effects:
             base, mine = (self.comparison.left(m, found.white) for m in (self.base, model))
@@ -337,7 +335,7 @@ class StepwiseSelection:
             ):
                 return self._eliminated(smaller)
         for effect in model.effects:
-            for simple in sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys()):
+            for simple in self._simpler_forms(effect):
                 simpler = self.refits.in_place(model, white, effect, simple)
                 if self._is_new(simpler) and self._does_as_well(simpler, model):
                     return self._eliminated(simpler)
@@ -345,6 +343,14 @@ class StepwiseSelection:
                 if two and self._is_far_better(two, model, white):
                     return self._eliminated(two)
         return model
+
+    def _simpler_forms(self, effect: str) -> list[str]:
+        """What an effect contains and may be instead: what was tried, and what holds the motor as it does."""
+        return sorted(
+            simple
+            for simple in CONTAINS.get(effect, set())
+            if simple in self.refits.begun or EFFECTS[simple].holds == EFFECTS[effect].holds
+        )
 
     def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:
         """A model with a simpler form of a rich effect, and one more beside it that promises as much as the rich form.

@@ -20,7 +20,9 @@ from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..recording_file import Runs
 from .assessment import ALARM
+from .balance import electrical_misfit
 from .diagnosis import (
+    MAX_ELECTRICAL,
     Detectable,
     Diagnosis,
     EffectFound,
@@ -83,7 +85,8 @@ def diagnose(
     while (idle := _idle(naming, final, selection.library)) is not None:
         naming = selection.without(naming, idle)
         final = _judged(naming, solved)
-    verdict = _verdict(naming)
+    electrical = electrical_misfit(naming.chosen)
+    verdict = "not_in_library" if electrical > MAX_ELECTRICAL else _verdict(naming)
     gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
     total = _total(gaps, base)
     if unlike_held_out(total):
@@ -107,6 +110,7 @@ def diagnose(
         base=base,
         final=final,
         p_nothing=naming.nothing,
+        electrical_misfit=electrical,
         seconds=seconds,
     )
 

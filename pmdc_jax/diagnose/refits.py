@@ -98,17 +98,26 @@ class Refits:
         return self.models[key]
 
     def in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
-        """The current model with an effect in place of another: a fuller form of it, or one that has starts of its own,
-        or was begun before."""
+        """The current model with an effect in place of another: a fuller or a simpler form of it, or one that has
+        starts of its own, or was begun before."""
         effects = (*(e for e in current.effects if e != old), new)
 
         def refit() -> Model:
-            starts = self._starts(current, effects) or [self._start(current, effects, {})]
+            its = self._simple_form(current, old, new)
+            starts = self._starts(current, effects) or [self._start(current, effects, its)]
             if old in FULLER and FULLER[old].effect == new:
                 starts = [self._in_full(current, old, effects), *starts]
             return self._best_of(effects, starts, white)
 
         return self._once(effects, current, refit)
+
+    def _simple_form(self, current: Model, rich: str, simple: str) -> dict[str, Values]:
+        """How to begin with a simple form that was never tried, by what a rich one is of it."""
+        contains = TRIALS[rich].contains
+        if simple in self.begun or simple not in contains:
+            return {}
+        effect = next(e for e in current.motor.effects if e.name == rich)
+        return {simple: contains[simple](effect)}
 
     def sought(self, current: Model, effect: str) -> Model:
         """The current model with one more effect, searched for without regard to how it was fitted."""

@@ -28,16 +28,16 @@ def white_noise(signals: Sequence[np.ndarray]) -> float | None:
         return None
     size = np.sqrt(np.mean([np.nanmean(np.square(s)) for s in signals]))
     spread = np.median(np.abs(differences)) / (0.6745 * np.sqrt(6.0))
-    return float(max(spread, _rounding(known), FLOOR * size, 1e-12))
+    return float(max(spread, resolution_noise(known), FLOOR * size, 1e-12))
 
 
 def is_coarse(signal: np.ndarray) -> bool:
     """Whether a signal moves in steps that its noise does not blur: errors then last as long as it stands still."""
     known = signal[~np.isnan(signal)]
-    return bool(np.std(np.diff(known, 2)) / np.sqrt(6.0) < 2 * _rounding([known]))
+    return bool(np.std(np.diff(known, 2)) / np.sqrt(6.0) < 2 * resolution_noise([known]))
 
 
-def _rounding(signals: Sequence[np.ndarray]) -> float:
+def resolution_noise(signals: Sequence[np.ndarray]) -> float:
     """Standard deviation of what rounding to the quanta of the sensor does."""
     return quantum(np.concatenate([np.diff(s) for s in signals])) / np.sqrt(12.0)
 

@@ -58,6 +58,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "curves": [asdict(curve) for curve in diagnosis.curves],
         "detectable": [asdict(one) for one in diagnosis.detectable],
         "p_nothing_missing": diagnosis.p_nothing,
+        "electrical_misfit": diagnosis.electrical_misfit,
         "before": {"parameters": {name: _estimate(estimate) for name, estimate in before}},
     }
     return identification_json(diagnosis.final) | _plain(found)

@@ -99,7 +99,8 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
             "" if unlike_held_out(diagnosis.gap) else "; what is left is no effect of the library"
         )
         found = _capitalised(_effects_in_words(diagnosis))
-        sentences.append(f"{found} explains part of it and was added{rest}.")
+        verb, added = ("explain", "were") if len(diagnosis.effects) > 1 else ("explains", "was")
+        sentences.append(f"{found} {verb} part of it and {added} added{rest}.")
     else:
         sentences.append("Something is missing that no effect of the library explains.")
     if diagnosis.curves:
@@ -113,6 +114,12 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
             f"Drawn by the data it looks most like a {kind} over {curve.variable}, clearest with"
             f" {value} {place_in_words(curve.variable, curve.x[peak])}"
             f" ({p_value_words(curve.p_value)})."
+        )
+    if diagnosis.breaks_electrical_equation:
+        sentences.append(
+            "From sample to sample the current departs from where voltage and speed lead it by"
+            f" {significant(diagnosis.electrical_misfit)} times what the noise of the sensors explains, and no torque"
+            " can be why: what is missing acts on voltage or current, or the recorded current was filtered or averaged."
         )
     if beyond := diagnosis.beyond_fitted:
         sentences.append(

@@ -25,10 +25,12 @@ from ..prepare import Prepared
 LINES, WHOLE = 2e4, 0.02
 # Power in counts squared, between that of a speed that was rounded to counts, 1/12, and that of such a mean, 1/3
 COUNTED = 1 / 6
+# ... and the same of the mean over all high frequencies, between 1/12 and 1/4
+COUNTED_IN_ALL = 1 / 7
 # ... known of a run of so many samples
 ENOUGH = 200
-# Shares of the highest frequency about half of it, near it, and next to it
-BANDS = ((0.4, 0.6), (0.9, 0.95), (0.98, 1.0))
+# Shares of the highest frequency about half of it, near it, and next to it; and all that are high
+BANDS = ((0.4, 0.6), (0.9, 0.95), (0.98, 1.0), (0.4, 1.0))
 # A mean over two samples has no more than this share of the power near the highest frequency next to it: in theory 1/40
 NONE = 1 / 8
 
@@ -120,25 +122,27 @@ def counted_over(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]
 
     Angles that are rounded to counts have a white noise of 1/12 count squared. Of differences over one sample it is
     four times as strong at the highest frequency, and twice at half of that; of differences over two samples, counted
-    by halves, it is none at all, and four times.
+    by halves, it is none at all, and four times. While a rotor turns steadily the noise is no noise but a beat, which
+    may be anywhere: then it is as strong in all, and the fit must tell.
     """
-    middle, high, highest = _powers(counts)
+    middle, high, highest, in_all = _powers(counts)
     if highest > COUNTED:
         clearly = highest > np.sqrt(2.0) * max(middle, COUNTED)
         return LAST, -np.inf if clearly else -LIKELIER
+    if in_all > COUNTED_IN_ALL and not highest < NONE * high:
+        return LAST, LIKELIER
     return TWO if highest < NONE * high else None, -LIKELIER
 
 
 def differenced_over(speeds: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
     """The same of other speeds: nothing of differences over two samples is at the highest frequency, but of any other
     signal with noise or steps there is as much as near it."""
-    _, high, highest = _powers(speeds) if speeds else (0.0, 0.0, 0.0)
+    _, high, highest, _ = _powers(speeds) if speeds else (0.0, 0.0, 0.0, 0.0)
     return TWO if highest < NONE * high else None, LIKELIER
 
 
 def _powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
-    """The power of some signals about half of their highest frequency, near it, and next to it, if it were the same at
-    all of them.
+    """The power of some signals within each of the `BANDS`, if it were the same at all frequencies.
 
     By second differences: what is slow is so much stronger that it would leak.
     """
