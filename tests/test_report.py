@@ -19,7 +19,7 @@ from pmdc_jax.recording import Finding
 from pmdc_jax.report import figures, notation
 from pmdc_jax.report.identification import write_report
 from pmdc_jax.report.json import identification_json, write_json
-from pmdc_jax.report.summary import summary
+from pmdc_jax.report.summary import MODEL_ASSUMPTION, summary
 from pmdc_jax.report.terminal import identification_tables
 
 TRUTH = {"R": 0.157, "L": 84e-6, "Kb": 0.0501, "Kt": 0.0501, "J": 1.21e-3, "f": 2.3e-4}
@@ -312,6 +312,21 @@ def test_summary_says_what_matters():
     assert "No run was held out" in sentences
     assert "L stands at the bound" in sentences
     assert "did not converge" in sentences
+
+
+def test_summary_presumes_nothing_that_a_message_doubts():
+    told = "the fit leaves 22 times its white noise: `pmdc diagnose` tells what is missing"
+    doubted = fake_identification(messages=(told,), doubts=(told,))
+    assert MODEL_ASSUMPTION not in summary(doubted)
+    assert MODEL_ASSUMPTION in summary(fake_identification(messages=("something else",)))
+
+
+def test_several_directions_with_one_reason_are_told_once():
+    unseen = partial_identification()
+    (one, *_) = unseen.unidentified_directions
+    twice = replace(one, parameters=(*one.parameters, "friction"))
+    sentences = summary(replace(unseen, unidentified_directions=(one, twice)))
+    assert sum(one.mend in sentence for sentence in sentences) == 1
 
 
 def test_summary_names_the_worst_hold_out_and_its_excess():

@@ -93,3 +93,4 @@ class Identification:
     covariance: np.ndarray = field(repr=False)
     covariance_names: tuple[str, ...] = ()
     messages: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()  # those messages which say that the model lacks something

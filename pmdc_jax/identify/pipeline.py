@@ -61,5 +61,6 @@ def identify(
     given, polished = last_fit(given, plainly, plainly, white)
     found = results_of(given, solved._replace(fit=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
-    messages = (*found.messages, *of_friction(friction, found), *missed(found.fit))
-    return attrs.evolve(found, seconds=seconds, messages=messages)
+    doubts = (*of_friction(friction, found), *missed(found.fit))
+    messages = (*found.messages, *doubts)
+    return attrs.evolve(found, seconds=seconds, messages=messages, doubts=doubts)

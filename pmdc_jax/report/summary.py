@@ -34,19 +34,16 @@ def summary(identification: Identification) -> list[str]:
     """The sentences at the top of the report, the most important first."""
     sentences = [_identified_sentence(identification), _holdout_sentence(identification)]
     sentences += cautions(identification)
-    # where the fit misses much, a message has said so already
-    told = any("pmdc diagnose" in message for message in identification.messages)
-    if _with_status(identification, "identified") and not told:
+    if _with_status(identification, "identified") and not identification.doubts:
         sentences.append(MODEL_ASSUMPTION)
     return sentences
 
 
 def cautions(identification: Identification) -> list[str]:
     """What the recordings cannot tell, and where the numbers are not to be trusted."""
-    sentences = [
-        f"{as_sentence(direction.why)} {as_sentence(direction.mend)}"
-        for direction in identification.unidentified_directions
-    ]
+    directions = identification.unidentified_directions
+    told = (f"{as_sentence(one.why)} {as_sentence(one.mend)}" for one in directions)
+    sentences = list(dict.fromkeys(told))  # several directions may have one reason
     at_bound = _with_status(identification, "at_bound")
     if at_bound:
         who = f"{enumerate_words(at_bound)} {'stand' if len(at_bound) > 1 else 'stands'}"
