@@ -209,6 +209,20 @@ def test_a_simple_form_begins_within_its_ranges(rich, simple):
         assert abs(values[field]) > 0.1 * sizes[list(sizes)[1]]
 
 
+LIKE = [(old, new) for old in TRIALS for new in TRIALS[old].alike]
+
+
+@pytest.mark.parametrize(("old", "new"), LIKE)
+def test_what_is_alike_begins_alike(old, new):
+    """There and back again is where it was."""
+    effect = EFFECTS[old](**dict.fromkeys(EFFECTS[old].ranges, np.asarray(3e-3)))
+    values = TRIALS[old].alike[new](effect)
+    assert values.keys() == EFFECTS[new].ranges.keys()
+    other = EFFECTS[new](**{field: np.asarray(x) for field, x in values.items()})
+    back = TRIALS[new].alike[old](other)
+    assert back == {field: float(getattr(effect, field)) for field in effect.ranges}
+
+
 @pytest.mark.parametrize("simple", FULLER)
 def test_a_fuller_form_begins_as_the_simple_one_with_more_to_it(simple):
     """Possible, within its ranges, and as large as the simple one."""

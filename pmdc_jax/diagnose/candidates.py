@@ -17,6 +17,8 @@ from ..effects import (
     AsymmetricFriction,
     CoulombFriction,
     ShaftCompliance,
+    SpeedSensorDelay,
+    SpeedSensorLag,
     StribeckFriction,
 )
 
@@ -274,6 +276,14 @@ def _offset(friction: AsymmetricFriction) -> Values:
     return {"torque_Nm": float(friction.forward_Nm - friction.backward_Nm) / 2}
 
 
+def _as_late(lag: SpeedSensorLag) -> Values:
+    return {"delay_s": float(lag.time_constant_s)}
+
+
+def _as_slow(delay: SpeedSensorDelay) -> Values:
+    return {"time_constant_s": float(delay.delay_s)}
+
+
 class Fuller(NamedTuple):
     """A fuller form of an effect."""
 
@@ -293,6 +303,8 @@ class Trial(NamedTuple):
     around: Callable[[Values], list[Values]] | None = None
     # effects that it contains, and replaces, each with what of the fitted effect is it
     contains: Mapping[str, Callable[[Any], Values]] = MappingProxyType({})
+    # effects that look much like it, each with how it would begin in its place
+    alike: Mapping[str, Callable[[Any], Values]] = MappingProxyType({})
     # a fuller form of it, which the runs must rule out
     fuller: Fuller | None = None
 
@@ -331,7 +343,9 @@ TRIALS: Mapping[str, Trial] = {
             _finite("width_V", lambda s: [share * s.voltage for share in (0.01, 0.05)]),
         )
     ),
-    "speed_sensor_lag": Trial(_finite("time_constant_s", _times)),
-    "speed_sensor_delay": Trial(_finite("delay_s", _times)),
+    "speed_sensor_lag": Trial(
+        _finite("time_constant_s", _times), alike={"speed_sensor_delay": _as_late}
+    ),
+    "speed_sensor_delay": Trial(_finite("delay_s", _times), alike={"speed_sensor_lag": _as_slow}),
     "current_sensor_offset": Trial(_amplitude("offset_A", lambda s: s.current, signed=True)),
 }

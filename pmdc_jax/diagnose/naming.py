@@ -13,6 +13,7 @@ from ..identify.polish import Fit
 from ..identify.prepare import Prepared
 from ..identify.solve import Solved
 from .assessment import ALARM, HARDER, MUCH_OF_IT, Assessment, chance_of_nothing
+from .candidates import TRIALS
 from .compare import FAR, MARGIN, Comparison, Fitted, plainest
 from .effect_relations import CONTAINS, are_rivals, spelt_out
 from .library import Library
@@ -264,13 +265,17 @@ class StepwiseSelection:
         return self._with(model, found, fuller) + self._in_harder_form(model, found, added)
 
     def _equivalent_swaps(self, current: Model, found: Assessment) -> list[Model | None]:
-        """The model with others in the place of its effects that did as well as these when they were added."""
+        """The model with others in the place of its effects that did as well as these when they were added, or are much
+        like them."""
         if len(current.effects) < 2:
             return []
         return [
             self.refits.in_place(current, found.screen.white, effect, other)
             for effect in current.effects
-            for other in sorted(self.instead.get(effect, set()) - set(current.effects))
+            for other in sorted(
+                (self.instead.get(effect, set()) | TRIALS[effect].alike.keys())
+                - set(current.effects)
+            )
         ]
 
     def _with(

@@ -98,12 +98,12 @@ class Refits:
         return self.models[key]
 
     def in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
-        """The current model with an effect in place of another: a fuller or a simpler form of it, or one that has
-        starts of its own, or was begun before."""
+        """The current model with an effect in place of another: a fuller or a simpler form of it, one that is
+        alike, or one that has starts of its own, or was begun before."""
         effects = (*(e for e in current.effects if e != old), new)
 
         def refit() -> Model:
-            its = self._simple_form(current, old, new)
+            its = self._by_what_it_replaces(current, old, new)
             starts = self._starts(current, effects) or [self._start(current, effects, its)]
             if old in FULLER and FULLER[old].effect == new:
                 starts = [self._in_full(current, old, effects), *starts]
@@ -111,13 +111,14 @@ class Refits:
 
         return self._once(effects, current, refit)
 
-    def _simple_form(self, current: Model, rich: str, simple: str) -> dict[str, Values]:
-        """How to begin with a simple form that was never tried, by what a rich one is of it."""
-        contains = TRIALS[rich].contains
-        if simple in self.begun or simple not in contains:
+    def _by_what_it_replaces(self, current: Model, old: str, new: str) -> dict[str, Values]:
+        """How to begin with an effect that is alike, or with a simple form that was never tried, by what it replaces."""
+        trial = TRIALS[old]
+        begins = {**(trial.contains if new not in self.begun else {}), **trial.alike}
+        if new not in begins:
             return {}
-        effect = next(e for e in current.motor.effects if e.name == rich)
-        return {simple: contains[simple](effect)}
+        effect = next(e for e in current.motor.effects if e.name == old)
+        return {new: begins[new](effect)}
 
     def sought(self, current: Model, effect: str) -> Model:
         """The current model with one more effect, searched for without regard to how it was fitted."""
