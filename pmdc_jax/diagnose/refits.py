@@ -112,7 +112,7 @@ class Refits:
         return self._once(effects, current, refit)
 
     def _by_what_it_replaces(self, current: Model, old: str, new: str) -> dict[str, Values]:
-        """How to begin with an effect that is alike, or with a simple form that was never tried, in place of another."""
+        """How to begin with an effect that is alike, or a simple form that was never tried, in place of another."""
         trial = TRIALS[old]
         begins = {**(trial.contains if new not in self.begun else {}), **trial.alike}
         if new not in begins:
