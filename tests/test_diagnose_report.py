@@ -141,6 +141,8 @@ def test_what_no_torque_can_leave_in_words():
     left = "41.0 times what the noise of the sensors explains, and no torque can be why"
     assert left in words(evolve(not_in_library(), electrical_misfit=41.0))
     assert "times what the noise" not in words(not_in_library())
+    assert "no interval covers that" in words(not_in_library())
+    assert "no interval covers that" not in words(named())
 
 
 def test_rivals_and_the_run_that_decides_in_words():

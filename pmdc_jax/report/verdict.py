@@ -131,7 +131,7 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
             "With it held-out runs are missed by more than without: something else is missing that looks alike in the"
             " fitted ones. Fit one of the held-out runs, too."
         )
-    return sentences
+    return [*sentences, "Parameters make up for what is missing: no interval covers that."]
 
 
 def disagreement(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> str:
