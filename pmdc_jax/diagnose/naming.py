@@ -15,7 +15,7 @@ from ..identify.solve import Solved
 from .assessment import ALARM, HARDER, MUCH_OF_IT, Assessment, chance_of_nothing
 from .candidates import TRIALS
 from .compare import FAR, MARGIN, Comparison, Fitted, plainest
-from .effect_relations import CONTAINS, are_rivals, spelt_out
+from .effect_relations import CONTAINS, FULLER, are_rivals, spelt_out
 from .library import Library
 from .model import Model, final_fit
 from .periodic import Line, line_of
@@ -350,12 +350,9 @@ class StepwiseSelection:
         return model
 
     def _simpler_forms(self, effect: str) -> list[str]:
-        """What an effect contains and may be instead: what was tried, and what holds the motor as it does."""
-        return sorted(
-            simple
-            for simple in CONTAINS.get(effect, set())
-            if simple in self.refits.begun or EFFECTS[simple].holds == EFFECTS[effect].holds
-        )
+        """What an effect contains and may be instead: what was tried, and what it is but a fuller form of."""
+        fuller = {simple for simple, form in FULLER.items() if form.effect == effect}
+        return sorted(CONTAINS.get(effect, set()) & (self.refits.begun.keys() | fuller))
 
     def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:
         """A model with a simpler form of a rich effect, and one more beside it that promises as much as the rich form.
@@ -380,6 +377,9 @@ class StepwiseSelection:
         return two if two and two.is_possible else None
 
     def _is_far_better(self, two: Model, model: Model, white: Whitener) -> bool:
+        """Whether two effects leave far less than a rich one by the filter, and no more as it is."""
+        if two.fit.fitness > model.fit.fitness:
+            return False
         criterion = {f.model: f.criterion for f in self.comparison.ranked([two, model], white)}
         return bool(criterion[two] + MARGIN < criterion[model])
 
