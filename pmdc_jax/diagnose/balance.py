@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from ..identify.generalised_least_squares import residuals_of, series_of
 from ..identify.noise import resolution_noise, white_noise
-from ..motor import Motor
-from .model import Model, rows_of
+from ..motor import Drive, Motor
+from .model import Model
 
 # Fewer samples of a run tell nothing
 ENOUGH = 50
@@ -24,38 +25,36 @@ def electrical_misfit(model: Model) -> float:
 
     With residuals i and w of current and speed, R i + L di/dt + Kb w = 0 between two samples, w on a straight line.
     """
-    tape, given = model.given.problem.tape, model.given
-    ratios = [1.0]
     if model.is_exact:
         return 1.0
-    for run, rows in zip(model.training, rows_of(model), strict=True):
-        both = rows.residual.kind[1] == (0, 1)
-        if not both or not float(tape.drive_of(run).voltage) or rows.residual.known.sum() < ENOUGH:
+    given, tape, ratios = model.given, model.given.problem.tape, [1.0]
+    residuals = residuals_of(given, model.fit)
+    for run, residual in zip(model.training, residuals, strict=True):
+        drive, known = tape.drive_of(run), residual.known
+        if residual.kind[1] != (0, 1) or not drive.voltage or known.sum() < ENOUGH:
             continue
-        left = rows.residual.values
-        measured = left + rows.simulated.values
-        known = rows.residual.known
+        left, measured = residual.values, series_of(tape, run, np.asarray(tape.measured)).values
         current, speed = (_noise(measured[known, c], left[known, c]) for c in range(2))
-        a, before, after, volt = _step(model.motor, tape.sample_time_of(run))
+        kept, before, after, volt = _step(model.motor, drive, tape.sample_time_of(run))
         i, w = left.T
-        rest = i[1:] - a * i[:-1] + before * w[:-1] + after * w[1:]
+        rest = i[1:] - kept * i[:-1] - before * w[:-1] - after * w[1:]
         rest = rest[known[1:] & known[:-1]]
         unfelt = given.input_noise.get(given.runs[run].name, 0.0)
-        explained = (
-            current**2 * (1 + a**2) + speed**2 * (before**2 + after**2) + (volt * unfelt) ** 2
-        )
+        explained = current**2 * (1 + kept**2) + speed**2 * (before**2 + after**2)
+        explained += (volt * unfelt) ** 2
         ratios.append(float(np.sqrt(np.mean(np.square(rest)) / explained)))
     return max(ratios)
 
 
-def _step(motor: Motor, seconds: float) -> tuple[float, float, float, float]:
-    """What of the current is left after a step, and what the speed before and after it, and a volt throughout, take of
-    it and add to it: A per A, A per rad/s twice, A per V."""
-    R, L, Kb = (float(x) for x in (motor.R, motor.L, motor.Kb))
-    x = R * seconds / L
-    a, mean = np.exp(-x), -np.expm1(-x) / x
-    later = (1 - mean) / x
-    return a, Kb * seconds / L * (mean - later), Kb * seconds / L * later, seconds / L * mean
+def _step(motor: Motor, drive: Drive, seconds: float) -> tuple[float, float, float, float]:
+    """What of the current is left after a step, and what the speed before and after it, and a volt throughout, add to
+    it: A per A, A per rad/s twice, A per V."""
+    A, B = map(np.asarray, motor.state_space(drive))
+    decay = A[0, 0] * seconds
+    mean = np.expm1(decay) / decay
+    later = (mean - 1) / decay
+    by_speed, by_volt = A[0, 1] * seconds, B[0, 0] * seconds
+    return np.exp(decay), by_speed * (mean - later), by_speed * later, by_volt * mean
 
 
 def _noise(measured: Float[np.ndarray, " samples"], left: Float[np.ndarray, " samples"]) -> float:

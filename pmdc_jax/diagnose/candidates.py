@@ -14,7 +14,6 @@ import numpy as np
 
 from ..effects import (
     EFFECTS,
-    AsymmetricFriction,
     CoulombFriction,
     ShaftCompliance,
     SpeedSensorDelay,
@@ -268,14 +267,6 @@ def _without_peak(friction: StribeckFriction) -> Values:
     return {"torque_Nm": float(friction.coulomb_Nm + friction.static_Nm) / 2}
 
 
-def _mean_friction(friction: AsymmetricFriction) -> Values:
-    return {"torque_Nm": float(friction.forward_Nm + friction.backward_Nm) / 2}
-
-
-def _offset(friction: AsymmetricFriction) -> Values:
-    return {"torque_Nm": float(friction.forward_Nm - friction.backward_Nm) / 2}
-
-
 def _as_late(lag: SpeedSensorLag) -> Values:
     return {"delay_s": float(lag.time_constant_s)}
 
@@ -290,6 +281,8 @@ class Fuller(NamedTuple):
     effect: str
     begun: Callable[[Any, Scales], Values]  # by the simple form, what makes it fuller clearly there
     extra: tuple[str, ...]  # the fields that make it so
+    # how the simple form begins by the fuller one, which may have been found without it
+    reduced: Callable[[Any], Values] | None = None
 
 
 class Trial(NamedTuple):
@@ -301,8 +294,8 @@ class Trial(NamedTuple):
     starts: Callable[[Scales], list[Values]] | None = None
     # what else to try from where its refit ended, if it has many optima
     around: Callable[[Values], list[Values]] | None = None
-    # effects that it contains, and replaces, each with what of the fitted effect is it
-    contains: Mapping[str, Callable[[Any], Values]] = MappingProxyType({})
+    # effects that it contains, and replaces
+    contains: frozenset[str] = frozenset()
     # effects that look much like it, each with how it would begin in its place
     alike: Mapping[str, Callable[[Any], Values]] = MappingProxyType({})
     # a fuller form of it, which the runs must rule out
@@ -312,11 +305,11 @@ class Trial(NamedTuple):
 TRIALS: Mapping[str, Trial] = {
     "coulomb_friction": Trial(
         _amplitude("torque_Nm", lambda s: s.torque),
-        fuller=Fuller("stribeck_friction", _with_peak, ("static_Nm", "speed_rad_s")),
+        fuller=Fuller("stribeck_friction", _with_peak, ("static_Nm", "speed_rad_s"), _without_peak),
     ),
-    "stribeck_friction": Trial(_stribeck, contains={"coulomb_friction": _without_peak}),
+    "stribeck_friction": Trial(_stribeck, contains=frozenset({"coulomb_friction"})),
     "asymmetric_friction": Trial(
-        _asymmetric, contains={"coulomb_friction": _mean_friction, "constant_load": _offset}
+        _asymmetric, contains=frozenset({"coulomb_friction", "constant_load"})
     ),
     "quadratic_drag": Trial(_amplitude("drag_Nms2_rad2", lambda s: s.torque / s.speed**2)),
     "cogging_torque": Trial(_periodic("amplitude_Nm", lambda s: s.torque)),

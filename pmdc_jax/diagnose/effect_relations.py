@@ -5,7 +5,7 @@ from __future__ import annotations
 from .candidates import TRIALS
 
 # An effect that contains others replaces them
-CONTAINS = {effect: set(trial.contains) for effect, trial in TRIALS.items() if trial.contains}
+CONTAINS = {effect: trial.contains for effect, trial in TRIALS.items() if trial.contains}
 # The simple forms of which there are fuller ones
 FULLER = {effect: trial.fuller for effect, trial in TRIALS.items() if trial.fuller}
 

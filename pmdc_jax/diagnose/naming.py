@@ -351,8 +351,8 @@ class StepwiseSelection:
 
     def _simpler_forms(self, effect: str) -> list[str]:
         """What an effect contains and may be instead: what was tried, and what it is but a fuller form of."""
-        fuller = {simple for simple, form in FULLER.items() if form.effect == effect}
-        return sorted(CONTAINS.get(effect, set()) & (self.refits.begun.keys() | fuller))
+        reduced = {s for s, form in FULLER.items() if form.effect == effect and form.reduced}
+        return sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys() | reduced)
 
     def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:
         """A model with a simpler form of a rich effect, and one more beside it that promises as much as the rich form.

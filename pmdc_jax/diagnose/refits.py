@@ -113,12 +113,12 @@ class Refits:
 
     def _by_what_it_replaces(self, current: Model, old: str, new: str) -> dict[str, Values]:
         """How to begin with an effect that is alike, or a simple form that was never tried, in place of another."""
-        trial = TRIALS[old]
-        begins = {**(trial.contains if new not in self.begun else {}), **trial.alike}
-        if new not in begins:
+        begins = TRIALS[old].alike.get(new)
+        if new not in self.begun and new in FULLER and FULLER[new].effect == old:
+            begins = FULLER[new].reduced
+        if begins is None:
             return {}
-        effect = next(e for e in current.motor.effects if e.name == old)
-        return {new: begins[new](effect)}
+        return {new: begins(next(e for e in current.motor.effects if e.name == old))}
 
     def sought(self, current: Model, effect: str) -> Model:
         """The current model with one more effect, searched for without regard to how it was fitted."""
