@@ -11,6 +11,7 @@ from plotly.subplots import make_subplots
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from ..control.controllers import CONTROLLERS
 from ..motor import PARAMETERS
 from ..wheelchair import (
     LOADS,
@@ -28,7 +29,6 @@ from .figures import INPUT, MEASURED, RESIDUAL, SIMULATED, style
 from .notation import significant, thousands
 from .page import figure_json, write_page
 from .terminal import plain_table
-from .tuning import TITLES
 
 COLOURS = (RESIDUAL, SIMULATED, INPUT)
 
@@ -75,7 +75,7 @@ def table_2(paper: Paper) -> tuple[list[str], list[list[str]]]:
         limits = (paper.fastest[SUFFICIENT_VOLTAGE], paper.fastest[VOLTAGE])
         rows.append(
             [
-                f"{TITLES[kind]}, settling [s]",
+                f"{CONTROLLERS[kind].label}, settling [s]",
                 f"{printed.settling:g}",
                 significant(simulated and simulated.settling, 3),
                 significant(ours["SettlingTime"], 3),
@@ -84,7 +84,7 @@ def table_2(paper: Paper) -> tuple[list[str], list[list[str]]]:
         )
         rows.append(
             [
-                f"{TITLES[kind]}, overshoot [%]",
+                f"{CONTROLLERS[kind].label}, overshoot [%]",
                 f"{printed.overshoot:g}",
                 significant(simulated and simulated.overshoot, 3),
                 significant(ours["Overshoot"], 2),
@@ -112,7 +112,7 @@ def remarks(paper: Paper) -> list[str]:
 
 def _printed_remarks(paper: Paper) -> list[str]:
     return [
-        f"The printed gains of the {TITLES[kind]}, simulated on the printed motor without any limit, give"
+        f"The printed gains of the {CONTROLLERS[kind].label}, simulated on the printed motor without any limit, give"
         f" {found.overshoot:.1f} % and {found.settling:.3f} s instead of {TABLE_2[kind].overshoot:g} % and"
         f" {TABLE_2[kind].settling:g} s, and ask for {found.peak_voltage:.0f} V on the way."
         for kind, found in paper.as_printed.items()
@@ -224,7 +224,7 @@ def steps_figure(paper: Paper) -> go.Figure:
     )
     for (kind, response), colour in zip(paper.steps.items(), COLOURS, strict=True):
         time = 1e3 * response.time
-        shared = {"x": time, "name": TITLES[kind], "mode": "lines", "legendgroup": kind}
+        shared = {"x": time, "name": CONTROLLERS[kind].label, "mode": "lines", "legendgroup": kind}
         speed = go.Scatter(**shared, y=response.speed, line={"color": colour, "width": 1.6})
         shape = {"color": colour, "width": 1.2, "shape": "hv"}
         voltage = go.Scatter(**shared, y=response.voltage, line=shape, showlegend=False)
@@ -233,7 +233,7 @@ def steps_figure(paper: Paper) -> go.Figure:
         if kind in paper.as_printed:
             printed = paper.as_printed[kind]
             thin = {"color": colour, "width": 1.2, "dash": "dot"}
-            shared |= {"x": 1e3 * printed.time, "name": f"{TITLES[kind]}, printed gains"}
+            shared |= {"x": 1e3 * printed.time, "name": f"{CONTROLLERS[kind].label}, printed gains"}
             figure.add_trace(go.Scatter(**shared, y=printed.speed, line=thin), row=1, col=1)
     for level in (SETPOINT, LOWER_SETPOINT):
         line = {"color": MEASURED, "width": 1, "dash": "dash"}

@@ -10,7 +10,6 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ..control.controller_file import gains_of, law_content
-from ..control.controllers import CONTROLLERS
 from ..control.judge import SMALL_STEP, JudgedController, Robustness
 from ..control.objective import SECOND_SETPOINT
 from ..control.tuning import Tuning
@@ -27,7 +26,6 @@ COMPARISON_HEADINGS = (
     "Overshoot\np95 [%]",
 )
 # by the name of the controller, for the report of the paper
-TITLES = {name: kind.label for name, kind in CONTROLLERS.items()}
 
 
 def tuning_json(tuning: Tuning) -> dict[str, Any]:
