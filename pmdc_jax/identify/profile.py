@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 
 from .polish import gauss_newton_step
-from .problem import Problem, Unknowns, evaluate, normal_matrix
+from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
 # A coordinate (natural logarithm) surer than this is as good as quadratic: its profile is not drawn.
 QUADRATIC = 0.05
 ROUNDS = 5  # of the search for each end of the interval
-REFITS = 2  # Gauss-Newton steps of the other unknowns at each trial
+REFITS = 3  # Gauss-Newton steps of the other unknowns to each trial, at most
+# ... after which one more would lower the sum of squares by no larger share of the rise that is looked for
+CLOSE = 0.05
+
+
+class _Point(NamedTuple):
+    """A point on the profile: the normal matrix there, and the sum of squares that one more step foretells."""
+
+    unknowns: Unknowns
+    matrix: np.ndarray
+    squares: float
+    gain: float  # of that step
 
 
 def profile_interval(
@@ -28,16 +41,16 @@ def profile_interval(
     **Source**: Venzon, Moolgavkar, Applied Statistics 37 (1988), doi:10.2307/2347496; scaled for correlated
     residuals as a quasi-likelihood, McCullagh (1983).
     """
-    centre = float(best.coordinates[index])
+    lowest = _point(problem, best, index)
+    centre, close = float(best.coordinates[index]), CLOSE * reach**2 * inflation
     limits = (float(problem.parameters.lower[index]), float(problem.parameters.upper[index]))
-    lowest = _refitted(problem, best, index, centre)[1]
     ends = []
     for sign, limit in zip((-1.0, 1.0), limits, strict=True):
-        distance, unknowns = reach * spread, best
+        distance, point = reach * spread, lowest
         for _ in range(ROUNDS):
             trial = centre + sign * min(distance, abs(limit - centre))
-            unknowns, squares = _refitted(problem, unknowns, index, trial)
-            rise = np.sqrt(max(squares - lowest, 1e-12) / inflation)
+            point = _refitted(problem, point, index, trial, close)
+            rise = np.sqrt(max(point.squares - lowest.squares, 1e-12) / inflation)
             # the root of the rise is a straight line where the picture is quadratic
             distance = abs(trial - centre) * min(max(reach / rise, 0.3), 3.0)
             if abs(rise / reach - 1) < 0.02:
@@ -46,22 +59,30 @@ def profile_interval(
     return ends[0], ends[1]
 
 
-def _refitted(
-    problem: Problem, start: Unknowns, index: int, value: float
-) -> tuple[Unknowns, float]:
-    """All other unknowns refitted, and the sum of squares there, as the last step foretells it."""
-    unknowns = start._replace(coordinates=start.coordinates.at[index].set(value))
-    count, squares = len(start.coordinates), np.inf
+def _refitted(problem: Problem, point: _Point, index: int, value: float, close: float) -> _Point:
+    """The point of the profile where the coordinate has a value, found from another one."""
     for _ in range(REFITS):
-        matrix = np.array(
-            normal_matrix(evaluate(problem, unknowns), problem.tape, problem.fitted_runs)
-        )
-        step, gain = gauss_newton_step(matrix, {index}, count)
-        squares = matrix[-1, -1] - gain
-        moved = np.asarray(unknowns.coordinates) + step[:count]
-        inside = np.clip(moved, problem.parameters.lower, problem.parameters.upper)
-        unknowns = Unknowns(
-            jnp.asarray(inside),
-            unknowns.local + jnp.asarray(step[count:]).reshape(unknowns.local.shape),
-        )
-    return unknowns, float(squares) if np.isfinite(squares) else 1e300
+        point = _point(problem, _moved(problem, point, index, value), index)
+        if not close < point.gain < np.inf:
+            break
+    return point
+
+
+def _moved(problem: Problem, point: _Point, index: int, value: float) -> Unknowns:
+    """The coordinate at a value, and all other unknowns where a step along the profile leads with it."""
+    unknowns, count = point.unknowns, len(point.unknowns.coordinates)
+    delta, matrix = value - float(unknowns.coordinates[index]), point.matrix.copy()
+    matrix[:-1, -1] += delta * matrix[:-1, index]
+    step, _ = gauss_newton_step(matrix, {index}, count)
+    step[index] = delta
+    moved = np.asarray(flatten(unknowns)) + step
+    moved[:count] = np.clip(moved[:count], problem.parameters.lower, problem.parameters.upper)
+    return unflatten(problem, jnp.asarray(moved))
+
+
+def _point(problem: Problem, unknowns: Unknowns, index: int) -> _Point:
+    found = evaluate(problem, unknowns)
+    matrix = np.array(normal_matrix(found, problem.tape, problem.fitted_runs))
+    gain = gauss_newton_step(matrix, {index}, len(unknowns.coordinates))[1]
+    squares = float(matrix[-1, -1] - gain)
+    return _Point(unknowns, matrix, squares if np.isfinite(squares) else 1e300, gain)

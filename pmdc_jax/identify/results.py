@@ -76,12 +76,15 @@ def _intervals(
 ) -> dict[int, tuple[float, float]]:
     """The 95 % intervals of the coordinates that have one, as many at a time as there are cores."""
     coordinates = np.asarray(best.unknowns.coordinates)
+    # teeth that meet at another moment change all that follows: next to the fit squares leap, and no profile is smooth
+    leaps = problem.parameters(best.unknowns.coordinates).toothed is not None
 
     def interval(k: int) -> tuple[float, float]:
         spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.interval_factor[k])
         # no refit follows an unseen direction as far as the truth may lie along it
         hidden = info.unseen_variance[k] > info.covariance[k, k] / 2
-        if not problem.parameters.logarithmic[k] or spread < QUADRATIC or hidden:
+        sure = not problem.parameters.logarithmic[k] or spread < QUADRATIC
+        if sure or hidden or leaps:
             return coordinates[k] - reach * spread, coordinates[k] + reach * spread
         return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
 
