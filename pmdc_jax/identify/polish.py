@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..threads import side_by_side
 from .noise import FLOOR
 from .parameters import Parameters
 from .problem import (
@@ -211,12 +212,13 @@ def _whichever_fits(
     """Every run's own unknowns as they are, or those of the trial that fits it best."""
     if not trials:
         return unknowns
-    local, least = unknowns.local, _squares_of_runs(problem, evaluate(problem, unknowns))
-    for trial in trials:
-        squares = _squares_of_runs(problem, evaluate(problem, unknowns._replace(local=trial)))
-        local = jnp.where((squares < least)[:, None], trial, local)
-        least = np.minimum(squares, least)
-    return unknowns._replace(local=local)
+    tried = [unknowns.local, *trials]
+
+    def squares(local: Float[Array, "runs 5"]) -> Float[np.ndarray, " runs"]:
+        return _squares_of_runs(problem, evaluate(problem, unknowns._replace(local=local)))
+
+    best = np.argmin(side_by_side(squares, tried), axis=0)
+    return unknowns._replace(local=jnp.stack(tried)[best, np.arange(problem.tape.runs)])
 
 
 def _squares_of_runs(problem: Problem, evaluation: Evaluation) -> Float[np.ndarray, " runs"]:
