@@ -1,0 +1,46 @@
+"""The electrical equation, asked from sample to sample: torques do not trouble it, nor brushes that hold a current."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from benchmarks import virtual_bench as vb
+from pmdc_jax import Recording
+from pmdc_jax.diagnose.balance import electrical_misfit
+from pmdc_jax.diagnose.diagnosis import MAX_ELECTRICAL
+from pmdc_jax.diagnose.model import Model, model_of
+from pmdc_jax.effects import EFFECTS
+from pmdc_jax.identify.prepare import prepare
+from pmdc_jax.identify.solve import solve
+from pmdc_jax.motor import PARAMETERS
+
+MOTOR = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS} | {"brush_drop_V": 0.6}
+SLOW_TORQUE = vb.Noise(0.1, 0.5, torque_Nm=0.05, torque_correlation_s=0.3)
+
+
+def fitted(averaged_A: int = 1) -> Model:
+    """A motor with brushes in slow torque noise, its recorded current a mean over so many samples."""
+    rng, runs = np.random.default_rng(11), []
+    excitations = {"prbs": vb.prbs(rng, 2.0), "triangle": vb.slow_triangle(2.0)}
+    for name, excitation in excitations.items():
+        columns = vb.record(vb.BenchMotor(**MOTOR), excitation, rng, SLOW_TORQUE)
+        time, voltage, current, speed = (
+            columns[q] for q in ("time_s", "voltage_V", "current_A", "speed_rad_s")
+        )
+        current = lfilter(np.ones(averaged_A) / averaged_A, 1.0, current)
+        runs.append(Recording(name, time, voltage, current, speed, columns["load_torque_Nm"]))
+    given = prepare(runs, (), effects=[EFFECTS["brush_voltage_drop"]])
+    given, solved = solve(given, "cma_es", 0)
+    return model_of(("brush_voltage_drop",), given, solved.fit)
+
+
+@pytest.mark.usefixtures("x64")
+def test_brushes_that_hold_the_current_take_up_any_voltage():
+    assert electrical_misfit(fitted()) < 1.5
+
+
+@pytest.mark.usefixtures("x64")
+def test_an_averaged_current_is_no_motor():
+    assert electrical_misfit(fitted(averaged_A=4)) > MAX_ELECTRICAL
