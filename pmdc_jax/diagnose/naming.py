@@ -233,6 +233,9 @@ class StepwiseSelection:
         tried = []
         if found.asks_for_more():
             tried += self._with(current, found, shortlist(current, found))
+            if any(model and model.fit.at_bound for model in tried):
+                # no fuller form: a load larger than friction is no asymmetric friction
+                tried += self._with(current, found, shortlist(current, found, fuller=False))
         if found.left < ALARM and not here and not tried:
             tried += self._searched_with_friction(current, found)
         return tried + harder

@@ -21,13 +21,13 @@ COMPARABLE = 0.6
 TIED = 1e-3
 
 
-def shortlist(current: Model, found: Assessment) -> list[Signal]:
+def shortlist(current: Model, found: Assessment, fuller: bool = True) -> list[Signal]:
     """The most significant shape of each of the few effects that explain most.
 
     If that is an effect which is there already and little is left, its own formula is what is left to be desired,
     or else an effect that does more than its columns show; but a sensor's formula is exact, and one that explains far
-    more is missing, however much like slow noise it looks. One that contains an
-    effect which is there, and explains most of what is left, needs no other beside it.
+    more is missing, however much like slow noise it looks. One that contains an effect which is there, and explains
+    most of what is left, needs no other beside it, if `fuller` forms are to be tried alone.
     """
     obvious = clear(found)
     ranked = [s for s in obvious if effect_of(s) not in current.effects]
@@ -37,8 +37,8 @@ def shortlist(current: Model, found: Assessment) -> list[Signal]:
     exact = own and EFFECTS[effect_of(obvious[0])].equation == "sensor"
     if own and not exact and found.unexplained < FORMULA:
         ranked = [s for s in ranked if TRIALS[effect_of(s)].starts]
-    elif fuller := richer(current, found):
-        return fuller
+    elif fuller and (alone := richer(current, found)):
+        return alone
     # what may be slow noise is trusted less, but is tried for what it explains
     ranked.sort(key=lambda s: -s.gain)
     # where little is left one has to settle nearly all of it, so those that promise less do no harm
