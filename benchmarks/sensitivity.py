@@ -48,7 +48,6 @@ def _rows() -> list[Row]:
         for name, c in columns.items()
     ]
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(recordings))
-    initial, offset = jnp.asarray(tape.initial), jnp.zeros(tape.runs)
     values = np.array([getattr(truth, name) for name in NAMES])
     motor = Motor(*(jnp.asarray(v) for v in values))
     logarithms = jnp.log(jnp.asarray(values))
@@ -57,10 +56,10 @@ def _rows() -> list[Row]:
         return Motor(*jnp.exp(logarithms))
 
     def one_simulation():
-        return jax.block_until_ready(free_run(motor, tape, initial, offset))
+        return jax.block_until_ready(free_run(motor, tape))
 
     def with_sensitivities():
-        return jax.block_until_ready(sensitivities(assemble, logarithms, tape, initial, offset))
+        return jax.block_until_ready(sensitivities(assemble, logarithms, tape))
 
     def filtered():
         return [scipy_lfilter.squared_errors(values[None], Run.of(c)) for c in columns.values()]

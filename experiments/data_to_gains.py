@@ -44,7 +44,7 @@ def loop_metrics(logarithms, nominal: Motor):
 
 def outputs(logarithms, tape: Tape):
     """Simulated current and speed of every sample."""
-    return free_run(motor_of(logarithms), tape, jnp.asarray(tape.initial), jnp.zeros(tape.runs))
+    return free_run(motor_of(logarithms), tape)
 
 
 def estimate(measured, at, tape: Tape, scale):

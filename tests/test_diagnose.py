@@ -38,7 +38,7 @@ from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Unknowns
 from pmdc_jax.identify.refine import Optimum
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.simulate import LOCAL, Tape, free_run
+from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape, free_run
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 SCALES = Scales(10.0, 300.0, 10.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0)
@@ -532,7 +532,8 @@ def test_response_is_the_change_of_the_simulation(x64, name):
     bare = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()})
     effect = EFFECTS[name](**{f: jnp.asarray(x) for f, x in SMOOTH[name].items()})
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
-    without, with_it = (free_run(m, tape, tape.initial, jnp.zeros(2), BEGUN) for m in (bare, motor))
+    own = RunUnknowns.as_recorded(tape)._replace(angle=BEGUN)
+    without, with_it = (free_run(m, tape, own) for m in (bare, motor))
     path = path_of(without, tape, BEGUN, False)
     if EFFECTS[name].equation == "sensor":
         found = sensed(motor, tape, path)
@@ -605,7 +606,7 @@ def test_sizes_in_amperes_are_not_tried_where_no_current_was_measured(x64):
     time, voltage, speed = (columns[q] for q in ("time_s", "voltage_V", "speed_rad_s"))
     given = prepare([Recording("silent", time, voltage, speed=speed)], [], unloaded=True)
     coordinates = jnp.log(jnp.asarray([PAPER[n] for n in PARAMETERS]))
-    start = Unknowns(coordinates, jnp.zeros((1, LOCAL)))
+    start = Unknowns(coordinates, RunUnknowns(*jnp.zeros((LOCAL, 1))))
     base = model_of((), given, polish(given.problem, Optimum(start, np.inf, (), False), steps=0))
     tried = {candidate.effect for candidate in Library(base).candidates}
     assert {"coulomb_friction", "speed_sensor_delay"} <= tried

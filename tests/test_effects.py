@@ -19,10 +19,9 @@ from scipy.integrate import solve_ivp
 from benchmarks import virtual_bench as vb
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
-from pmdc_jax.identify.problem import apart
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recording import Recording
-from pmdc_jax.simulate import LOCAL, Tape, free_run, sensitivities, squared_errors
+from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape, free_run, sensitivities, squared_errors
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 STARTS = ((5.0, 60.0), (-3.0, -8.0), (0.0, 0.0))  # current A, speed rad/s of each run
@@ -296,7 +295,7 @@ RUNS = recordings()
 def simulated(motor: Motor, runs: list[Recording]) -> list[np.ndarray]:
     """Current and speed of every run, (samples, 2)."""
     tape = Tape.from_recordings(runs)
-    seen = free_run(motor, tape, jnp.asarray(tape.initial), jnp.zeros(tape.runs))
+    seen = free_run(motor, tape)
     return [
         np.stack([tape.samples_of(k, seen[:, c], len(run)) for c in range(2)], 1)
         for k, run in enumerate(runs)
@@ -526,14 +525,8 @@ def test_a_run_may_begin_twisted(x64, name):
         )
         start[-1] += twist
         expected.append(integrated(case, run, start, run.time)[:2])
-    seen = free_run(
-        with_effect(name),
-        tape,
-        jnp.asarray(tape.initial),
-        jnp.zeros(tape.runs),
-        None,
-        jnp.full(tape.runs, twist),
-    )
+    twisted = RunUnknowns.as_recorded(tape)._replace(twist=jnp.full(tape.runs, twist))
+    seen = free_run(with_effect(name), tape, twisted)
     for k, (run, right) in enumerate(zip(RUNS, expected, strict=True)):
         for channel in range(2):
             found = tape.samples_of(k, seen[:, channel], len(run))
@@ -550,9 +543,8 @@ def test_teeth_in_many_short_blocks_are_joined(x64):
     gear = EFFECTS["gear_backlash"](**jax.tree.map(jnp.asarray, {**values, "gap_rad": 0.0765}))
     numbers = (4.47, 0.0011, 0.1294, 0.131, 2.11e-4, 8.3e-5)
     motor = Motor(*map(jnp.asarray, numbers), effects=(gear,))
-    start = jnp.zeros((1, 2)), jnp.zeros(1)
-    seen, _ = sensitivities(lambda nothing: motor, jnp.zeros(1), tape, *start)
-    assert np.max(np.abs(seen - free_run(motor, tape, *start))) < 1e-4 * np.max(np.abs(seen))
+    seen, _ = sensitivities(lambda nothing: motor, jnp.zeros(1), tape)
+    assert np.max(np.abs(seen - free_run(motor, tape))) < 1e-4 * np.max(np.abs(seen))
 
 
 def zero(name: str) -> dict[str, float]:
@@ -584,20 +576,22 @@ def test_sensitivities_are_central_differences(x64, name):
     scales = zip(parameters.names, parameters.logarithmic, strict=True)
     at = np.array([np.log(truth[n]) if log else truth[n] for n, log in scales])
     tape = Tape.from_recordings(RUNS)
-    local = np.column_stack([tape.initial, np.full((tape.runs, 3), [0.01, 0.2, 0.02])])
+    own = np.column_stack([tape.initial, np.full((tape.runs, 3), [0.01, 0.2, 0.02])])
     # away from zero, where a dry element has no derivative
-    local[2:, :2] = 1.0, 5.0
-    seen, jacobian = sensitivities(parameters, jnp.asarray(at), tape, *apart(jnp.asarray(local)))
+    own[2:, :2] = 1.0, 5.0
+    begun = RunUnknowns(*jnp.asarray(own.T))
+    seen, jacobian = sensitivities(parameters, jnp.asarray(at), tape, begun)
 
-    def run(at, local):
-        return np.asarray(free_run(parameters(jnp.asarray(at)), tape, *apart(jnp.asarray(local))))
+    def run(at, own):
+        begun = RunUnknowns(*jnp.asarray(own.T))
+        return np.asarray(free_run(parameters(jnp.asarray(at)), tape, begun))
 
-    np.testing.assert_allclose(seen, run(at, local), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(seen, run(at, own), rtol=1e-9, atol=1e-9)
     count = len(at)
     for column in range(count + LOCAL):
         step = np.zeros(count + LOCAL)
-        step[column] = CASES[name].difference * max(1.0, np.abs(np.r_[at, local.max(0)][column]))
-        up, down = (run(at + s * step[:count], local + s * step[count:]) for s in (1, -1))
+        step[column] = CASES[name].difference * max(1.0, np.abs(np.r_[at, own.max(0)][column]))
+        up, down = (run(at + s * step[:count], own + s * step[count:]) for s in (1, -1))
         expected = (up - down) / (2 * step[column])
         if not expected.any():
             assert not jacobian[..., column].any()
@@ -615,7 +609,7 @@ def test_the_search_sees_what_the_free_run_sees(x64, name):
     """Sums of squared errors of a population are those of its members; the search rounds delays to samples."""
     motor = with_effect(name, CASES[name].values | ({"delay_s": 3e-3} if "delay" in name else {}))
     tape = Tape.from_recordings(RUNS)
-    seen = free_run(motor, tape, tape.initial, jnp.zeros(tape.runs))
+    seen = free_run(motor, tape)
     expected = (((seen - tape.measured) ** 2) * tape.weight).sum((0, 2))
     found = squared_errors(jax.tree.map(lambda x: np.full(2, x), motor), tape)
     np.testing.assert_allclose(np.array(found)[:, 1], expected, rtol=1e-6)
@@ -648,7 +642,7 @@ def test_finite_all_over_its_ranges(x64, name):
     limits = np.stack([parameters.lower[6:], parameters.upper[6:]])
     for corner in np.ndindex(*(2,) * limits.shape[1]):
         at = jnp.asarray(np.append(base, limits[list(corner), np.arange(limits.shape[1])]))
-        seen, jacobian = sensitivities(parameters, at, tape, tape.initial, np.zeros(tape.runs))
+        seen, jacobian = sensitivities(parameters, at, tape)
         assert jnp.all(jnp.isfinite(seen)) and jnp.all(jnp.isfinite(jacobian)), (corner, at[6:])
 
 

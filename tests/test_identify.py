@@ -42,7 +42,7 @@ from pmdc_jax.identify.whitening import Whitening
 from pmdc_jax.motor import PARAMETERS
 from pmdc_jax.motor_file import Uncertainty
 from pmdc_jax.recording import Recording
-from pmdc_jax.simulate import LOCAL, Tape
+from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape
 
 PAPER = vb.paper_motor()
 NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
@@ -495,7 +495,7 @@ def test_torque_noise_is_filtered_out():
         assert sharp[name].stderr < 1.2 * plain[name].stderr, name
         assert abs(sharp[name].value - getattr(PAPER, name)) < 4 * sharp[name].stderr, name
     # and no state that a run begins with has run away
-    initial = np.asarray(last.unknowns.local)[:, :2]
+    initial = np.column_stack([last.unknowns.runs.current, last.unknowns.runs.speed])
     measured = [(run.current[0], run.speed[0]) for run in runs]
     np.testing.assert_allclose(initial, measured, atol=5 * NOISE.speed_rad_s)
 
@@ -535,8 +535,7 @@ def problem_of(runs: list[Recording], bounds=None) -> Problem:
 def start_at(problem: Problem, factor: float = 1.0) -> Unknowns:
     """The paper's motor, or some factor off, and each run as it begins in its record."""
     coordinates = np.log([factor * getattr(PAPER, n) for n in PARAMETERS])
-    local = np.concatenate([problem.tape.initial, np.zeros((2, LOCAL - 2))], 1)
-    return Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
+    return Unknowns(jnp.asarray(coordinates), RunUnknowns.as_recorded(problem.tape))
 
 
 def test_a_bound_in_the_way_is_reported(x64, runs):
@@ -591,7 +590,7 @@ def test_known_loads_stay_known(x64, runs):
     end = refine(problem, start_at(problem, 1.5))
     polished = polish(problem, end).optimum
     for unknowns in (end.unknowns, polished.unknowns):
-        np.testing.assert_array_equal(np.asarray(unknowns.local)[:, 2:], 0.0)
+        np.testing.assert_array_equal(np.asarray(unknowns.runs[2:]), 0.0)
 
 
 def test_friction_that_had_all_but_vanished_is_found_again(x64, runs):
@@ -917,7 +916,7 @@ def behind_a_gear(gap: float, load: float, twist: float = 0.0) -> tuple[Problem,
     named = [truth[name.removeprefix("gear_backlash.")] for name in given.problem.parameters.names]
     logarithmic = np.asarray(given.problem.parameters.logarithmic)
     coordinates = np.where(logarithmic, np.log(named), named)
-    return given.problem, Unknowns(jnp.asarray(coordinates), jnp.zeros((1, LOCAL)))
+    return given.problem, Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((LOCAL, 1))))
 
 
 @pytest.mark.slow
@@ -941,7 +940,7 @@ def test_what_belongs_to_a_run_is_never_fitted_for_the_worse(gap):
 def test_a_run_may_begin_anywhere_in_the_play(twist):
     with jax.enable_x64(True):
         problem, begun = behind_a_gear(gap=0.3, load=0.0, twist=twist)
-        truth = begun._replace(local=begun.local.at[0, 4].set(twist))
+        truth = begun._replace(runs=begun.runs._replace(twist=jnp.array([twist])))
         fitted, right = (
             float(jnp.square(evaluate(problem, own).residuals).sum())
             for own in (fit_run_unknowns(problem, begun, 8)[0], truth)
@@ -966,8 +965,8 @@ def test_a_hold_out_may_begin_at_any_angle(turned_by):
         truth = motor | {f"cogging_torque.{field}": x for field, x in wave.items()}
         named = zip(problem.parameters.names, problem.parameters.logarithmic, strict=True)
         coordinates = [np.log(truth[name]) if log else truth[name] for name, log in named]
-        begun = Unknowns(jnp.asarray(coordinates), jnp.zeros((2, LOCAL)))
-        right = begun._replace(local=begun.local.at[1, 3].set(angle))
+        begun = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((LOCAL, 2))))
+        right = begun._replace(runs=begun.runs._replace(angle=jnp.array([0.0, angle])))
         ended = fit_run_unknowns(problem, begun)[1]
         fitted, least = (
             float(jnp.square(evaluation.residuals).sum())

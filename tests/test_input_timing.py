@@ -14,11 +14,12 @@ from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recording import Recording
-from pmdc_jax.simulate import LOCAL, Tape, free_run, sensitivities
+from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape, free_run, sensitivities
 
 # sampled more slowly than its current settles: 2 ms beside L / R of 1.25 ms
 SMALL = {"R": 0.8, "L": 1e-3, "Kb": 0.04, "Kt": 0.039, "J": 4e-5, "f": 3e-5}
 STEP = 2e-3
+FROM_REST = RunUnknowns(*np.zeros((LOCAL, 1)))
 
 
 def driven(seed: int, samples: int, load: float = 0.0) -> Recording:
@@ -33,7 +34,7 @@ def driven(seed: int, samples: int, load: float = 0.0) -> Recording:
 def seen(run: Recording, motor: Motor) -> np.ndarray:
     """The package's free run from rest, (samples, 2)."""
     tape = Tape.from_recordings([run], straight=True)
-    outputs = free_run(motor, tape, jnp.zeros((1, 2)), jnp.zeros(1))
+    outputs = free_run(motor, tape, FROM_REST)
     return np.stack([tape.samples_of(0, outputs[:, c], len(run)) for c in range(2)], 1)
 
 
@@ -116,11 +117,10 @@ def test_sensitivities_are_central_differences(x64, names):
     parameters = Parameters.of(bounds, [EFFECTS[name] for name in names])
     at = np.log([*SMALL.values(), *[{"coulomb_friction": 0.02}.get(n, 0.003) for n in names]])
     tape = Tape.from_recordings([driven(3, 300)], straight=True)
-    own = (jnp.zeros((1, 2)), jnp.zeros(1))
-    found, jacobian = sensitivities(parameters, jnp.asarray(at), tape, *own)
+    found, jacobian = sensitivities(parameters, jnp.asarray(at), tape, FROM_REST)
 
     def run(at):
-        return np.asarray(free_run(parameters(jnp.asarray(at)), tape, *own))
+        return np.asarray(free_run(parameters(jnp.asarray(at)), tape, FROM_REST))
 
     np.testing.assert_allclose(found, run(at), rtol=1e-9, atol=1e-9)
     assert jacobian.shape[-1] == len(at) + LOCAL

@@ -24,7 +24,14 @@ from pmdc_jax.effects import CoulombFriction, ResistanceHeating
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recording import Recording
 from pmdc_jax.recording_file import write_recording
-from pmdc_jax.simulate import Tape, free_run, reference_solution, squared_errors, uniform
+from pmdc_jax.simulate import (
+    RunUnknowns,
+    Tape,
+    free_run,
+    reference_solution,
+    squared_errors,
+    uniform,
+)
 from pmdc_jax.simulate.exponential import phi_functions
 from pmdc_jax.threads import side_by_side
 
@@ -75,8 +82,9 @@ def exact_steps(m: dict[str, float], run: Recording, start) -> np.ndarray:
 def alone(m: Motor, run: Recording, start=None, **changes) -> np.ndarray:
     """Free run of one recording by the package, (samples, 2); `changes` of its tape."""
     tape = dataclasses.replace(Tape.from_recordings([run], unloaded=True), **changes)
-    initial = jnp.asarray(tape.initial if start is None else [start])
-    seen = free_run(m, tape, initial, jnp.zeros(1))
+    if start is not None:
+        tape = dataclasses.replace(tape, initial=np.array([start]))
+    seen = free_run(m, tape)
     return np.stack([tape.samples_of(0, seen[:, c], len(run)) for c in range(2)], 1)
 
 
@@ -246,7 +254,7 @@ def test_joined_blocks_are_one_sequential_run(x64, effects):
     """
     run = recording(current=np.zeros(SAMPLES), speed=np.zeros(SAMPLES))
     tape = Tape.from_recordings([run])
-    seen = np.asarray(free_run(motor(effects), tape, jnp.asarray(tape.initial), jnp.zeros(1)))
+    seen = np.asarray(free_run(motor(effects), tape))
     one = jax.tree.map(lambda leaf: np.reshape(leaf, 1), motor(effects))
     for block, sample in ((0, 1), (0, 127), (1, 0), (1, 1), (2, 64), (3, 127)):
         weight = np.zeros_like(tape.weight)
@@ -268,7 +276,8 @@ def test_runs_on_one_tape_are_each_as_alone(x64):
     tape = Tape.from_recordings(runs)
     assert tape.value.shape[0] == 8  # one more than filled: the last block holds nothing
     offsets = np.array([0.0, 0.05, -0.02, 0.0])
-    seen = free_run(m, tape, jnp.asarray(tape.initial), jnp.asarray(offsets))
+    own = RunUnknowns.as_recorded(tape)._replace(load_offset=jnp.asarray(offsets))
+    seen = free_run(m, tape, own)
     for k, (run, offset) in enumerate(zip(runs, offsets, strict=True)):
         loaded = Recording(
             run.name, run.time, run.voltage, run.current, run.speed, run.load + offset

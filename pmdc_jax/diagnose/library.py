@@ -123,9 +123,8 @@ class Library:
         key = id(candidate)
         if key not in self._simulated:
             values = {field: jnp.asarray(x) for field, x in candidate.columns[0].items()}
-            local = self._base.fit.unknowns.local
             motor = self.bare.with_effects([EFFECTS[candidate.effect](**values)])
-            seen = free_run(motor, tape, local[:, :2], local[:, 2])
+            seen = free_run(motor, tape, self._base.fit.unknowns.runs)
             change = np.asarray(seen) - np.asarray(self._base.fit.evaluation.seen)
             self._simulated[key] = change.transpose(2, 1, 0)
         return self._simulated[key]

@@ -73,7 +73,7 @@ class Model:
         """The free run along which it was fitted, of the rotor itself."""
         held = "speed" in {EFFECTS[name].holds for name in self.effects}
         problem = self.given.problem
-        begun = self.fit.unknowns.local[:, 3]
+        begun = self.fit.unknowns.runs.angle
         return path_of(of_rotor(problem, self.fit), problem.tape, begun, held)
 
     @property

@@ -208,7 +208,7 @@ class Refits:
 
         ends = side_by_side_until(_roughly, starts, enough)
         best = min(ends, key=lambda end: end.fitness)
-        unknowns = best_backlash_start(given.problem, best.unknowns, starts[0][1].unknowns.local)
+        unknowns = best_backlash_start(given.problem, best.unknowns, starts[0][1].unknowns.runs)
         begun = best._replace(unknowns=unknowns)
         if around := TRIALS[effects[-1]].around:
             return _best_around(effects, given, begun, around)
@@ -287,9 +287,8 @@ class Refits:
                 value = values.get(effect, self.begun.get(effect, {}))[field]
                 coordinates.append(np.log(max(value, 1e-300)) if log else value)
         inside = np.clip(coordinates, parameters.lower, parameters.upper)
-        local = np.array(unknowns.local)
-        local[:, 3] += angles
-        start = Unknowns(jnp.asarray(inside), jnp.asarray(local))
+        runs = unknowns.runs._replace(angle=unknowns.runs.angle + angles)
+        start = Unknowns(jnp.asarray(inside), runs)
         return given, Optimum(start, np.inf, (), False)
 
     def _lost(self, model: Model, name: str) -> bool:

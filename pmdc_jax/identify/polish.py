@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..simulate import RunUnknowns
 from ..threads import side_by_side
 from .noise import FLOOR
 from .parameters import Parameters
@@ -170,9 +171,7 @@ def _weighed(problem: Problem, unknowns: Unknowns, known: Evaluation | None = No
     )
 
 
-def best_backlash_start(
-    problem: Problem, unknowns: Unknowns, begun: Float[Array, "runs 5"]
-) -> Unknowns:
+def best_backlash_start(problem: Problem, unknowns: Unknowns, begun: RunUnknowns) -> Unknowns:
     """Every run's own unknowns as they are, or as they had `begun` with the teeth of its gear elsewhere in their play,
     whichever fits best.
 
@@ -181,7 +180,8 @@ def best_backlash_start(
     """
     motor = problem.parameters(unknowns.coordinates)
     play = sum(float(effect.play()) for effect in motor.effects)
-    trials = [begun.at[:, 4].set(share * play) for share in BACKLASH_STARTS] if play else []
+    middle = jnp.zeros_like(begun.twist)
+    trials = [begun._replace(twist=middle + share * play) for share in BACKLASH_STARTS if play]
     return _whichever_fits(problem, unknowns, trials)
 
 
@@ -201,24 +201,26 @@ def best_initial_angle(problem: Problem, unknowns: Unknowns) -> Unknowns:
     if len(periods) > 1:
         turns += [np.arange(1, round(2 * np.pi / period)) * period for period in periods]
     for some in turns:
-        trials = [unknowns.local.at[:, 3].add(turn * turnable) for turn in some]
+        begun = unknowns.runs
+        trials = [begun._replace(angle=begun.angle + turn * turnable) for turn in some]
         unknowns = _whichever_fits(problem, unknowns, trials)
     return unknowns
 
 
 def _whichever_fits(
-    problem: Problem, unknowns: Unknowns, trials: Sequence[Float[Array, "runs 5"]]
+    problem: Problem, unknowns: Unknowns, trials: Sequence[RunUnknowns]
 ) -> Unknowns:
     """Every run's own unknowns as they are, or those of the trial that fits it best."""
     if not trials:
         return unknowns
-    tried = [unknowns.local, *trials]
+    tried = [unknowns.runs, *trials]
 
-    def squares(local: Float[Array, "runs 5"]) -> Float[np.ndarray, " runs"]:
-        return _squares_of_runs(problem, evaluate(problem, unknowns._replace(local=local)))
+    def squares(runs: RunUnknowns) -> Float[np.ndarray, " runs"]:
+        return _squares_of_runs(problem, evaluate(problem, unknowns._replace(runs=runs)))
 
-    best = np.argmin(side_by_side(squares, tried), axis=0)
-    return unknowns._replace(local=jnp.stack(tried)[best, np.arange(problem.tape.runs)])
+    best, each = np.argmin(side_by_side(squares, tried), axis=0), np.arange(problem.tape.runs)
+    runs = jax.tree.map(lambda *values: jnp.stack(values)[best, each], *tried)
+    return unknowns._replace(runs=runs)
 
 
 def _squares_of_runs(problem: Problem, evaluation: Evaluation) -> Float[np.ndarray, " runs"]:
@@ -240,21 +242,21 @@ def fit_run_unknowns(
     run = np.asarray(problem.tape.run)
     everyone, share = jnp.ones(problem.tape.runs, bool), np.ones(problem.tape.runs)
 
-    unknowns = best_initial_angle(still, best_backlash_start(still, unknowns, unknowns.local))
+    unknowns = best_initial_angle(still, best_backlash_start(still, unknowns, unknowns.runs))
     best = evaluate(still, unknowns)
     for _ in range(passes):
         matrix = np.asarray(normal_matrix(best, still.tape, everyone))
         flat, gain = gauss_newton_step(matrix, set(), 0)
         if gain < WORTH * matrix[-1, -1] / problem.most_samples:
             break
-        step = unflatten(problem, jnp.asarray(flat)).local
-        trial = unknowns._replace(local=unknowns.local + share[:, None] * step)
-        reached = evaluate(still, trial)
+        step = unflatten(problem, jnp.asarray(flat)).runs
+        changes = zip(unknowns.runs, step, strict=True)
+        trial = RunUnknowns(*(x + share * change for x, change in changes))
+        reached = evaluate(still, unknowns._replace(runs=trial))
         # not where it cannot be simulated
         better = _squares_of_runs(problem, reached) <= _squares_of_runs(problem, best)
         share = np.where(better, 1.0, share / 4)
-        local = jnp.where(better[:, None], trial.local, unknowns.local)
-        unknowns = unknowns._replace(local=local)
+        unknowns = unknowns._replace(runs=_select_runs(jnp.asarray(better), trial, unknowns.runs))
         best = _select_blocks(jnp.asarray(better[run]), reached, best)
     return unknowns, best
 
@@ -264,9 +266,8 @@ def with_holdout_unknowns(problem: Problem, fit: Fit) -> Fit:
     if not np.any(~np.asarray(problem.fitted_runs) & np.asarray(problem.tape.load_unknown)):
         return fit
     unknowns, evaluation = fit_run_unknowns(problem, fit.unknowns)
-    counts = jnp.asarray(problem.fitted_runs)
-    local = jnp.where(counts[:, None], fit.unknowns.local, unknowns.local)
-    optimum = fit.optimum._replace(unknowns=unknowns._replace(local=local))
+    runs = _select_runs(problem.fitted_runs, fit.unknowns.runs, unknowns.runs)
+    optimum = fit.optimum._replace(unknowns=unknowns._replace(runs=runs))
     scaled = _scaled(evaluation, np.asarray(problem.noise) / fit.noise)
     return Fit(
         optimum,
@@ -281,6 +282,11 @@ def _scaled(evaluation: Evaluation, stretch: Float[np.ndarray, "2"]) -> Evaluati
         residuals=evaluation.residuals * stretch[:, None],
         jacobian=evaluation.jacobian * stretch[:, None, None],
     )
+
+
+def _select_runs(chosen: Bool[Array, " runs"], one: RunUnknowns, other: RunUnknowns) -> RunUnknowns:
+    """What belongs to some runs from the one, and what belongs to the others from the other."""
+    return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), one, other)
 
 
 def _select_blocks(

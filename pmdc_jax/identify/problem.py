@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..compiled import compiled, quickly_compiled
-from ..simulate import LOCAL, Tape, sensitivities
+from ..simulate import LOCAL, RunUnknowns, Tape, sensitivities
 from .parameters import Parameters
 from .whitening import Whitening
 
@@ -21,13 +21,7 @@ class Unknowns(NamedTuple):
     """What a refinement moves: search coordinates, and what each run does not tell."""
 
     coordinates: Float[Array, " parameters"]
-    # initial current A and speed rad/s, load offset N m, initial angle rad and twist rad
-    local: Float[Array, "runs 5"]
-
-
-def apart(local: Float[Array, "runs 5"]) -> tuple[Array, Array, Array, Array]:
-    """The runs' own unknowns as a simulation takes them."""
-    return local[:, :2], local[:, 2], local[:, 3], local[:, 4]
+    runs: RunUnknowns
 
 
 class Problem(eqx.Module):
@@ -129,8 +123,8 @@ def weighed(problem: Problem, plain: Evaluation) -> Evaluation:
 
 
 def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
-    tape, local = problem.tape, unknowns.local
-    seen, jacobian = sensitivities(problem.parameters, unknowns.coordinates, tape, *apart(local))
+    tape = problem.tape
+    seen, jacobian = sensitivities(problem.parameters, unknowns.coordinates, tape, unknowns.runs)
     scale = tape.weight / problem.noise[:, None]
     jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]
     return Evaluation(seen, (seen - tape.measured) * scale, jacobian)
@@ -196,8 +190,8 @@ def _columns(count: int, runs: int) -> np.ndarray:
 
 def unflatten(problem: Problem, flat: Float[Array, " columns"]) -> Unknowns:
     count = len(problem.free)
-    return Unknowns(flat[:count], flat[count:].reshape(problem.tape.runs, LOCAL))
+    return Unknowns(flat[:count], RunUnknowns(*flat[count:].reshape(-1, LOCAL).T))
 
 
 def flatten(unknowns: Unknowns) -> Float[Array, " columns"]:
-    return jnp.concatenate([unknowns.coordinates, unknowns.local.reshape(-1)])
+    return jnp.concatenate([unknowns.coordinates, jnp.stack(unknowns.runs, 1).reshape(-1)])

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..motor import PARAMETERS, Motor
 from ..recording import Recording
-from ..simulate import Tape
+from ..simulate import RunUnknowns, Tape
 from ..threads import side_by_side
 from .identifiability import SHARE, explain
 from .identification import Estimate, Identification, Role, RunFit, Status
@@ -49,9 +49,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
     unknowns, ended = fit_run_unknowns(problem, best.unknowns)
-    fit = _fits(
-        given.runs, given.roles, problem.tape, np.asarray(ended.seen), np.asarray(unknowns.local)
-    )
+    fit = _fits(given.runs, given.roles, problem.tape, np.asarray(ended.seen), unknowns.runs)
     names, covariance = parameters.with_tied(info.covariance)
     noise = {name: white_noise(_residuals(fit, name)) for name in ("current", "speed")}
     return Identification(
@@ -212,7 +210,7 @@ def _fits(
     roles: Sequence[Role],
     tape: Tape,
     seen: np.ndarray,
-    local: np.ndarray,
+    own: RunUnknowns,
 ) -> dict[str, RunFit]:
     # as it was fitted, less what its sensor put into it
     fitted = np.where(np.asarray(tape.weight) > 0, tape.measured, np.nan)[:, 1]
@@ -227,7 +225,7 @@ def _fits(
             speed_rmse=_rmse(measured, speed),
             current_fit_percent=_fit_percent(run.current, current) if driven else None,
             speed_fit_percent=_fit_percent(measured, speed),
-            load_offset=float(local[index, 2]) if tape.load_unknown[index] else None,
+            load_offset=float(own.load_offset[index]) if tape.load_unknown[index] else None,
             time=run.time,
             voltage=run.voltage,
             current=run.current,

@@ -10,7 +10,7 @@ from scipy import fft, ndimage
 
 from ..simulate import free_run
 from .polish import Fit
-from .problem import Problem, apart
+from .problem import Problem
 
 # Neighbouring frequencies over which the power of a misfit is averaged
 NEIGHBOURS = 33
@@ -24,9 +24,9 @@ def of_rotor(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
     if all(effect.equation != "sensor" for effect in effects):
         return fit.evaluation.seen
     unknowns = fit.unknowns
-    motor, local = problem.parameters(unknowns.coordinates), jnp.asarray(unknowns.local)
+    motor = problem.parameters(unknowns.coordinates)
     bare = motor.with_effects(effect for effect in motor.effects if effect.equation != "sensor")
-    return free_run(bare, problem.tape, *apart(local))
+    return free_run(bare, problem.tape, unknowns.runs)
 
 
 def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:

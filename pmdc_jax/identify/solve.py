@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..progress import ReportProgress, silent
-from ..simulate import Tape
+from ..simulate import RunUnknowns, Tape
 from ..threads import beside, side_by_side_until
 from .bounds import effect_bounds
 from .corrections.input_noise import without_input_noise
@@ -154,8 +154,7 @@ def polish_with_angle(
 
 
 def _start(tape: Tape, coordinates: jax.Array | np.ndarray) -> Unknowns:
-    local = np.column_stack([tape.initial, np.zeros(tape.runs), tape.angle, np.zeros(tape.runs)])
-    return Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
+    return Unknowns(jnp.asarray(coordinates), RunUnknowns.as_recorded(tape))
 
 
 def _distinct(found: Found, parameters: Parameters) -> list[np.ndarray]:

@@ -13,13 +13,14 @@ from ..recording import Recording
 from ..recording_file import Run, recordings_of
 from .population import squared_errors
 from .reference import reference_solution
-from .shooting import LOCAL, free_run, sensitivities
+from .shooting import LOCAL, RunUnknowns, free_run, sensitivities
 from .tape import Tape
 from .uneven import seen_at_record
 from .uniform import uniform
 
 __all__ = [
     "LOCAL",
+    "RunUnknowns",
     "Tape",
     "free_run",
     "reference_solution",
@@ -45,7 +46,7 @@ def simulate(motor: Motor, recording: Run) -> Recording:
     (recording,) = recordings_of(recording, to_simulate=True)
     even = uniform(recording)
     tape = Tape.from_recordings([even], unloaded=True)
-    outputs = free_run(motor, tape, jnp.asarray(tape.initial), jnp.zeros(1))
+    outputs = free_run(motor, tape)
     seen = np.stack([tape.samples_of(0, outputs[:, c], len(even)) for c in range(2)], 1)
     if even.uneven is not None:
         seen = seen_at_record(motor, tape.drive_of(0), even, seen)

@@ -42,10 +42,6 @@ JOINED = 1e-4
 # rattle in their play. There are as many passes as a run has blocks, and nothing to learn from the derivatives.
 PASSES = 32
 
-# Columns of the sensitivities for a run's own unknowns: initial current, initial speed, load offset, initial angle,
-# and how far a spring is then wound up beyond what the load does.
-LOCAL = 5
-
 Starts = Float[Array, "blocks states"]
 
 
@@ -58,32 +54,36 @@ class Pass(NamedTuple):
     d_end: Float[Array, "columns blocks states"]
 
 
-class Own(NamedTuple):
-    """What belongs to each run: how it starts, and a constant load in N m on top of the recorded one."""
+class RunUnknowns(NamedTuple):
+    """What belongs to each run alone: how it begins, and a constant load on top of the recorded one."""
 
-    current: Float[Array, " runs"]
-    speed: Float[Array, " runs"]
-    load_offset: Float[Array, " runs"]
-    angle: Float[Array, " runs"]
-    twist: Float[Array, " runs"]
+    current: Float[Array, " runs"]  # A
+    speed: Float[Array, " runs"]  # rad/s
+    load_offset: Float[Array, " runs"]  # N m
+    angle: Float[Array, " runs"]  # of the rotor, rad: it matters only to effects that depend on it
+    twist: Float[Array, " runs"]  # of a spring beyond what the load does to it, rad
+
+    @classmethod
+    def as_recorded(cls, tape: Tape) -> RunUnknowns:
+        """As the tape has them: no load besides the recorded one, and no spring wound up."""
+        current, speed = jnp.asarray(tape.initial).T
+        none = jnp.zeros_like(current)
+        return cls(current, speed, none, jnp.asarray(tape.angle), none)
+
+
+# How many columns the sensitivities have for them
+LOCAL = len(RunUnknowns._fields)
 
 
 @compiled
 def free_run(
-    motor: Motor,
-    tape: Tape,
-    initial: Float[Array, "runs 2"],
-    load_offset: Float[Array, " runs"],
-    angle: Float[Array, " runs"] | None = None,
-    twist: Float[Array, " runs"] | None = None,
+    motor: Motor, tape: Tape, own: RunUnknowns | None = None
 ) -> Float[Array, "blocks 2 samples"]:
-    """Current (A) and speed (rad/s) as the sensors report them, simulated freely from each run's `initial`.
+    """Current (A) and speed (rad/s) as the sensors report them, simulated freely.
 
-    `load_offset` is a constant load in N m on top of each run's recorded one; `angle`, of the rotor in rad as
-    the run starts, matters only to effects that depend on it, and is the recorded one (else 0) unless given; so does
-    `twist`, in rad, by which a shaft is then twisted beyond what the load does, 0 unless given.
+    `own` is what belongs to each run alone, as recorded unless given.
     """
-    own = _own(tape, initial, load_offset, angle, twist)
+    own = own or RunUnknowns.as_recorded(tape)
     prepared = (motor, along_grids(motor, tape))
     begins = _begins(motor, own, tape)
     states = begins.shape[1]
@@ -98,18 +98,14 @@ def sensitivities(
     assemble: Callable[[Float[Array, " parameters"]], Motor],
     parameters: Float[Array, " parameters"],
     tape: Tape,
-    initial: Float[Array, "runs 2"],
-    load_offset: Float[Array, " runs"],
-    angle: Float[Array, " runs"] | None = None,
-    twist: Float[Array, " runs"] | None = None,
+    own: RunUnknowns | None = None,
 ) -> tuple[Float[Array, "blocks 2 samples"], Float[Array, "blocks 2 samples columns"]]:
-    """Free run, and its derivatives by `parameters` and then by the run's own initial current, initial speed,
-    load offset, initial angle and initial twist.
+    """Free run, and its derivatives by `parameters` and then by what belongs to the run alone.
 
     `assemble` makes a motor of the parameters; the rest is as in `free_run`. A motor whose runs depend on their
     beginning by chance gives NaN.
     """
-    own = _own(tape, initial, load_offset, angle, twist)
+    own = own or RunUnknowns.as_recorded(tape)
     count = len(parameters)
     every = count + LOCAL
 
@@ -121,7 +117,7 @@ def sensitivities(
     motor = prepared[0]
     d_motor = jax.tree.map(lambda leaf: _pad_columns(leaf, every), d_prepared[0])
     ones = jnp.eye(LOCAL, every, count)[:, :, None]
-    d_own = Own(*(jnp.broadcast_to(one, (every, tape.runs)) for one in ones))
+    d_own = RunUnknowns(*(jnp.broadcast_to(one, (every, tape.runs)) for one in ones))
     begins, d_begins = _along_columns(
         lambda motor, own: _begins(motor, own, tape), (motor, own), (d_motor, d_own)
     )
@@ -163,14 +159,7 @@ def _among_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "..
     return jnp.concatenate([own[..., :count], zero, own[..., count:], zero], -1)
 
 
-def _own(tape: Tape, initial, load_offset, angle, twist) -> Own:
-    initial = jnp.asarray(initial)
-    angle = jnp.asarray(tape.angle if angle is None else angle)
-    twist = jnp.zeros_like(angle) if twist is None else jnp.asarray(twist)
-    return Own(initial[:, 0], initial[:, 1], jnp.asarray(load_offset), angle, twist)
-
-
-def _begins(motor: Motor, own: Own, tape: Tape) -> Starts:
+def _begins(motor: Motor, own: RunUnknowns, tape: Tape) -> Starts:
     """How the run of each block begins."""
     first = jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs))
     load = jnp.asarray(tape.load)[first, 0] + own.load_offset
@@ -183,7 +172,7 @@ def _begins(motor: Motor, own: Own, tape: Tape) -> Starts:
     return _pack(state._replace(extra=state.extra | wound)).T[tape.run]
 
 
-def _guess(motor: Motor, own: Own, tape: Tape, begins: Starts) -> Starts:
+def _guess(motor: Motor, own: RunUnknowns, tape: Tape, begins: Starts) -> Starts:
     """Starts of the blocks by what was measured there: most of the way, and rarely all of it."""
     known = (tape.weight[:, :, 0] > 0).T
     current, speed = jnp.where(known, tape.measured[:, :, 0].T, begins[:, :2].T)
@@ -199,7 +188,7 @@ def _guess(motor: Motor, own: Own, tape: Tape, begins: Starts) -> Starts:
 
 
 def _join(
-    prepared, still, tape: Tape, own: Own, begins: Starts, most: int | None = None
+    prepared, still, tape: Tape, own: RunUnknowns, begins: Starts, most: int | None = None
 ) -> tuple[Starts, Starts, Pass]:
     """Starts at which every block begins where the one before it ended; those of the last pass, and that pass.
 
