@@ -10,7 +10,7 @@ from ..compiled import compiled
 from ..effects.base import State
 from ..motor import Drive, Motor
 from ..precision import double_precision
-from ..simulate.solver import Propagator, held_step, propagator
+from ..simulate.solver import Input, Propagator, held_step, propagator
 from .controllers import Number
 from .metrics import BAND
 from .steady import steady_state
@@ -121,12 +121,13 @@ def _next_state(
     load: Float[Array, ""],
 ) -> State:
     """The next state at this voltage, or at the one that ends the step at the current limit."""
-    flat_out = held_step(motor, along, DRIVE, state, voltage, load)
+    acting = Input(DRIVE, voltage, load)
+    flat_out = held_step(motor, along, acting, state)
     if current_limit is None:
         return flat_out
-    idle = held_step(motor, along, DRIVE, state, jnp.zeros_like(voltage), load)
+    idle = held_step(motor, along, acting._replace(value=jnp.zeros_like(voltage)), state)
     gain = flat_out.current - idle.current
     most = jnp.sign(voltage) * current_limit
     share = (most - idle.current) / jnp.where(gain == 0, 1.0, gain)
     applied = voltage * jnp.clip(share, -1.0, 1.0)
-    return held_step(motor, along, DRIVE, state, applied, load)
+    return held_step(motor, along, acting._replace(value=applied), state)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..compiled import compiled
 from ..motor import Drive, Motor
-from ..simulate.solver import held_step, propagator
+from ..simulate.solver import Input, held_step, propagator
 from .controllers import Number
 from .law import Law
 from .steady import steady_state
@@ -70,7 +70,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
 
         def between(state, _):
             seen = (state.current, state.speed, applied)
-            return held_step(motor, along, drive, state, applied, load), seen
+            return held_step(motor, along, Input(drive, applied, load), state), seen
 
         # a loop and not written out: effects make long steps, and a sample may have dozens
         state, instants = jax.lax.scan(between, state, length=substeps, unroll=substeps == 1)

@@ -16,10 +16,10 @@ from jaxtyping import Array, Bool, Float
 
 from ..compiled import compiled
 from ..effects import State
-from ..motor import Drive, Motor
+from ..motor import Motor
 from ..simulate import Tape
 from ..simulate.shooting import outputs, reported
-from ..simulate.solver import Propagator, along_grids, held_step, pick_grid, steps_in_sample
+from ..simulate.solver import Input, Propagator, along_grids, held_step, pick_grid, steps_in_sample
 
 Signal = Float[Array, "samples blocks"]
 Outputs = Float[Array, "samples 2 blocks"]
@@ -67,11 +67,9 @@ def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
 @compiled
 def sensed(motor: Motor, tape: Tape, path: Path) -> Outputs:
     """By how much the sensors of `motor` report something else than the path."""
-    along, drive = _of_blocks(motor, tape)
-    value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T
-    rise = None if tape.rise is None else jnp.asarray(tape.rise).T
+    along, acting = _of_blocks(motor, tape)
     state, steps = _states(motor, tape, path), steps_in_sample(motor, tape)
-    seen = outputs(motor, along, drive, state, value, load, steps, rise)
+    seen = outputs(motor, along, acting, state, steps)
     late = reported(motor, tape, seen.transpose(2, 0, 1))
     return late.transpose(2, 1, 0) - jnp.stack([path.current, path.speed], 1)
 
@@ -122,8 +120,8 @@ def respond(
     return driven + jnp.einsum("sibj,bjc->sibc", free, starts)
 
 
-def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Drive]:
-    """The propagator and the drive of every block, over (samples, blocks)."""
+def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Input]:
+    """The propagator of every block, and what acts there, over (samples, blocks)."""
     along, drive = pick_grid(along_grids(motor, tape), tape, tape.grid)
     samples = tape.value.shape[1]
 
@@ -133,16 +131,15 @@ def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Drive]:
             blocks_last, (*blocks_last.shape[:-2], samples, blocks_last.shape[-1])
         )
 
-    return jax.tree.map(spread, along), drive
+    value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T
+    rise = None if tape.rise is None else jnp.asarray(tape.rise).T
+    return jax.tree.map(spread, along), Input(drive, value, load, rise)
 
 
 @compiled  # one trace of the bare motor serves all effects
 def _one_sample(motor: Motor, tape: Tape, path: Path) -> State:
-    along, drive = _of_blocks(motor, tape)
-    value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T
-    rise = None if tape.rise is None else jnp.asarray(tape.rise).T
-    state = _states(motor, tape, path)
-    return held_step(motor, along, drive, state, value, load, steps_in_sample(motor, tape), rise)
+    along, acting = _of_blocks(motor, tape)
+    return held_step(motor, along, acting, _states(motor, tape, path), steps_in_sample(motor, tape))
 
 
 def _states(motor: Motor, tape: Tape, path: Path) -> State:
@@ -151,20 +148,19 @@ def _states(motor: Motor, tape: Tape, path: Path) -> State:
     start = motor.initial_state(path.current, path.speed, load, path.angle)
     if not set(motor.states) - {"angle"}:
         return start
-    along, drive = _of_blocks(motor, tape)
-    steps, value = steps_in_sample(motor, tape), jnp.asarray(tape.value).T
+    (along, acting), steps = _of_blocks(motor, tape), steps_in_sample(motor, tape)
     begins = jnp.zeros(load.shape, bool).at[0].set(tape.begins)
 
     def advance(extra, sample):
         begins, rest, current, speed, value, load, block = sample
         extra = jax.tree.map(lambda new, old: jnp.where(begins, new, old), rest, extra)
         here = jax.tree.map(lambda leaf: leaf[..., 0, block], along)
-        driven = jax.tree.map(lambda share: share[block], drive)
+        drive = jax.tree.map(lambda share: share[block], acting.drive)
         state = State(current, speed, extra)
-        return held_step(motor, here, driven, state, value, load, steps).extra, extra
+        return held_step(motor, here, Input(drive, value, load), state, steps).extra, extra
 
     block = jnp.broadcast_to(jnp.arange(load.shape[1]), load.shape)
-    samples = (begins, start.extra, path.current, path.speed, value, load, block)
+    samples = (begins, start.extra, path.current, path.speed, acting.value, load, block)
     in_time = jax.tree.map(lambda x: x.T.reshape(-1), samples)
     nothing = jax.tree.map(lambda x: 0.0 * x[0], in_time[1])
     extra = jax.lax.scan(advance, nothing, in_time)[1]

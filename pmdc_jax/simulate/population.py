@@ -18,6 +18,7 @@ from ..threads import CORES, side_by_side
 from .exponential import Matrix, product
 from .solver import (
     HeldInput,
+    Input,
     Propagator,
     Walk,
     along_grids,
@@ -139,7 +140,7 @@ def _errors_of_linear(motors: Motor, tape: Tape):
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
-            return (held_step(motors, along, drive, state, value, load), errors), None
+            return (held_step(motors, along, Input(drive, value, load), state), errors), None
 
         (_, errors), _ = jax.lax.scan(sample, (starts, carry.seen), by_sample, unroll=STRIDE)
         return Walk(end, errors)
@@ -194,7 +195,7 @@ def _errors_with_effects(motors: Motor, tape: Tape):
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
-            after = held_step(motors, along, drive, state, value, load, steps)
+            after = held_step(motors, along, Input(drive, value, load), state, steps)
             return (after, errors), None
 
         run = tape.run[block]

@@ -22,9 +22,10 @@ from jaxtyping import Array, Float
 
 from ..compiled import compiled
 from ..effects.base import State
-from ..motor import Drive, Motor
+from ..motor import Motor
 from .solver import (
     HeldInput,
+    Input,
     Propagator,
     Walk,
     along_grids,
@@ -246,9 +247,9 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
         rises = None if rise is None else rise[k]
 
         def look_and_step(motor, along, state, load):
-            after = held_step(motor, along, drive, state, value[k], load, steps, rises)
-            after = _turned(state, after, turn[k])
-            return after, outputs(motor, along, drive, state, value[k], load, steps, rises)
+            acting = Input(drive, value[k], load, rises)
+            after = _turned(state, held_step(motor, along, acting, state, steps), turn[k])
+            return after, outputs(motor, along, acting, state, steps)
 
         (state, seen), (d_state, d_seen) = _along_columns(
             look_and_step, (motor, along, state, load[k]), (d_motor, d_along, d_state, d_load)
@@ -339,17 +340,13 @@ def _stitch_tangents(
     return jax.lax.scan(follow, nothing, blocks)[1]
 
 
-def outputs(
-    motor: Motor, along: Propagator, drive: Drive, state: State, value, load, steps, rise=None
-):
+def outputs(motor: Motor, along: Propagator, acting: Input, state: State, steps):
     """Reported current and speed, and for a late sensor the speed where it looks within the sample that follows."""
     current, speed = motor.sensors(state)
     if along.look is None:
         return jnp.stack([current, speed])
     part, share = along.look
-    if rise is not None:
-        value, rise = value - (1 - share) / 2 * rise, share * rise
-    there = held_step(motor, part, drive, state, value, load, steps, rise)
+    there = held_step(motor, part, acting.part(share / 2, share), state, steps)
     return jnp.stack([current, speed, motor.sensors(there)[1]])
 
 

@@ -31,6 +31,25 @@ FINEST = 32
 STIFF = 1.0
 
 
+class Input(NamedTuple):
+    """What acts on a motor over a step."""
+
+    drive: Drive
+    value: Scalars  # of what drives, V, A or N m: held, or the mean of a straight line
+    load: Scalars  # N m
+    rise: Scalars | None = None  # of the value in all, where it is not held
+
+    def at(self, share: Scalars | float) -> Scalars:
+        """The value after such a share of the step."""
+        return self.value if self.rise is None else self.value + (share - 0.5) * self.rise
+
+    def part(self, middle: Scalars | float, share: Scalars | float) -> Input:
+        """What acts over such a share of the step, about its `middle`."""
+        if self.rise is None:
+            return self
+        return self._replace(value=self.at(middle), rise=share * self.rise)
+
+
 class Stages(NamedTuple):
     """Weights of ETDRK4 for whatever is not linear."""
 
@@ -180,16 +199,11 @@ def steps_within(motor: Motor, seconds: float, current: Scalars) -> int | Int[Ar
 def held_step(
     motor: Motor,
     along: Propagator,
-    drive: Drive,
+    acting: Input,
     state: State,
-    value: Scalars,
-    load: Scalars,
     steps: int | Int[Array, ""] = 1,
-    rise: Scalars | None = None,
 ) -> State:
     """The state one sample later, in `steps` equal steps, for one of which `along` is made.
-
-    What drives is held at `value`, or goes straight through it at the middle of the sample and rises by `rise` in all.
 
     Motors whose effects leave them linear: exact. Otherwise the linear part is exact and the rest goes by the
     four stages of ETDRK4, in which dry elements act in the direction the step began with, and teeth touch or not as
@@ -198,50 +212,31 @@ def held_step(
     """
     if along.weights is None:
         # the state last: two fused multiply-adds, where a sum of sums would take an addition more
-        driven = _times(along.inputs, (value, load))
-        if rise is not None:
-            driven = _add(driven, _bend(motor, along, drive, state, value, load, rise))
+        driven = _times(along.inputs, (acting.value, acting.load))
+        if acting.rise is not None:
+            driven = _add(driven, _bend(motor, along, acting, state))
         current, speed = _times(along.whole, (state.current, state.speed), driven)
         return State(current, speed, state.extra)
     if isinstance(steps, int) and steps == 1:
-        return _step(motor, along, drive, state, value, load, rise)
+        return _step(motor, along, acting, state)
 
     def step(k, now: State) -> State:
-        if rise is None:
-            return _step(motor, along, drive, now, value, load)
-        middle = value + ((k + 0.5) / steps - 0.5) * rise
-        return _step(motor, along, drive, now, middle, load, rise / steps)
+        return _step(motor, along, acting.part((k + 0.5) / steps, 1 / steps), now)
 
     return jax.lax.fori_loop(0, steps, step, state)
 
 
-def _bend(
-    motor: Motor,
-    along: Propagator,
-    drive: Drive,
-    state: State,
-    value: Scalars,
-    load: Scalars,
-    rise: Scalars,
-) -> Vector:
+def _bend(motor: Motor, along: Propagator, acting: Input, state: State) -> Vector:
     """What a drive that rises on a straight line does in a step, beyond what its mean does."""
     assert along.ramp is not None, "a propagator for held drives"
     low, high = (
-        _vector(motor, motor.derivative(state, value + half, load, drive))
-        for half in (-rise / 2, rise / 2)
+        _vector(motor, motor.derivative(state, acting.at(end), acting.load, acting.drive))
+        for end in (0.0, 1.0)
     )
     return _times(along.ramp, tuple(b - a for a, b in zip(low, high, strict=True)))
 
 
-def _step(
-    motor: Motor,
-    along: Propagator,
-    drive: Drive,
-    state: State,
-    value: Scalars,
-    load: Scalars,
-    rise: Scalars | None = None,
-) -> State:
+def _step(motor: Motor, along: Propagator, acting: Input, state: State) -> State:
     teeth = motor.toothed
     if teeth is not None:
         touching = teeth.teeth(state).touch
@@ -253,7 +248,7 @@ def _step(
     weights = along.weights
     assert weights is not None
     motor = motor.with_effects(e.averaged_over_step(state, weights.step) for e in motor.effects)
-    rate, after = _unswitched(motor, along, weights, drive, state, value, load, rise)
+    rate, after = _unswitched(motor, along, weights, acting, state)
     x, begun, moved = _vector(motor, state), _vector(motor, rate), _vector(motor, after)
     slow = _slow(motor, after)
     if teeth is not None and weights.contact is not None:
@@ -261,7 +256,10 @@ def _step(
         moved = _add(moved, mend)
     if motor.switches:
         now, still = motor.at(state), state._replace(current=0.0 * x[0], speed=0.0 * x[1])
-        for row, holds, unit in ((1, "speed", 1 / now.J), (0, "current", drive.voltage / now.L)):
+        for row, holds, unit in (
+            (1, "speed", 1 / now.J),
+            (0, "current", acting.drive.voltage / now.L),
+        ):
             hold, ahead = motor.grip(holds, still), motor.grip(holds, _state(motor, moved, slow))
             if hold is not None and ahead is not None:
                 push, decay = weights.push[:, row] * unit, -weights.linear[row, row] * weights.step
@@ -277,14 +275,7 @@ def _step(
 
 
 def _unswitched(
-    motor: Motor,
-    along: Propagator,
-    weights: Weights,
-    drive: Drive,
-    state: State,
-    value: Scalars,
-    load: Scalars,
-    rise: Scalars | None,
+    motor: Motor, along: Propagator, weights: Weights, acting: Input, state: State
 ) -> tuple[State, State]:
     """The rate at which a step begins, and how it ends if dry elements and teeth go on as they began."""
     h, linear, always = weights.step, weights.linear, jnp.all(weights.step > 0)
@@ -292,15 +283,15 @@ def _unswitched(
     x, slow = _vector(motor, state), _slow(motor, state)
 
     def rates(x, slow, when):
-        driven = value if rise is None else value + (when - 0.5) * rise
-        rate = motor.derivative(_state(motor, x, slow), driven, load, drive, moving)
+        now = _state(motor, x, slow)
+        rate = motor.derivative(now, acting.at(when), acting.load, acting.drive, moving)
         return _vector(motor, rate), _slow(motor, rate)
 
     if weights.stages is None:
         begun, s0 = computed_once(rates(x, slow, 0.5), always)
         moved = _add(x, _times(weights.push, begun))
-        if rise is not None:
-            moved = _add(moved, _bend(motor, along, drive, state, value, load, rise))
+        if acting.rise is not None:
+            moved = _add(moved, _bend(motor, along, acting, state))
         return _state(motor, begun, s0), _state(motor, moved, _shifted(slow, h, s0))
 
     def rest(x, slow, when):
