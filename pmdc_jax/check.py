@@ -9,6 +9,7 @@ import numpy as np
 from .alignment import shifted_channels, slow_sampling
 from .angle import unwrapped
 from .clock import GAP, is_evenly_sampled
+from .differences import noise_by_differences
 from .plausibility import (
     angle_against_speed,
     implausible_units,
@@ -17,7 +18,7 @@ from .plausibility import (
     speed_of,
 )
 from .recording import Finding, Recording, place_of_sample
-from .unmeasured import clipped_extremes, noise_of
+from .unmeasured import clipped_extremes
 
 MAX_JITTER = 0.02  # of a step, root mean square
 MAX_JUMP = 0.2  # from sample to sample, of the range of a current that drives
@@ -161,7 +162,9 @@ def current_jumps(run: Recording) -> Iterator[Finding]:
         return
     steps = np.abs(np.diff(run.current))
     row = int(np.argmax(steps))
-    if steps[row] > MAX_JUMP * np.ptp(run.current) and steps[row] > 10 * noise_of(run.current):
+    if steps[row] > MAX_JUMP * np.ptp(run.current) and steps[row] > 10 * noise_by_differences(
+        3, run.current
+    ):
         yield Finding(
             run.name,
             "current",
@@ -197,8 +200,8 @@ def excitation(runs: Sequence[Recording]) -> Iterator[Finding]:
                 "whole run",
                 "Record the motor as it turns as well. If only friction held it, leave out the run",
             )
-        elif speed is not None and np.nanstd(speed) <= np.sqrt(2) * noise_of(speed):
-            noise = noise_of(speed)
+        elif speed is not None and np.nanstd(speed) <= np.sqrt(2) * noise_by_differences(3, speed):
+            noise = noise_by_differences(3, speed)
             what = f"it swings less than its noise of {noise:.3g}" if noise else "it never changes"
             yield Finding(
                 run.name,
@@ -245,4 +248,4 @@ def _moves(values: np.ndarray | None) -> bool:
     size = max(len(values) // 50, 1)
     means = values[: len(values) // size * size].reshape(-1, size).mean(1)
     rounding = 1e-9 * float(np.max(np.abs(values), initial=0.0))
-    return bool(np.std(means) > 2 * noise_of(values) / np.sqrt(size) + rounding)
+    return bool(np.std(means) > 2 * noise_by_differences(3, values) / np.sqrt(size) + rounding)

@@ -9,6 +9,7 @@ import attrs
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .differences import noise_by_differences
 from .recording import MAX_MISSING, Finding, Recording, place_of_sample
 
 # A spike is so many times what a signal usually bends from sample to sample ...
@@ -86,18 +87,11 @@ def clipped_extremes(
             yield float(extreme), start, length
 
 
-def noise_of(values: np.ndarray) -> float:
-    """Standard deviation of white noise, from third differences, which motion hardly reaches."""
-    third = np.diff(values, 3)
-    third = third[np.isfinite(third)]
-    return float(np.median(np.abs(third)) / (0.6745 * np.sqrt(20))) if len(third) else 0.0
-
-
 def _is_noisy(values: np.ndarray) -> bool:
     """Whether the channel scatters: neither a clean simulation nor one rounded to a few digits."""
     values = values[np.isfinite(values)]
     inner = values[(values > values.min()) & (values < values.max())]
-    if len(inner) < 100 or noise_of(inner) < 1e-5 * np.ptp(values):
+    if len(inner) < 100 or noise_by_differences(3, inner) < 1e-5 * np.ptp(values):
         return False
     third = np.diff(inner, 3)
     return bool(np.mean(third[1:] * third[:-1] < 0) > 0.5)  # 0.77 for white noise, 0 for motion

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..differences import noise_by_differences
+
 # A channel without noise (a simulation) is still scaled by something: this share of its size.
 FLOOR = 1e-5
 # Steps that are this share of the largest one are none
@@ -22,12 +24,10 @@ def white_noise(signals: Sequence[np.ndarray]) -> float | None:
     than what rounding to the quanta of the sensor does, which most differences do not show.
     """
     known = [s[~np.isnan(s)] for s in signals]
-    differences = [np.diff(s, 2) for s in known]
-    differences = np.concatenate([d for d in differences if len(d)] or [np.empty(0)])
-    if not len(differences):
+    if not any(len(s) > 2 for s in known):
         return None
     size = np.sqrt(np.mean([np.nanmean(np.square(s)) for s in signals]))
-    spread = np.median(np.abs(differences)) / (0.6745 * np.sqrt(6.0))
+    spread = noise_by_differences(2, *known)
     return float(max(spread, resolution_noise(known), FLOOR * size, 1e-12))
 
 

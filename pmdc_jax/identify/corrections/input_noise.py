@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ...differences import noise_by_differences
 from ...simulate import Tape, uniform
 from ..generalised_least_squares import series_of
 from ..likelihood import negative_log_likelihood
@@ -113,17 +114,11 @@ def smoothed(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " sampl
     **Source**: Goldenshluger & Nemirovski, Mathematical Methods of Statistics 6 (1997) 135 (intersection of
     confidence intervals); Katkovnik, IEEE Transactions on Signal Processing 47 (1999) 2567.
     """
-    noise = _noise(signal)
+    noise = noise_by_differences(4, signal)  # most of a signal is smooth
     if not noise > ROUNDING * np.max(np.abs(signal)):
         return signal
     estimates, errors = zip(*(_widest(signal, noise, *window) for window in WINDOWS), strict=True)
     return np.average(estimates, axis=0, weights=1 / np.square(errors))
-
-
-def _noise(signal: np.ndarray) -> float:
-    """Standard deviation of white noise, by the median of its fourth differences: most of a signal is smooth."""
-    differences = np.diff(signal, 4)
-    return float(np.median(np.abs(differences)) / 0.6745 / np.sqrt(70)) if len(differences) else 0.0
 
 
 def _widest(

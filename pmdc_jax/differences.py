@@ -1,0 +1,27 @@
+"""How noisy a signal is, whatever it does slowly."""
+
+from __future__ import annotations
+
+from math import comb
+
+import numpy as np
+from jaxtyping import Float
+
+# Median of the absolute value of a normal variable, in standard deviations
+MEDIAN = 0.6745
+
+
+def noise_by_differences(order: int, *signals: Float[np.ndarray, " _"]) -> float:
+    """Standard deviation of the white noise of signals of one kind, by differences of an `order`; zero without any.
+
+    These leave out what is a polynomial of a lower degree over a few samples, and have (2 n)! / (n!)^2 times the
+    variance of the noise; their median leaves out jumps. Differences that are not finite do not count.
+
+    **Source**: von Neumann, Annals of Mathematical Statistics 12 (1941), doi:10.1214/aoms/1177731677; the median:
+    Rousseeuw, Croux, Journal of the American Statistical Association 88 (1993), doi:10.1080/01621459.1993.10476408.
+    """
+    differences = np.concatenate([np.diff(signal, order) for signal in signals] or [np.empty(0)])
+    sizes = np.abs(differences[np.isfinite(differences)])
+    return (
+        float(np.median(sizes) / (MEDIAN * np.sqrt(comb(2 * order, order)))) if len(sizes) else 0.0
+    )
