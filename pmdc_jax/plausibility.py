@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .angle import unwrapped
 from .recording import Finding, Recording
 
 MAX_WINDOWS = 4000
@@ -258,7 +259,7 @@ def _windows(run: Recording, longer: int = 1) -> dict[str, np.ndarray]:
     if speed is not None:
         found["direction"] = middle(np.sign(speed))
     if run.angle is not None:
-        found["angle_rate"] = np.diff(run.angle[ends]) / length
+        found["angle_rate"] = np.diff(unwrapped(run.angle)[0][ends]) / length
     good = (length < 1.5 * np.median(length)) & np.isfinite(sum(found.values()))
     return {k: values[good] for k, values in found.items()} if good.sum() >= MIN_WINDOWS else {}
 
@@ -266,5 +267,5 @@ def _windows(run: Recording, longer: int = 1) -> dict[str, np.ndarray]:
 def speed_of(run: Recording) -> np.ndarray | None:
     """Speed in rad/s, (samples,), from the angle where it was not recorded; None without either."""
     if run.speed is None and run.angle is not None:
-        return np.gradient(run.angle, run.time)
+        return np.gradient(unwrapped(run.angle)[0], run.time)
     return run.speed

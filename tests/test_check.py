@@ -11,6 +11,7 @@ from attrs import evolve
 from scipy.linalg import expm
 
 from pmdc_jax.check import check
+from pmdc_jax.plausibility import speed_of
 from pmdc_jax.recording import Recording
 from pmdc_jax.simulate.uniform import speed_by_spline
 
@@ -201,7 +202,8 @@ def test_a_wrapped_angle_is_noted_and_goes_on(step):
     times = int(step * (len(run) - 1) / (2 * np.pi))
     assert found.severity == "note"
     assert f"starts again after each turn, {times} time" in found.what
-    np.testing.assert_allclose(speed_by_spline(run.angle, run.time), step / run.sample_time)
+    for speed in (speed_by_spline(run.angle, run.time), speed_of(run)):
+        np.testing.assert_allclose(speed, step / run.sample_time)
 
 
 def test_stamps_that_jitter_are_noted_with_what_the_samples_are_taken_for():
