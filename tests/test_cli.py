@@ -20,6 +20,7 @@ from pmdc_jax import cli
 from pmdc_jax.compilation_cache import keep_compiled
 from pmdc_jax.errors import InputError
 from pmdc_jax.identify.identification import Estimate
+from pmdc_jax.report import terminal
 
 HEAVY = ("jax", "numpy", "plotly", "polars", "scipy", "equinox", "diffrax")
 
@@ -116,6 +117,7 @@ def test_identify_passes_every_option_on(faked, capsys):
     )
     assert cli.main(arguments.split()) == 0
     recordings, options = faked.identify
+    assert callable(options.pop("progress"))
     assert recordings == ["a", "b"]
     assert options == {
         "holdout": ["c"],
@@ -125,7 +127,6 @@ def test_identify_passes_every_option_on(faked, capsys):
         "effects": ("coulomb_friction",),
         "search": "genetic",
         "seed": 7,
-        "progress": None,
     }
     assert faked.read[0] == ("a.csv", {"speed": "rpm_meas:rpm"})
 
@@ -173,6 +174,7 @@ def test_diagnose_passes_every_option_on(faked, capsys):
     )
     assert cli.main(arguments.split()) == 0
     recordings, options = faked.identify
+    assert callable(options.pop("progress"))
     assert recordings == ["a", "b"]
     assert options == {
         "holdout": ["c"],
@@ -181,7 +183,6 @@ def test_diagnose_passes_every_option_on(faked, capsys):
         "unloaded": True,
         "search": "genetic",
         "seed": 7,
-        "progress": None,
     }
     assert faked.read[0] == ("a.csv", {"speed": "rpm_meas:rpm"})
     out, err = capsys.readouterr()
@@ -328,18 +329,25 @@ def test_demo_refuses_a_file_as_folder(faked, capsys, tmp_path):
     assert faked.identify is None
 
 
-def test_progress_is_silent_without_a_terminal(faked, capsys):
+def test_short_work_is_silent_without_a_terminal(faked, capsys):
     assert cli.main(["identify", "a.csv"]) == 0
-    assert faked.identify[1]["progress"] is None
+    faked.identify[1]["progress"]("searching", fitness=1.0)
     assert capsys.readouterr().err == ""
 
 
-def test_progress_tells_what_it_does_on_a_terminal(monkeypatch, capsys):
-    from pmdc_jax.report.terminal import progress
+def test_long_work_speaks_now_and_then_without_a_terminal(monkeypatch, capsys):
+    seconds = iter([0.0, 14.0, 16.0, 16.0, 17.0])
+    monkeypatch.setattr(terminal, "SILENCE", 15.0)
+    monkeypatch.setattr(terminal, "monotonic", lambda: next(seconds))
+    with terminal.progress() as report:
+        for doing in ("checking", "searching", "refining"):
+            report(doing, 12.3456)
+    assert capsys.readouterr().err == "after 16 s: searching, best fitness 12.35\n"
 
+
+def test_progress_tells_what_it_does_on_a_terminal(monkeypatch, capsys):
     monkeypatch.setenv("FORCE_COLOR", "1")
-    with progress() as report:
-        assert report is not None
+    with terminal.progress() as report:
         report("searching, generation 12", fitness=1.0234, fraction=0.4)
         report("refining")
     out, err = capsys.readouterr()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from time import monotonic
 
 from attrs import evolve
 from rich.console import Console, Group, OverflowMethod, RenderableType
@@ -19,6 +20,8 @@ from .summary import role_word, runs_in_order, status_word, summary
 
 STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
 SEVERITY_STYLES = {"error": "red", "warning": "yellow"}
+# Seconds after which work that no terminal shows says what it does
+SILENCE = 15.0
 PIPE_WIDTH = 100  # rich would fold tables at 80 columns where there is no terminal
 
 
@@ -61,22 +64,38 @@ def identification_tables(identification: Identification) -> RenderableType:
 
 
 @contextmanager
-def progress() -> Iterator[ReportProgress | None]:
-    """A live line on standard error saying what goes on; None where that is no terminal."""
-    console = Console(stderr=True)
+def progress() -> Iterator[ReportProgress]:
+    """A live line on standard error saying what goes on; where that is no terminal, a line of it now and then."""
+    console = console_for(stderr=True)
     if not console.is_terminal:
-        yield None
+        yield _now_and_then(console)
         return
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as display:
         task = display.add_task("starting", total=None)
 
         def report(doing: str, fitness: float | None = None, fraction: float | None = None) -> None:
-            so_far = "" if fitness is None else f", best fitness {significant(fitness, 4)}"
             done, total = (None, None) if fraction is None else (fraction, 1.0)
-            display.update(task, description=doing + so_far, completed=done, total=total)
+            display.update(task, description=_so_far(doing, fitness), completed=done, total=total)
 
         yield report
+
+
+def _now_and_then(console: Console) -> ReportProgress:
+    began = last = monotonic()
+
+    def report(doing: str, fitness: float | None = None, fraction: float | None = None) -> None:
+        nonlocal last
+        del fraction
+        if monotonic() - last > SILENCE:
+            last = monotonic()
+            console.print(Text(f"after {last - began:.0f} s: {_so_far(doing, fitness)}"))
+
+    return report
+
+
+def _so_far(doing: str, fitness: float | None) -> str:
+    return doing if fitness is None else f"{doing}, best fitness {significant(fitness, 4)}"
 
 
 def parameter_table(identification: Identification) -> Table:
