@@ -49,6 +49,12 @@ class Model:
         return bool(simulated) and all(effect.is_possible() for effect in self.motor.effects)
 
     @property
+    def effects_at_bound(self) -> set[str]:
+        """The effects of which a parameter is held at its bound."""
+        names = self.given.problem.parameters.names
+        return {names[k].partition(".")[0] for k in self.fit.at_bound} & set(self.effects)
+
+    @property
     def dry(self) -> float:
         """Coulomb friction, N m, the mean of both directions."""
         return sum(self._dry) / 2
