@@ -26,6 +26,7 @@ from .effect_relations import CONTAINS, FULLER, spelt_out
 from .library import Library
 from .model import Model, model_of, refit_from
 from .screen import Screen, Signal
+from .shortlist import effect_of
 
 # Share of the gain foretold by the evidence that a refit keeps, or else is tried in another way
 KEPT = 0.5
@@ -56,20 +57,10 @@ class Refits:
 
     def with_signal(self, current: Model, signal: Signal, found: Screen) -> Model | None:
         """The current model with one more effect, None where its evidence is none that physics allows."""
-        candidate = signal.candidate
-        assert candidate is not None
-        contains, kept = CONTAINS.get(candidate.effect, set()), set(current.effects)
-        if contains & spelt_out(kept):
-            kept = spelt_out(kept) - contains
-        # as they were added, and what is spelt out last
-        order = [*(e for e in current.effects if e in kept), *(kept - set(current.effects))]
-        effects = (*order, candidate.effect)
+        effects = _with_another(current.effects, effect_of(signal))
 
         def refit() -> Model | None:
-            added: dict[str, Values] = {}
-            if "constant_load" in order and "constant_load" not in current.effects:
-                added["constant_load"] = {"torque_Nm": current.slanted}
-            start = self._pointed_at(current, effects, added, signal, found)
+            start = self._pointed_at(current, effects, signal, found)
             if start is None:
                 return None
             others = self._starts(current, effects)
@@ -240,7 +231,6 @@ class Refits:
         self,
         current: Model,
         effects: tuple[str, ...],
-        values: dict[str, Values],
         signal: Signal,
         found: Screen,
     ) -> Start | None:
@@ -258,7 +248,10 @@ class Refits:
         its = candidate.build(coefficients, current.dry)
         if its is None:
             return None
-        return self._start(current, effects, {**values, candidate.effect: its}, fit.moved, angles)
+        values = {candidate.effect: its}
+        if "constant_load" in set(effects) - set(current.effects) - {candidate.effect}:
+            values["constant_load"] = {"torque_Nm": current.slanted}
+        return self._start(current, effects, values, fit.moved, angles)
 
     def _start(
         self,
@@ -298,6 +291,15 @@ class Refits:
             model.given.problem.fitted_blocks, ..., column
         ]
         return float(np.square(seen).sum()) < 1 / FLAT**2
+
+
+def _with_another(here: tuple[str, ...], effect: str) -> tuple[str, ...]:
+    """A set of effects with one more, in place of those that it contains: as they were added, what is spelt out after
+    them, and it last."""
+    contains, kept = CONTAINS.get(effect, set()), set(here)
+    if contains & spelt_out(kept):
+        kept = spelt_out(kept) - contains
+    return (*(e for e in here if e in kept), *sorted(kept - set(here)), effect)
 
 
 def _fitness(model: Model) -> float:
