@@ -20,7 +20,7 @@ from pmdc_jax.diagnose.compare import Fitted
 from pmdc_jax.diagnose.effect_relations import FULLER, are_rivals, is_within
 from pmdc_jax.diagnose.evidence import Block, products
 from pmdc_jax.diagnose.experiment import difference_between
-from pmdc_jax.diagnose.library import Library
+from pmdc_jax.diagnose.library import Change, Library
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
 from pmdc_jax.diagnose.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.periodic import common_line, spectrum
@@ -28,6 +28,7 @@ from pmdc_jax.diagnose.pipeline import may_be_none
 from pmdc_jax.diagnose.quantisation import READINGS, readings
 from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
+from pmdc_jax.diagnose.rows import _side_by_side
 from pmdc_jax.diagnose.screen import Screen, Signal, common_to_waves, log_chance
 from pmdc_jax.diagnose.shortlist import effect_of, promising, shortlist
 from pmdc_jax.effects import EFFECTS
@@ -545,6 +546,18 @@ def test_response_is_the_change_of_the_simulation(x64, name):
         scale = np.abs(expected[:, c] * weight[:, c]).max()
         error = np.abs((found - expected)[:, c] * weight[:, c]).max()
         assert error <= 0.02 * scale + 1e-12, (name, c, error, scale)
+
+
+@pytest.mark.parametrize("most", [1, 4, 5, 32])
+def test_columns_are_the_same_however_many_stand_side_by_side(most):
+    rng = np.random.default_rng(3)
+    kicks, seen = rng.standard_normal((2, 10, 2, 3, 13))
+    changes = [Change(kicks[..., a:b], seen[..., a:b]) for a, b in ((0, 5), (5, 6), (6, 13))]
+    parts = list(_side_by_side(changes, most))
+    assert all(part.kicks.shape[-1] == most for part, _ in parts)
+    for field, whole in (("kicks", kicks), ("seen", seen)):
+        together = [getattr(part, field)[..., :width] for part, width in parts]
+        np.testing.assert_array_equal(np.concatenate(together, -1), whole)
 
 
 # --------------------------------------------------------------------------------- sets of effects

@@ -35,8 +35,8 @@ KNOTS_IN_PERIOD = 25
 MOVING, SLOWEST = 0.02, 0.05
 # Of the largest voltage, what a converter of seven bits and more resolves
 OF_CONVERTER = 0.01
-# Columns that are simulated side by side: the more, the more memory they take
-TOGETHER = 32
+# Columns that are simulated side by side, and numbers in all of them: the more, the more memory they take
+TOGETHER, AT_ONCE = 32, 2**23
 
 
 class Change(NamedTuple):
@@ -44,6 +44,11 @@ class Change(NamedTuple):
 
     kicks: np.ndarray  # where one sample leads to the next
     seen: np.ndarray  # ... and what is seen on top of it
+
+
+def side_by_side_on(tape: Tape) -> int:
+    """How many columns are simulated side by side."""
+    return max(1, min(TOGETHER, AT_ONCE // (2 * tape.value.size)))
 
 
 class Curve(NamedTuple):
@@ -108,7 +113,8 @@ class Library:
             elif shapes:
                 settings = [values for c in shapes for values in c.columns]
                 units = np.array([unit for c in shapes for unit in c.units])
-                for part in np.array_split(np.arange(len(settings)), -(-len(settings) // TOGETHER)):
+                parts = -(-len(settings) // side_by_side_on(tape))
+                for part in np.array_split(np.arange(len(settings)), parts):
                     values = {f: np.array([settings[k][f] for k in part]) for f in settings[0]}
                     case = (EFFECTS[name], values, self.bare, tape, path)
                     yield partial(_scaled_down, case, units[part])

@@ -18,7 +18,7 @@ from ..identify.generalised_least_squares import series_of
 from ..identify.noise_model import Series, Whitener
 from ..motor import Motor
 from ..simulate import Tape
-from .library import TOGETHER, Change
+from .library import Change, side_by_side_on
 from .model import Model, RunSeries, rows_of
 from .quantisation import readings
 from .response import Path, respond
@@ -62,7 +62,7 @@ def gathered(
         for k, f in enumerate(fits)
     ]
     first = 0
-    for change, width in _side_by_side(changes):
+    for change, width in _side_by_side(changes, side_by_side_on(tape)):
         response = np.asarray(_response(bare, tape, path, change))[..., :width]
         for run, of_run in zip(model.training, rows, strict=True):
             signal = response.transpose(2, 1, 0, 3)
@@ -79,20 +79,20 @@ def _response(bare: Motor, tape: Tape, path: Path, change: Change) -> Float32[Ar
     return jnp.where(sound, response, 0.0).astype(jnp.float32)
 
 
-def _side_by_side(changes: Iterable[Change]) -> Iterator[tuple[Change, int]]:
+def _side_by_side(changes: Iterable[Change], most: int) -> Iterator[tuple[Change, int]]:
     """The changes in parts of one width, for which the response is compiled once; how many columns each is of."""
     waiting: list[Change] = []
     count = 0
     for change in changes:
         waiting.append(change)
         count += change.kicks.shape[-1]
-        while count >= TOGETHER:
+        while count >= most:
             together = _joined(waiting)
-            yield Change(*(x[..., :TOGETHER] for x in together)), TOGETHER
-            waiting = [Change(*(x[..., TOGETHER:] for x in together))]
-            count -= TOGETHER
+            yield Change(*(x[..., :most] for x in together)), most
+            waiting = [Change(*(x[..., most:] for x in together))]
+            count -= most
     if count:
-        nothing = [(0, 0)] * 3 + [(0, TOGETHER - count)]
+        nothing = [(0, 0)] * 3 + [(0, most - count)]
         yield Change(*(np.pad(x, nothing) for x in _joined(waiting))), count
 
 
