@@ -51,12 +51,12 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
         )
     if {"J", "f"} <= names and not electrical and not loaded and not driven:
         return (
-            "No run has a voltage or a known load torque, so only the ratios of Kt, J and f are seen",
+            "No run has a voltage or a known load torque other than zero, so only the ratios of Kt, J and f are seen",
             "Record the voltage too, add a run with a known load torque, or give Kt with --known",
         )
     if {"Kt", "J"} <= names and not loaded and not driven:
         return (
-            "No run has a known load torque, so only the ratios of Kt, J and f are seen",
+            "No run has a known load torque other than zero, so only the ratios of Kt, J and f are seen",
             "Add a run with a known load torque, or tie Kt = Kb with --tie Kt=Kb",
         )
     if names == {"L"}:
