@@ -90,7 +90,7 @@ class GearBacklash(_TwoInertias):
 
     **Fields**: `stiffness_Nm_rad` of the teeth in contact in N m/rad, > 0; `damping_Nms_rad` in N m s/rad, > 0;
     `load_share`, s, the share of the inertia behind the gear, between 0 and 1; `gap_rad`, the whole play in rad, > 0,
-    usually 0.001 to 0.1.
+    usually 0.001 to 0.1 at the load, and as many times that at the motor as a reduction gear has turns.
     **Excitation needed**: torque through zero again and again, at two amplitudes.
     **Source**: Nordin, Gutman, "Controlling mechanical systems with backlash: a survey", Automatica 38
     (2002), doi:10.1016/S0005-1098(02)00047-X, section 2.
@@ -109,7 +109,7 @@ class GearBacklash(_TwoInertias):
         "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
         "damping_Nms_rad": ParameterRange("N m s/rad", 1e-11, 1e6),
         "load_share": ParameterRange("", 1e-2, 0.99),
-        "gap_rad": ParameterRange("rad", 1e-6, 1.0),
+        "gap_rad": ParameterRange("rad", 1e-6, 10.0),
     }
 
     gap_rad: Scalars
