@@ -44,7 +44,7 @@ def continuous_loop(
         asked = controller.command(memory, reference, speed, current, 0.0)
         return asked, _within_limits(motor, state, asked, voltage_limit, current_limit)
 
-    def rate(t, y, args):
+    def rate(t: Number, y: tuple[State, Memory], args: None) -> tuple[State, Memory]:
         state, memory = y
         asked, applied = voltages(state, memory)
         _, speed = motor.sensors(state)

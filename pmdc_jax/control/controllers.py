@@ -105,11 +105,15 @@ class PI(AbstractController):
     setpoint_weight: Number
     tracking_time: Number
 
-    def command(self, memory, reference, speed, current, step):
+    def command(
+        self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
+    ) -> Number:
         del current, step
         return self.proportional * (self.setpoint_weight * reference - speed) + memory.integral
 
-    def rates(self, memory, reference, speed, excess, step):
+    def rates(
+        self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
+    ) -> Memory:
         integral = _integral_rate(
             self.integral, self.tracking_time, reference - speed, excess, step
         )
@@ -145,13 +149,17 @@ class PID(AbstractController):
     setpoint_weight: Number
     tracking_time: Number
 
-    def command(self, memory, reference, speed, current, step):
+    def command(
+        self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
+    ) -> Number:
         del current
         slope = (speed - memory.filtered) / (self.filter_time + step)
         wanted = self.proportional * (self.setpoint_weight * reference - speed)
         return wanted + memory.integral - self.derivative * slope
 
-    def rates(self, memory, reference, speed, excess, step):
+    def rates(
+        self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
+    ) -> Memory:
         integral = _integral_rate(
             self.integral, self.tracking_time, reference - speed, excess, step
         )
@@ -184,12 +192,16 @@ class StateFeedback(AbstractController):
     current_gain: Number
     speed_gain: Number
 
-    def command(self, memory, reference, speed, current, step):
+    def command(
+        self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
+    ) -> Number:
         del memory, step
         state = self.current_gain * current + self.speed_gain * speed
         return self.reference_gain * reference - state
 
-    def rates(self, memory, reference, speed, excess, step):
+    def rates(
+        self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
+    ) -> Memory:
         del reference, speed, excess, step
         zero = jnp.zeros_like(memory.integral)
         return Memory(zero, zero)
@@ -216,12 +228,16 @@ class StateFeedbackIntegral(AbstractController):
     integral: Number
     tracking_time: Number
 
-    def command(self, memory, reference, speed, current, step):
+    def command(
+        self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
+    ) -> Number:
         del step
         state = self.current_gain * current + self.speed_gain * speed
         return self.reference_gain * reference - state + memory.integral
 
-    def rates(self, memory, reference, speed, excess, step):
+    def rates(
+        self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
+    ) -> Memory:
         integral = _integral_rate(
             self.integral, self.tracking_time, reference - speed, excess, step
         )

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..compiled import compiled
 from ..motor import Motor
+from .controllers import Number
 from .gains import GainSpace
 from .law import SampledMotor
 from .objective import CHOICE, DESCENT, Task, cost, exact_score, smooth_score
@@ -25,6 +26,8 @@ OVERFLOWN = 1e6  # cost of gains with which the speed overflows
 
 Coordinates = Float[Array, "starts gains"]
 Costs = Float[Array, " starts"]
+# Where the starts have got to, Adam's state, the best points they have seen, and what these cost
+Descent = tuple[Coordinates, optax.OptState, Coordinates, Costs]
 
 
 def best_coordinates(
@@ -60,8 +63,15 @@ def _best(coordinates: Coordinates, costs: Costs, count: int) -> Float[Array, "b
     return coordinates[jnp.argsort(costs)[:count]]
 
 
-def _smooth_costs(task, space, model, motors, coordinates, width) -> Costs:
-    def of(x):
+def _smooth_costs(
+    task: Task,
+    space: GainSpace,
+    model: SampledMotor,
+    motors: Motor,
+    coordinates: Coordinates,
+    width: Number,
+) -> Costs:
+    def of(x: Float[Array, " gains"]) -> Float[Array, ""]:
         return cost(task, smooth_score(task, model, motors, space.controller(x), width), DESCENT)
 
     return _finite(jax.vmap(of)(coordinates))
@@ -73,30 +83,36 @@ def _finite(costs: Costs) -> Costs:
 
 
 @compiled
-def _screen(task, space, model, motors, coordinates) -> Costs:
+def _screen(
+    task: Task, space: GainSpace, model: SampledMotor, motors: Motor, coordinates: Coordinates
+) -> Costs:
     return _smooth_costs(task, space, model, motors, coordinates, FIRST_WIDTH)
 
 
 @compiled
-def _rank(task, space, model, motors, coordinates) -> Costs:
-    def of(x):
+def _rank(
+    task: Task, space: GainSpace, model: SampledMotor, motors: Motor, coordinates: Coordinates
+) -> Costs:
+    def of(x: Float[Array, " gains"]) -> Float[Array, ""]:
         return cost(task, exact_score(task, model, motors, space.controller(x)), CHOICE)
 
     return _finite(jax.vmap(of)(coordinates))
 
 
 @compiled
-def _descend(task, space, model, motors, start: Coordinates) -> tuple[Coordinates, Costs]:
+def _descend(
+    task: Task, space: GainSpace, model: SampledMotor, motors: Motor, start: Coordinates
+) -> tuple[Coordinates, Costs]:
     """All starts at once: the sum of their costs has each one's own gradient."""
     lower, upper = (jnp.asarray(bound) for bound in space.bounds())
     schedule = optax.cosine_decay_schedule(RATE, ITERATIONS)
     optimiser = optax.adam(schedule, b1=0.8, b2=0.95)
 
-    def total(x, width):
+    def total(x: Coordinates, width: Number) -> tuple[Float[Array, ""], Costs]:
         costs = _smooth_costs(task, space, model, motors, x, width)
         return jnp.sum(costs), costs
 
-    def iteration(carry, k):
+    def iteration(carry: Descent, k: Int[Array, ""]) -> tuple[Descent, None]:
         x, state, best, lowest = carry
         width = FIRST_WIDTH * (LAST_WIDTH / FIRST_WIDTH) ** jnp.minimum(2 * k / ITERATIONS, 1.0)
         (_, costs), gradient = jax.value_and_grad(total, has_aux=True)(x, width)

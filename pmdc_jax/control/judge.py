@@ -18,7 +18,7 @@ from .controllers import AbstractController
 from .law import Law, SampledMotor
 from .loop import Response, closed_loop
 from .margins import margins
-from .metrics import StepMetrics, load_metrics, step_metrics
+from .metrics import LoadMetrics, StepMetrics, load_metrics, step_metrics
 from .objective import SECOND_SETPOINT, Score, Task, exact_score
 
 REPORTED_SUBSTEPS = 10  # instants a sample in what is reported
@@ -100,13 +100,13 @@ def simulated(task: Task, motor: Motor, law: Law) -> Response:
 def speeds(task: Task, motors: Motor, law: Law) -> Float[Array | np.ndarray, "motors samples"]:
     """Of every motor at every sample, rad/s."""
 
-    def speed(motor):
+    def speed(motor: Motor) -> Float[Array | np.ndarray, " samples"]:
         return closed_loop(motor, law, task.course(), task.substeps).speed[:: task.substeps]
 
     return jax.vmap(speed)(motors)
 
 
-def _by_name(metrics) -> dict[str, float | None]:
+def _by_name(metrics: StepMetrics | LoadMetrics) -> dict[str, float | None]:
     """Numbers by name, None for what never happens."""
     values = {name: float(value) for name, value in metrics._asdict().items()}
     return {name: value if math.isfinite(value) else None for name, value in values.items()}

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..compiled import compiled
-from ..effects.base import State
+from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
 from ..precision import double_precision
 from ..simulate.solver import Input, Propagator, held_step, propagator
@@ -18,6 +20,9 @@ from .steady import steady_state
 INSTANTS = 20_000  # of a simulated dash
 DOUBLINGS = 12  # of its duration, before the band counts as out of reach
 DRIVE = Drive()  # by the voltage
+
+# Where the motor is, whether it is in full reverse, and whether its speed has turned there
+Dash = tuple[State, Bool[Array, ""], Bool[Array, ""]]
 
 
 @double_precision
@@ -55,7 +60,7 @@ def fastest_settling(
     return None
 
 
-def _with_one_switch(motor: Motor, duration: float, *bounds) -> float:
+def _with_one_switch(motor: Motor, duration: float, *bounds: Any) -> float:
     """Settling time with the latest switch to full reverse that keeps the speed in the band."""
     settling, stays = _dash(motor, jnp.asarray(duration), jnp.asarray(INSTANTS), *bounds)
     early, late = 0, INSTANTS
@@ -92,7 +97,7 @@ def _dash(
     band = BAND * jnp.abs(setpoint - initial)
     load = jnp.asarray(load, float)
 
-    def instant(carry, k):
+    def instant(carry: Dash, k: Int[Array, ""]) -> tuple[Dash, Scalars]:
         state, braking, turned = carry
         short = ahead * (setpoint - state.speed) - band
         braking = braking | (k >= switch) | (short <= 0)

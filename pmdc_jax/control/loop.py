@@ -10,13 +10,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..compiled import compiled
+from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
 from ..simulate.solver import Input, held_step, propagator
 from .controllers import Number
-from .law import Law
+from .law import Law, LawState
 from .steady import steady_state
 
 REMEMBERED_SAMPLES = 32  # of the speed, for a sensor that is late
+
+
+# The motor's state, the law's, the voltage in V decided last, and the speeds in rad/s so far, latest first
+LoopState = tuple[State, LawState, Number, Float[Array, " remembered"]]
+# Current, speed and voltage at one instant
+Instant = tuple[Scalars, Scalars, Scalars]
 
 
 class Course(NamedTuple):
@@ -57,7 +64,9 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
     memory = law.start(course.initial, at, voltage)
     start = (at, memory, voltage, jnp.full(REMEMBERED_SAMPLES, motor.sensors(at)[1]))
 
-    def sample(carry, now):
+    def sample(
+        carry: LoopState, now: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]
+    ) -> tuple[LoopState, Instant]:
         state, memory, acting, past = carry
         reference, load, noise = now
         current, speed = motor.sensors(state)
@@ -68,7 +77,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
         memory, decided = law.step(memory, reference, speed, current)
         applied = jnp.asarray(acting if hardware.delay else decided)
 
-        def between(state, _):
+        def between(state: State, _: None) -> tuple[State, Instant]:
             seen = (state.current, state.speed, applied)
             return held_step(motor, along, Input(drive, applied, load), state), seen
 

@@ -44,7 +44,7 @@ def linear_loop(motor: Motor, law: Law) -> Loop:
     start = law.start(0.0, zero, jnp.zeros(()))
     leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, start))
 
-    def sample(inputs):
+    def sample(inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
         current, speed, *memory, voltage, error = inputs
         state: LawState = jax.tree.unflatten(tree, memory)
         after, decided = law.step(state, 0.0, speed + error, current)
@@ -78,7 +78,7 @@ def _characteristic(matrix: Matrix) -> Float[Array, " n+1"]:
     size = matrix.shape[0]
     eye = jnp.eye(size)
 
-    def next_coefficient(product, k):
+    def next_coefficient(product: Matrix, k: Float[Array, ""]) -> tuple[Matrix, Float[Array, ""]]:
         product = matrix @ product
         coefficient = -jnp.trace(product) / k
         return product + coefficient * eye, coefficient

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from ..effects.base import State
 from ..motor import Motor
@@ -24,17 +25,17 @@ def steady_state(motor: Motor, speed: Number, load: Number = 0.0) -> tuple[State
     if not motor.effects:
         return State(current, speed, {}), voltage
 
-    def unpacked(unknown):
+    def unpacked(unknown: Float[Array, " unknowns"]) -> tuple[State, Float[Array, ""]]:
         current, voltage, *extra = unknown
         return State(current, speed, dict(zip(motor.states, extra, strict=True))), voltage
 
-    def rates(unknown):
+    def rates(unknown: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
         state, voltage = unpacked(unknown)
         moving = (jnp.sign(state.current), jnp.sign(speed))
         rate = motor.derivative(state, voltage, jnp.asarray(load, float), None, moving)
         return jnp.stack([rate.current, rate.speed, *(rate.extra[name] for name in motor.states)])
 
-    def newton(_, unknown):
+    def newton(_: Int[Array, ""], unknown: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
         # a state that never rests, such as an angle, has no say: hence the pseudo-inverse
         return unknown - jnp.linalg.pinv(jax.jacfwd(rates)(unknown)) @ rates(unknown)
 
