@@ -43,7 +43,7 @@ def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
             term = one / float(math.factorial(j + k)) + product(small, term)
         return term
 
-    def double(carry):
+    def double(carry: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
         decay, *half = carry
         f0 = one + decay
         doubled = [

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..compiled import compiled
-from ..effects.base import State
+from ..effects.base import Scalars, State
 from ..motor import Motor
 from ..threads import CORES, side_by_side
 from .exponential import Matrix, product
@@ -32,13 +32,14 @@ from .tape import BLOCK, Samples, Tape
 # Samples in a stride of linear motors, a power of two that divides a block: measured, 8 and 32 are slower.
 STRIDE = 16
 
+# Of current (A^2) and speed (rad^2/s^2)
+Errors = tuple[Float[Array, " population"], Float[Array, " population"]]
+
 # Candidates a thread takes at least, linear and with effects: below this, handing them over costs more than it saves.
 LINEAR_SHARE, SHARE = 256, 32
 
 
-def squared_errors(
-    motors: Motor, tape: Tape
-) -> tuple[Float[Array, " population"], Float[Array, " population"]]:
+def squared_errors(motors: Motor, tape: Tape) -> Errors:
     """Sums of squared errors of current (A^2) and speed (rad^2/s^2) for a population, in free run.
 
     **Arguments**: `motors`, whose fields have the shape (population,). Every run starts at the tape's initial
@@ -51,7 +52,7 @@ def squared_errors(
     if shares == 1 or size % shares:  # unequal shares would be compiled once more
         return _errors(motors, tape, np.asarray(0), 1)
 
-    def part(k: int):
+    def part(k: int) -> Errors:
         return jax.block_until_ready(_errors(motors, tape, np.asarray(k), shares))
 
     # XLA walks a population on one core; the cores share it out among them
@@ -62,7 +63,7 @@ def squared_errors(
 
 # The widest vectors, where the processor has them: by default XLA uses half of their width.
 @partial(compiled, options={"xla_cpu_prefer_vector_width": 512})
-def _errors(motors: Motor, tape: Tape, share: Int[Array | np.ndarray, ""], shares: int):
+def _errors(motors: Motor, tape: Tape, share: Int[Array | np.ndarray, ""], shares: int) -> Errors:
     """Of one of the equal shares of a population."""
     if shares > 1:
         size = motors.R.shape[0] // shares
@@ -72,6 +73,10 @@ def _errors(motors: Motor, tape: Tape, share: Int[Array | np.ndarray, ""], share
         # a slice that is merged into the arithmetic costs it its vector instructions
         motors = jax.tree.unflatten(jax.tree.structure(motors), jax.lax.optimization_barrier(mine))
     return _errors_with_effects(motors, tape) if motors.effects else _errors_of_linear(motors, tape)
+
+
+# Where motors are, and their squared errors of current and speed so far
+Gathered = tuple[State, tuple[Scalars, ...]]
 
 
 class Stride(NamedTuple):
@@ -100,7 +105,9 @@ def _starts(stride: Stride, state: State, value: Samples, load: Samples) -> tupl
     inputs = jnp.concatenate([_in_strides(value), _in_strides(load)], axis=1)
     pushes = jnp.tensordot(inputs, stride.from_rest, 1)
 
-    def follow(x, push):
+    def follow(
+        x: Float[Array, "2 population"], push: Float[Array, "2 population"]
+    ) -> tuple[Float[Array, "2 population"], Float[Array, "2 population"]]:
         return stride.whole[:, 0] * x[0] + stride.whole[:, 1] * x[1] + push, x
 
     end, starts = jax.lax.scan(follow, jnp.stack([state.current, state.speed]), pushes)
@@ -111,7 +118,7 @@ def _in_strides(samples: Float[Samples, "... samples"]) -> Float[Array, "... str
     return jnp.asarray(samples).reshape(*samples.shape[:-1], -1, STRIDE)
 
 
-def _errors_of_linear(motors: Motor, tape: Tape):
+def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
     """One share of linear motors: its blocks one after another, the whole population in the state.
 
     The strides of a block go side by side: XLA makes one loop over strides and candidates of all the
@@ -120,7 +127,7 @@ def _errors_of_linear(motors: Motor, tape: Tape):
     grids = along_grids(motors, tape)
     strides, rows = jax.vmap(_stride)(grids), BLOCK // STRIDE
 
-    def advance(carry, block):
+    def advance(carry: Walk, block: Int[Array, ""]) -> Walk:
         grid = jnp.asarray(tape.grid)[block]
         _, drive = pick_grid(grids, tape, grid)
         along = jax.tree.map(lambda leaf: _repeated(_taken(leaf, grid), rows), grids)
@@ -133,7 +140,15 @@ def _errors_of_linear(motors: Motor, tape: Tape):
         # samples of a stride in front, behind them a row for each stride
         by_sample = jax.tree.map(lambda s: jnp.moveaxis(_in_strides(s), -1, 0)[..., None], samples)
 
-        def sample(carry, samples):
+        def sample(
+            carry: Gathered,
+            samples: tuple[
+                Float[Array, "strides 1"],
+                Float[Array, "strides 1"],
+                Float[Array, "2 strides 1"],
+                Float[Array, "2 strides 1"],
+            ],
+        ) -> tuple[Gathered, None]:
             state, errors = carry
             value, load, measured, weight = samples
             seen = (state.current, state.speed)
@@ -172,17 +187,26 @@ def _repeated(
     return jnp.broadcast_to(leaf[..., None, :], (*leaf.shape[:-1], rows, leaf.shape[-1]))
 
 
-def _errors_with_effects(motors: Motor, tape: Tape):
+def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
     """One share of motors with effects, from sample to sample."""
     grids, steps = along_grids(motors, tape), steps_in_sample(motors, tape)
     delay = motors.speed_delay()
     speeds, weights = (jnp.asarray(x)[:, 1].reshape(-1) for x in (tape.measured, tape.weight))
     ends = BLOCK * jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs), side="right")
 
-    def advance(carry, block):
+    def advance(carry: Walk, block: Int[Array, ""]) -> Walk:
         along, drive = pick_grid(grids, tape, tape.grid[block])
 
-        def sample(carry, samples):
+        def sample(
+            carry: Gathered,
+            samples: tuple[
+                Float[Array, ""],
+                Float[Array, ""],
+                Float[Array, "2"],
+                Float[Array, "2"],
+                Int[Array, ""],
+            ],
+        ) -> tuple[Gathered, None]:
             state, errors = carry
             value, load, measured, weight, k = samples
             if delay is not None:  # what is seen later is compared with what was measured later

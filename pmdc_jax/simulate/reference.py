@@ -5,6 +5,7 @@ from __future__ import annotations
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..effects.base import State
@@ -29,7 +30,7 @@ def reference_solution(
     `initial`, current and speed; `tolerance`, relative, and absolute in A and rad/s.
     """
 
-    def rate(t, state, args):
+    def rate(t: float | Float[Array | np.ndarray, ""], state: State, args: None) -> State:
         k = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
         return motor.derivative(State(*state), voltage[k], load[k])
 

@@ -12,13 +12,13 @@ doi:10.1007/BF02238534 (its use for parallel time integration).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..compiled import compiled
 from ..effects.base import State
@@ -36,6 +36,8 @@ from .solver import (
 )
 from .tape import BLOCK, Tape
 
+T = TypeVar("T")
+
 # The last pass corrects to first order what is left, so the joint error is about the square of this.
 JOINED = 1e-4
 
@@ -44,6 +46,9 @@ JOINED = 1e-4
 PASSES = 32
 
 Starts = Float[Array, "blocks states"]
+Start = Float[Array, " states"]  # of one block
+# A motor, and its propagators on the grids of a tape; or their derivatives, by columns in front
+Prepared = tuple[Motor, Propagator]
 
 
 class Pass(NamedTuple):
@@ -110,7 +115,7 @@ def sensitivities(
     count = len(parameters)
     every = count + LOCAL
 
-    def prepare(parameters):
+    def prepare(parameters: Float[Array, " parameters"]) -> Prepared:
         motor = assemble(parameters)
         return motor, along_grids(motor, tape)
 
@@ -147,7 +152,9 @@ def sensitivities(
     return seen, jnp.moveaxis(d_seen, 0, -1)
 
 
-def _along_columns(function: Callable, primals: tuple, tangents: tuple):
+def _along_columns(
+    function: Callable[..., T], primals: tuple[Any, ...], tangents: tuple[Any, ...]
+) -> tuple[T, T]:
     """A function's value, and its derivative along every column of the tangents."""
     return jax.vmap(lambda *tangent: jax.jvp(function, primals, tangent), out_axes=(None, 0))(
         *tangents
@@ -188,8 +195,18 @@ def _guess(motor: Motor, own: RunUnknowns, tape: Tape, begins: Starts) -> Starts
     return jnp.where(jnp.asarray(tape.begins)[:, None], begins, guess)
 
 
+# The starts of the last pass, the joined ones, that pass (None where nobody asks for its results, only for their
+# shapes), the largest gap that was left, and how many passes there were
+Joining = tuple[Starts, Starts, Any, Float[Array, ""], Int[Array, ""]]
+
+
 def _join(
-    prepared, still, tape: Tape, own: RunUnknowns, begins: Starts, most: int | None = None
+    prepared: Prepared,
+    still: Prepared,
+    tape: Tape,
+    own: RunUnknowns,
+    begins: Starts,
+    most: int | None = None,
 ) -> tuple[Starts, Starts, Pass]:
     """Starts at which every block begins where the one before it ended; those of the last pass, and that pass.
 
@@ -202,11 +219,11 @@ def _join(
     exact = motor.affine and not motor.switches
     passes = 1 if exact else min(most or len(guess) + 1, len(guess) + 1)
 
-    def unjoined(carry):
+    def unjoined(carry: Joining) -> Bool[Array, ""]:
         *_, gap, passed = carry
         return (gap > JOINED) & (passed < passes)
 
-    def again(carry):
+    def again(carry: Joining) -> Joining:
         _, starts, _, _, passed = carry
         run = _pass(prepared, still, begins.shape[1], tape, starts, own.load_offset)
         size = jnp.max(jnp.abs(jnp.concatenate([starts, run.end])), axis=0) + 1e-6
@@ -223,7 +240,14 @@ def _join(
 
 
 @eqx.filter_jit  # one trace serves `_join` and, of the same columns, whoever else asks
-def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_offset) -> Pass:
+def _pass(
+    prepared: Prepared,
+    d_prepared: Prepared,
+    columns: int,
+    tape: Tape,
+    starts: Starts,
+    load_offset: Float[Array, " runs"],
+) -> Pass:
     """Run every block from its start, with tangents. The last columns are the starts themselves."""
     motor, grids = prepared
     d_motor, d_grids = d_prepared
@@ -242,11 +266,13 @@ def _pass(prepared, d_prepared, columns: int, tape: Tape, starts: Starts, load_o
     turn = jnp.asarray(tape.turn).T
     rise = None if tape.rise is None else jnp.asarray(tape.rise).T
 
-    def advance(carry, k):
+    def advance(carry: Walk, k: Int[Array, ""]) -> Walk:
         state, d_state = carry.state
         rises = None if rise is None else rise[k]
 
-        def look_and_step(motor, along, state, load):
+        def look_and_step(
+            motor: Motor, along: Propagator, state: State, load: Float[Array, " blocks"]
+        ) -> tuple[State, Float[Array, "outputs blocks"]]:
             acting = Input(drive, value[k], load, rises)
             after = _turned(state, held_step(motor, along, acting, state, steps), turn[k])
             return after, outputs(motor, along, acting, state, steps)
@@ -287,7 +313,13 @@ def _turned(before: State, after: State, turn: Float[Array, " blocks"]) -> State
     return after._replace(extra={**after.extra, "angle": angle})
 
 
-def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts, limits=None) -> Starts:
+def _stitch(
+    passed: Pass,
+    tape: Tape,
+    starts: Starts,
+    begins: Starts,
+    limits: tuple[Start, Start] | None = None,
+) -> Starts:
     """Newton's correction: each block starts where the corrected one before it ends.
 
     Far from the end of the road Newton's straight line overshoots. So with `limits`, the size of the states and
@@ -296,7 +328,10 @@ def _stitch(passed: Pass, tape: Tape, starts: Starts, begins: Starts, limits=Non
     """
     by_start = jnp.moveaxis(passed.d_end[-starts.shape[1] :], 0, -1)
 
-    def follow(end, block):
+    def follow(
+        end: Start,
+        block: tuple[Start, Bool[Array, ""], Start, Float[Array, "states states"], Start],
+    ) -> tuple[Start, Start]:
         begin, first, passed_end, jacobian, start = block
         new = jnp.where(first, begin, end)
         change = new - start
@@ -320,16 +355,35 @@ def _recurrence(motor: Motor) -> Float[Array, " states"]:
     )
 
 
+# How a block begins or ends, and its derivatives by all columns
+WithTangents = tuple[Start, Float[Array, "states columns"]]
+
+
 def _stitch_tangents(
-    passed: Pass, tape: Tape, starts: Starts, begins: Starts, d_begins, count: int
-):
+    passed: Pass,
+    tape: Tape,
+    starts: Starts,
+    begins: Starts,
+    d_begins: Float[Array, "columns blocks states"],
+    count: int,
+) -> tuple[Starts, Float[Array, "blocks states columns"]]:
     """The same, and the derivatives of the starts by all columns."""
     states = starts.shape[1]
     by_column = jnp.moveaxis(passed.d_end, 0, -1)
     by_start = by_column[..., -states:]
     by_own = _among_columns(by_column[..., : count + 1], count)
 
-    def follow(carry, block):
+    def follow(
+        carry: WithTangents,
+        block: tuple[
+            Bool[Array, ""],
+            WithTangents,
+            Start,
+            Float[Array, "states states"],
+            Start,
+            Float[Array, "states columns"],
+        ],
+    ) -> tuple[WithTangents, WithTangents]:
         first, begin, passed_end, jacobian, start, own = block
         new, d_new = jax.tree.map(lambda a, b: jnp.where(first, a, b), begin, carry)
         return (passed_end + jacobian @ (new - start), jacobian @ d_new + own), (new, d_new)
@@ -340,7 +394,9 @@ def _stitch_tangents(
     return jax.lax.scan(follow, nothing, blocks)[1]
 
 
-def outputs(motor: Motor, along: Propagator, acting: Input, state: State, steps):
+def outputs(
+    motor: Motor, along: Propagator, acting: Input, state: State, steps: int | Int[Array, ""]
+) -> Float[Array, "outputs ..."]:
     """Reported current and speed, and for a late sensor the speed where it looks within the sample that follows."""
     current, speed = motor.sensors(state)
     if along.look is None:
@@ -350,7 +406,9 @@ def outputs(motor: Motor, along: Propagator, acting: Input, state: State, steps)
     return jnp.stack([current, speed, motor.sensors(there)[1]])
 
 
-def reported(motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]):
+def reported(
+    motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]
+) -> Float[Array, "blocks 2 samples"]:
     """Current and speed, the latter as late as the motor's sensor reports it; before a run began, as it began."""
     delay = motor.speed_delay()
     if delay is None:

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from .tape import Tape
 
 Held = Float[Array, "*#batch"]
+Time = float | Float[Array | np.ndarray, ""]  # of the solver: it counts steps
 Vector = tuple[Scalars, ...]  # current, speed, and the states of linear effects
+Slow = dict[str, Scalars]  # the states that are not in the linear part, by name
 
 # Steps into which a sample is divided at most
 FINEST = 32
@@ -220,7 +222,7 @@ def held_step(
     if isinstance(steps, int) and steps == 1:
         return _step(motor, along, acting, state)
 
-    def step(k, now: State) -> State:
+    def step(k: int | Int[Array, ""], now: State) -> State:
         return _step(motor, along, acting.part((k + 0.5) / steps, 1 / steps), now)
 
     return jax.lax.fori_loop(0, steps, step, state)
@@ -282,7 +284,7 @@ def _unswitched(
     moving = (jnp.sign(state.current), jnp.sign(state.speed))
     x, slow = _vector(motor, state), _slow(motor, state)
 
-    def rates(x, slow, when):
+    def rates(x: Vector, slow: Slow, when: float) -> tuple[Vector, Slow]:
         now = _state(motor, x, slow)
         rate = motor.derivative(now, acting.at(when), acting.load, acting.drive, moving)
         return _vector(motor, rate), _slow(motor, rate)
@@ -294,7 +296,7 @@ def _unswitched(
             moved = _add(moved, _bend(motor, along, acting, state))
         return _state(motor, begun, s0), _state(motor, moved, _shifted(slow, h, s0))
 
-    def rest(x, slow, when):
+    def rest(x: Vector, slow: Slow, when: float) -> tuple[Vector, Slow]:
         """What the linear part leaves over, and the rates of the states that are not in it."""
         rate, slow = rates(x, slow, when)
         return computed_once((_add(rate, _times(-linear, x)), slow), always)
@@ -330,16 +332,25 @@ class HeldInput(diffrax.AbstractSolver):
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
-    def order(self, terms):
+    def order(self, terms: diffrax.AbstractTerm) -> int:
         return 4
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(self, terms: diffrax.AbstractTerm, t0: Time, t1: Time, y0: Walk, args: None) -> None:
         return None
 
-    def func(self, terms, t0, y0, args):
+    def func(self, terms: diffrax.AbstractTerm, t0: Time, y0: Walk, args: None) -> Walk:
         return terms.vf(t0, y0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Time,
+        t1: Time,
+        y0: Walk,
+        args: None,
+        solver_state: None,
+        made_jump: bool | Bool[Array | np.ndarray, ""],
+    ) -> tuple[Walk, None, dict[str, Walk], None, diffrax.RESULTS]:
         y1 = self.advance(y0, jnp.round(t0).astype(jnp.int32))
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
@@ -415,15 +426,15 @@ def _vector(motor: Motor, state: State) -> Vector:
     return (state.current, state.speed, *(state.extra[name] for name in _linear_states(motor)))
 
 
-def _slow(motor: Motor, state: State) -> dict[str, Scalars]:
+def _slow(motor: Motor, state: State) -> Slow:
     """The states that are not in the linear part."""
     linear = _linear_states(motor)
     return {name: x for name, x in state.extra.items() if name not in linear}
 
 
-def _state(motor: Motor, x: Vector, slow: dict[str, Scalars]) -> State:
+def _state(motor: Motor, x: Vector, slow: Slow) -> State:
     return State(x[0], x[1], slow | dict(zip(_linear_states(motor), x[2:], strict=True)))
 
 
-def _shifted(slow: dict, weight: Held, rates: dict) -> dict:
+def _shifted(slow: Slow, weight: Held, rates: Slow) -> Slow:
     return {name: slow[name] + weight * rates[name] for name in slow}

@@ -159,7 +159,7 @@ class Tape(eqx.Module):
 class _Run:
     """One recording as the tape needs it: what drives it, what was measured, how it starts."""
 
-    def __init__(self, recording: Recording, straight: bool):
+    def __init__(self, recording: Recording, straight: bool) -> None:
         self.length = len(recording.time)
         self.blocks = -(-self.length // BLOCK)
         missing = np.full(self.length, np.nan)
