@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +29,7 @@ OVERFLOWN = 1e6  # cost of gains with which the speed overflows
 Coordinates = Float[Array, "starts gains"]
 Costs = Float[Array, " starts"]
 # Where the starts have got to, Adam's state, the best points they have seen, and what these cost
-Descent = tuple[Coordinates, optax.OptState, Coordinates, Costs]
+Descent = tuple[Coordinates, Any, Coordinates, Costs]
 
 
 def best_coordinates(

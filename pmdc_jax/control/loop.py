@@ -19,11 +19,10 @@ from .steady import steady_state
 
 REMEMBERED_SAMPLES = 32  # of the speed, for a sensor that is late
 
-
 # The motor's state, the law's, the voltage in V decided last, and the speeds in rad/s so far, latest first
 LoopState = tuple[State, LawState, Number, Float[Array, " remembered"]]
-# Current, speed and voltage at one instant
-Instant = tuple[Scalars, Scalars, Scalars]
+# Current, speed and voltage at one instant, or at those of a sample
+Instants = tuple[Scalars, Scalars, Scalars]
 
 
 class Course(NamedTuple):
@@ -66,7 +65,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
 
     def sample(
         carry: LoopState, now: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]
-    ) -> tuple[LoopState, Instant]:
+    ) -> tuple[LoopState, Instants]:
         state, memory, acting, past = carry
         reference, load, noise = now
         current, speed = motor.sensors(state)
@@ -77,7 +76,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
         memory, decided = law.step(memory, reference, speed, current)
         applied = jnp.asarray(acting if hardware.delay else decided)
 
-        def between(state: State, _: None) -> tuple[State, Instant]:
+        def between(state: State, _: None) -> tuple[State, Instants]:
             seen = (state.current, state.speed, applied)
             return held_step(motor, along, Input(drive, applied, load), state), seen
 
