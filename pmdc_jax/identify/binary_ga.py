@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -49,8 +50,12 @@ class BinaryGA(PopulationBasedAlgorithm):
     """
 
     def __init__(
-        self, population_size: int, solution: Float[Array, " n"], bits: int = 10, **kwargs
-    ):
+        self,
+        population_size: int,
+        solution: Float[Array, " n"],
+        bits: int = 10,
+        **kwargs: Callable[..., Any],
+    ) -> None:
         super().__init__(population_size, solution, **kwargs)
         self.bits = bits
 
@@ -83,7 +88,14 @@ class BinaryGA(PopulationBasedAlgorithm):
         best = state.population[jnp.argmin(state.fitness)]
         return self._decode(child).at[0].set(best), state
 
-    def _tell(self, key, population, fitness, state: State, params: Params) -> State:
+    def _tell(
+        self,
+        key: jax.Array,
+        population: Float[Array, "p n"],
+        fitness: Float[Array, " p"],
+        state: State,
+        params: Params,
+    ) -> State:
         del key, params
         return state.replace(population=population, fitness=fitness)
 

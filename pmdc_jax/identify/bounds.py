@@ -110,7 +110,7 @@ def _armature(recordings: Sequence[Recording]) -> tuple[float, float, float]:
     return (float(np.median(loads)) / 3 if loads else 1.0), Kb, 0.0
 
 
-def _motion(recordings: Sequence[Recording], Kt: float):
+def _motion(recordings: Sequence[Recording], Kt: float) -> tuple[float, float, float, float, float]:
     """Typical torque N m, speed rad/s and its change rad/s, shortest sample time and longest run in s."""
     torque, speed, change = [1e-9], [1e-9], [1e-9]
     for run in recordings:

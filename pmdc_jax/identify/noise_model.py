@@ -96,7 +96,9 @@ def _slow_power(white: Rows) -> float:
     return max(float(power.mean(0).max()) / by_chance, 1.0)
 
 
-def _scales(residuals: Sequence[Series], filters) -> list[Float[np.ndarray, "outputs outputs"]]:
+def _scales(
+    residuals: Sequence[Series], filters: Sequence[Float[np.ndarray, "_ _ _"]]
+) -> list[Float[np.ndarray, "outputs outputs"]]:
     scales = []
     for series, of_run in zip(residuals, filters, strict=True):
         rest = _filtered(series, of_run)

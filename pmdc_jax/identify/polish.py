@@ -319,7 +319,9 @@ def gauss_newton_step(matrix: np.ndarray, held: set[int], count: int) -> tuple[n
     return -(vectors @ shrunk) / lengths * moves, float(along @ shrunk)
 
 
-def _own_noise(problem: Problem, squares: np.ndarray):
+def _own_noise(
+    problem: Problem, squares: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Standard deviation of the residuals of each output, and the old scale over the new; white ones keep theirs.
 
     At least the share `FLOOR` of what is measured: where there is no noise, the likelihood is greatest if one output

@@ -137,7 +137,12 @@ def prepare(
     )
 
 
-def _refuse(recordings, holdout, tie, known) -> None:
+def _refuse(
+    recordings: Sequence[Recording],
+    holdout: Sequence[Recording],
+    tie: Sequence[tuple[str, str]],
+    known: Mapping[str, float] | None,
+) -> None:
     if not recordings:
         raise InputError("RUN", "there is no recording to fit", "Name at least one")
     for run in (*recordings, *holdout):

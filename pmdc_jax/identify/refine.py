@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Container
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,15 +27,22 @@ class Optimum(NamedTuple):
     converged: bool  # by the gradient, not by the solver's word
 
 
+Columns = Float[Array, " columns"]
+# The problem, where its unknowns began, what they are measured in, and the sum of squares that the residuals are over
+Task = tuple[Problem, Columns, Columns, Float[Array, ""]]
+
+
 # Levenberg-Marquardt needs of the residuals r and their Jacobian J no more than J'J, J'r and r'r. So it is given
 # the smallest residual vector with the same ones, as long as there are unknowns instead of samples.
 @eqx.filter_custom_jvp
-def compressed(flat: Float[Array, " columns"], args) -> Float[Array, " columns+1"]:
+def compressed(flat: Columns, args: Task) -> Float[Array, " columns+1"]:
     return _factor(flat, args)[:, -1]
 
 
 @compressed.def_jvp
-def _compressed_jvp(primals, tangents):
+def _compressed_jvp(
+    primals: tuple[Columns, Task], tangents: tuple[Columns | None, Any]
+) -> tuple[Float[Array, " columns+1"], Float[Array, " columns+1"]]:
     flat, args = primals
     factor = _factor(flat, args)
     direction = tangents[0]
@@ -42,7 +50,7 @@ def _compressed_jvp(primals, tangents):
     return factor[:, -1], change
 
 
-def _factor(flat: Float[Array, " columns"], args) -> Float[Array, "columns+1 columns+1"]:
+def _factor(flat: Columns, args: Task) -> Float[Array, "columns+1 columns+1"]:
     problem, begun, scale, size = args
     # optimistix promotes strictly; with the usual promotion what was traced before is found again
     with jax.numpy_dtype_promotion("standard"):
@@ -57,17 +65,23 @@ def _factor(flat: Float[Array, " columns"], args) -> Float[Array, "columns+1 col
     return jnp.sqrt(jnp.maximum(values, 0.0))[:, None] * vectors.T
 
 
-def _unscaled(problem: Problem, flat, begun, scale) -> Unknowns:
+def _unscaled(problem: Problem, flat: Columns, begun: Columns, scale: Columns) -> Unknowns:
     """Unknowns of which those without a scale stay where they began: rounding errors would carry them away."""
     return unflatten(problem, jnp.where(scale > 0, flat * scale, begun))
 
 
 @quickly_compiled
-def _levenberg_marquardt(problem: Problem, start: Unknowns, scale, size, tolerance):
+def _levenberg_marquardt(
+    problem: Problem,
+    start: Unknowns,
+    scale: Columns,
+    size: Float[Array, ""],
+    tolerance: Float[Array, ""],
+) -> tuple[Unknowns, Float[Array, ""]]:
     begun = flatten(start)
     solution = optx.least_squares(
         compressed,
-        optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),
+        optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),  # pyright: ignore[reportArgumentType]
         jnp.where(scale > 0, begun / jnp.where(scale > 0, scale, 1.0), 0.0),
         args=(problem, begun, scale, size),
         max_steps=STEPS,
@@ -107,5 +121,5 @@ def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-3) -> Optimu
     return Optimum(unknowns, float(squares) / problem.most_samples, tuple(sorted(held)), False)
 
 
-def _without(free, held) -> Bool[Array, " parameters"]:
+def _without(free: Bool[Array, " parameters"], held: Container[int]) -> Bool[Array, " parameters"]:
     return jnp.asarray([bool(f) and k not in held for k, f in enumerate(np.asarray(free))])

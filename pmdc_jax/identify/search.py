@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ..compiled import quickly_compiled
 from ..errors import InputError
 from ..progress import ReportProgress
 from ..simulate import Tape, squared_errors
 from .parameters import Parameters
+
+if TYPE_CHECKING:
+    from evosax.algorithms.base import EvolutionaryAlgorithm, Params, State
 
 
 class Method(NamedTuple):
@@ -139,16 +142,21 @@ class Kind(NamedTuple):
 # Two programs, for step by step evosax compiles dozens. They hand on the state of evosax's algorithm as a tuple: where
 # the programs were kept, evosax need not even be imported.
 
+Leaves = tuple[Array, ...]  # of evosax's state
+Asked = tuple[Float[Array, "population dimensions"], Leaves]
+
 
 @quickly_compiled
-def _begin(kind: Kind, seed: Value, *start: Value):
+def _begin(kind: Kind, seed: Value, *start: Value) -> Asked:
     """The first points of the unit cube to try, (population, dimensions), and the state to go on from."""
     algorithm, settings = _algorithm(kind)
     return _asked(kind, seed, 1, algorithm.init(jax.random.key(seed), *start, settings))
 
 
 @quickly_compiled
-def _go_on(kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Value, state):
+def _go_on(
+    kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Value, state: Leaves
+) -> Asked:
     """The next points to try after those of the `cube` turned out so fit, and the state to go on from."""
     algorithm, settings = _algorithm(kind)
     start = (cube[0],) if METHODS[kind.method].distribution else (cube, fitness)
@@ -158,18 +166,18 @@ def _go_on(kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Val
     return _asked(kind, seed, generation + 1, whole)
 
 
-def _asked(kind: Kind, seed, generation, state):
+def _asked(kind: Kind, seed: Value, generation: Value | int, state: State) -> Asked:
     algorithm, settings = _algorithm(kind)
     asked, state = algorithm.ask(_keys(seed, generation)[0], state, settings)
     return jnp.clip(asked, 0.0, 1.0), tuple(map(_strongly_typed, jax.tree.leaves(state)))
 
 
-def _keys(seed, generation) -> Array:
+def _keys(seed: Value, generation: Value | int) -> Array:
     return jax.random.split(jax.random.fold_in(jax.random.key(seed), generation))
 
 
 @cache
-def _algorithm(kind: Kind):
+def _algorithm(kind: Kind) -> tuple[EvolutionaryAlgorithm, Params]:
     """evosax's algorithm and its settings."""
     method = METHODS[kind.method]
     with jax.ensure_compile_time_eval():  # it is kept, and asked for while a program is traced
@@ -186,7 +194,7 @@ def _strongly_typed(leaf: Array) -> Array:
 class _Fitness:
     """Fitness of a population: coordinates (population, parameters) to (population,)."""
 
-    def __init__(self, parameters: Parameters, tape: Tape, noise: np.ndarray):
+    def __init__(self, parameters: Parameters, tape: Tape, noise: np.ndarray) -> None:
         self.parameters, self.noise = parameters, noise
         # on the device once, not at every generation
         self.tape: Tape = jax.tree.map(jnp.asarray, tape)

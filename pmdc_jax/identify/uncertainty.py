@@ -7,7 +7,7 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float, Int
 from scipy.special import chdtri, stdtrit
 
 from ..simulate import LOCAL
@@ -64,7 +64,13 @@ def information_of(problem: Problem, polished: Fit) -> Information:
     return information(found.residuals, found.jacobian, problem.tape.run, free, runs)
 
 
-def information(residuals, jacobian, run, free: np.ndarray, runs: int) -> Information:
+def information(
+    residuals: Float[Array | np.ndarray, "blocks 2 samples"],
+    jacobian: Float[Array | np.ndarray, "blocks 2 samples columns"],
+    run: Int[Array | np.ndarray, " blocks"],
+    free: Bool[np.ndarray, " parameters"],
+    runs: int,
+) -> Information:
     """Covariance of the estimated coordinates that stays right when residuals are correlated.
 
     With H = sum J'J, the estimate's error is H^-1 sum_k J_k' r_k. Each run's own unknowns are projected out; then
@@ -135,7 +141,13 @@ def _by_parts(
     return np.where(clear, variance, 0.0), np.where(clear, stdtrit(freedom, 0.975), REACH)
 
 
-def _split(hessian: np.ndarray, free: np.ndarray):
+def _split(
+    hessian: Float[np.ndarray, "parameters parameters"], free: Bool[np.ndarray, " parameters"]
+) -> tuple[
+    tuple[Float[np.ndarray, " parameters"], ...],
+    Float[np.ndarray, "parameters seen"],
+    Float[np.ndarray, "parameters parameters"],
+]:
     """Unseen directions, a root of the inverse on the others, and the variance that the unseen ones leave in all."""
     index = np.flatnonzero(free)
     values, vectors = np.linalg.eigh(hessian[np.ix_(index, index)])

@@ -54,7 +54,9 @@ class Whitening(eqx.Module):
         return cls(jnp.asarray(bands), jnp.asarray(np.moveaxis(usable, 2, 1)))
 
     def __call__(
-        self, signal: Float[Array, "blocks 2 samples columns"], run
+        self,
+        signal: Float[Array, "blocks 2 samples columns"],
+        run: Int[Array | np.ndarray, " blocks"],
     ) -> Float[Array, "blocks 2 samples columns"]:
         """Columns such as residuals, A and rad/s, made white."""
         blocks, outputs, samples, columns = signal.shape
@@ -81,7 +83,7 @@ def band(
     return matrix.reshape(CHUNK * outputs, -1)
 
 
-def remembered(known, order: int) -> Bool[np.ndarray, " samples"]:
+def remembered(known: Bool[np.ndarray, " samples"], order: int) -> Bool[np.ndarray, " samples"]:
     """Samples that were measured, as were the `order` before them."""
     lost = np.cumsum(np.append(0, ~known))
     return np.append(np.zeros(order, bool), lost[order + 1 :] == lost[: len(known) - order])
