@@ -6,7 +6,7 @@ grid that the recordings set. Effects that are no small change (a lag, a shaft) 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -72,6 +72,9 @@ class Candidate(NamedTuple):
         return np.inf if self.units[-1] == 1.0 else self.units[-1] / SMALL
 
 
+# The shapes of an effect, by its name and the scales of the recordings
+Rows = Callable[[str, Scales], list[Candidate]]
+
 # An amplitude that is small, as a share of the scale: the response to it is as good as a derivative.
 SMALL = 1e-4
 # ... and one that is nothing at all, where an amplitude must be positive.
@@ -83,7 +86,12 @@ def candidates(scales: Scales) -> list[Candidate]:
     return [c for name in EFFECTS for c in TRIALS[name].columns(name, scales)]
 
 
-def _amplitude(field: str, size: Callable[[Scales], float], signed: bool = False, **shapes):
+def _amplitude(
+    field: str,
+    size: Callable[[Scales], float],
+    signed: bool = False,
+    **shapes: Callable[[Scales], Iterable[float]],
+) -> Rows:
     """An effect of one amplitude; `shapes` are functions of the scales that give the grid of another field."""
 
     def rows(name: str, scales: Scales) -> list[Candidate]:
@@ -103,7 +111,7 @@ def _amplitude(field: str, size: Callable[[Scales], float], signed: bool = False
     return rows
 
 
-def _finite(field: str, grid: Callable[[Scales], Sequence[float]]):
+def _finite(field: str, grid: Callable[[Scales], Sequence[float]]) -> Rows:
     """An effect tried at finite sizes, scaled up or down by the coefficient."""
 
     def rows(name: str, scales: Scales) -> list[Candidate]:
@@ -118,7 +126,7 @@ def _finite(field: str, grid: Callable[[Scales], Sequence[float]]):
     return rows
 
 
-def _either(*rows: Callable[[str, Scales], list[Candidate]]):
+def _either(*rows: Rows) -> Rows:
     """An effect tried in several ways."""
     return lambda name, scales: [c for of_one in rows for c in of_one(name, scales)]
 
@@ -160,7 +168,7 @@ def _asymmetric(name: str, scales: Scales) -> list[Candidate]:
     return [Candidate(name, columns, (small, small), build, "backward_Nm")]
 
 
-def _periodic(field: str, size: Callable[[Scales], float], *others: Values):
+def _periodic(field: str, size: Callable[[Scales], float], *others: Values) -> Rows:
     """Sine and cosine of the angle, in every run of its own phase; `others` are settings of the other fields."""
 
     def rows(name: str, scales: Scales) -> list[Candidate]:
@@ -289,7 +297,7 @@ class Trial(NamedTuple):
     """How an effect is tried."""
 
     # its shapes, each a regression on columns, by its name and the scales of the recordings
-    columns: Callable[[str, Scales], list[Candidate]]
+    columns: Rows
     # where else to begin refitting it, one start after another, if it is easily fitted wrongly
     starts: Callable[[Scales], list[Values]] | None = None
     # what else to try from where its refit ended, if it has many optima

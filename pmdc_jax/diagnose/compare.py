@@ -31,7 +31,7 @@ class Fitted(NamedTuple):
 class Comparison:
     """Models and filters so far; each model is fitted once by each filter."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._filters: dict[Model, Whitener] = {}
         self._fitted: dict[tuple[Model, Whitener], Fitted] = {}
 

@@ -71,7 +71,13 @@ class Evidence(NamedTuple):
         moved = shared[0][: self.parameters, 0]
         return Regression(float(squares[0]), moved, found, spread)
 
-    def _regressed(self, blocks: Sequence[Block], targets: Sequence[int], visible: float):
+    def _regressed(
+        self, blocks: Sequence[Block], targets: Sequence[int], visible: float
+    ) -> tuple[
+        Float[np.ndarray, " targets"],
+        tuple[Float[np.ndarray, "shared targets"], Float[np.ndarray, " shared"]],
+        tuple[Float[np.ndarray, "runs own targets"], Float[np.ndarray, "runs own"]],
+    ]:
         """Least squares of some columns at once: the squares left of each, and the coefficients with their standard
         errors, those that all runs have in common and those of each run."""
         own = np.array([c for b in blocks if b.own for c in b.columns], int)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
+from jaxtyping import Float
 from scipy import stats
 
 from ..errors import InputError
@@ -84,7 +85,12 @@ def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExpe
     )
 
 
-def difference_between(motors: list[Motor], time, voltage, noise) -> float:
+def difference_between(
+    motors: list[Motor],
+    time: Float[np.ndarray, " samples"],
+    voltage: Float[np.ndarray, " samples"],
+    noise: Float[np.ndarray, "2"],
+) -> float:
     """Root of the summed squares of what two motors answer differently, over the noise; 0 where one cannot be
     simulated, as fitted to other runs it may be unstable in this one."""
     start = np.zeros_like(time)

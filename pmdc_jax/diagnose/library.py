@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ..compiled import quickly_compiled
 from ..effects import EFFECTS, AbstractEffect
@@ -20,7 +20,7 @@ from ..simulate import Tape, free_run
 from ..threads import one_ahead
 from .candidates import Candidate, Scales, candidates
 from .model import Model
-from .response import Path, kicks, pushes, sensed
+from .response import Outputs, Path, kicks, pushes, sensed
 
 OVER = {
     "mechanical": ("speed", "current", "time"),
@@ -82,7 +82,7 @@ class Curve(NamedTuple):
 class Library:
     """Everything that may be missing from a motor without effects, and what it would change."""
 
-    def __init__(self, base: Model):
+    def __init__(self, base: Model) -> None:
         """`base` is the motor without effects, as fitted."""
         self.bare = jax.tree.map(jnp.asarray, base.motor)
         self.scales = _scales(base)
@@ -174,7 +174,7 @@ def _small(
 ) -> tuple[Array, Array]:
     """Kicks, and what is seen on top of them, by small settings of one effect; settings last."""
 
-    def change(values):
+    def change(values: Mapping[str, Float[Array | np.ndarray, ""]]) -> tuple[Outputs, Outputs]:
         motor = bare.with_effects([effect(**values)])
         if effect.equation == "sensor":
             seen = sensed(motor, tape, path)

@@ -12,6 +12,7 @@ from ..identify.noise_model import Whitener
 from ..identify.polish import Fit
 from ..identify.prepare import Prepared
 from ..identify.solve import Solved
+from ..progress import ReportProgress
 from .assessment import ALARM, HARDER, MUCH_OF_IT, Assessment, chance_of_nothing
 from .candidates import TRIALS
 from .compare import FAR, MARGIN, Comparison, Fitted, plainest
@@ -65,7 +66,7 @@ class Naming(NamedTuple):
 class StepwiseSelection:
     """Gathers evidence, has sets of effects refitted, and compares them."""
 
-    def __init__(self, base: Model, solved: Solved, report):
+    def __init__(self, base: Model, solved: Solved, report: ReportProgress) -> None:
         """`base` is the motor without effects, and `solved` how it was found."""
         self.base, self.library = base, Library(base)
         self.comparison = Comparison()

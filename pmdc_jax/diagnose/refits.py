@@ -19,6 +19,7 @@ from ..identify.problem import Unknowns
 from ..identify.refine import Optimum
 from ..identify.solve import POOR, Solved, searched
 from ..identify.uncertainty import FLAT, information_of
+from ..progress import ReportProgress
 from ..threads import side_by_side, side_by_side_until
 from .candidates import TRIALS, Values
 from .compare import Comparison
@@ -46,8 +47,13 @@ class Refits:
     """The models that were fitted so far; `solved` is how the motor without effects was found."""
 
     def __init__(
-        self, base: Model, solved: Solved, library: Library, comparison: Comparison, report
-    ):
+        self,
+        base: Model,
+        solved: Solved,
+        library: Library,
+        comparison: Comparison,
+        report: ReportProgress,
+    ) -> None:
         self.library, self.solved, self.report = library, solved, report
         self.comparison = comparison
         self.models: dict[frozenset[str], Model] = {frozenset(): base}

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..compiled import compiled
 from ..effects import State
+from ..effects.base import Scalars
 from ..motor import Motor
 from ..simulate import Tape
 from ..simulate.shooting import outputs, reported
@@ -23,6 +24,8 @@ from ..simulate.solver import Input, Propagator, along_grids, held_step, pick_gr
 
 Signal = Float[Array, "samples blocks"]
 Outputs = Float[Array, "samples 2 blocks"]
+Columns = Float[Array, "2 blocks columns"]  # at one sample
+Extra = dict[str, Scalars]  # states that effects add, by name
 
 
 class Path(NamedTuple):
@@ -98,7 +101,10 @@ def respond(
     along, _ = _of_blocks(motor, tape)
     whole = along.whole[:, :, 0]
 
-    def step(x, sample):
+    def step(
+        x: Columns,
+        sample: tuple[Float[Array | np.ndarray, "2 blocks columns"], Float[Array, " blocks"]],
+    ) -> tuple[Columns, Columns]:
         kick, held = sample
         after = jnp.einsum("ijb,jbc->ibc", whole, x) + kick
         # a rotor that sticks forgets
@@ -110,7 +116,10 @@ def respond(
     basis = jnp.broadcast_to(jnp.eye(2)[:, None, :], (2, kicks.shape[2], 2))
     through, free = jax.lax.scan(step, basis, (jnp.zeros((*kicks.shape[:3], 2)), stuck))
 
-    def follow(start, block):
+    def follow(
+        start: Float[Array, "2 columns"],
+        block: tuple[Bool[Array, ""], Float[Array, "2 2"], Float[Array, "2 columns"]],
+    ) -> tuple[Float[Array, "2 columns"], Float[Array, "2 columns"]]:
         begins, passed, own = block
         start = jnp.where(begins, 0.0, start)
         return passed @ start + own, start
@@ -125,7 +134,7 @@ def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Input]:
     along, drive = pick_grid(along_grids(motor, tape), tape, tape.grid)
     samples = tape.value.shape[1]
 
-    def spread(leaf):
+    def spread(leaf: Float[Array, "blocks ..."]) -> Float[Array, "... samples blocks"]:
         blocks_last = jnp.moveaxis(leaf, 0, -1)[..., None, :]
         return jnp.broadcast_to(
             blocks_last, (*blocks_last.shape[:-2], samples, blocks_last.shape[-1])
@@ -142,6 +151,10 @@ def _one_sample(motor: Motor, tape: Tape, path: Path) -> State:
     return held_step(motor, along, acting, _states(motor, tape, path), steps_in_sample(motor, tape))
 
 
+# Whether a run begins, how the effects' states then begin, current, speed, value, load, and the block
+OfSample = tuple[Bool[Array, ""], Extra, Scalars, Scalars, Scalars, Scalars, Int[Array, ""]]
+
+
 def _states(motor: Motor, tape: Tape, path: Path) -> State:
     """The motor's states on the path; those that its effects add follow from current and speed there."""
     load = jnp.asarray(tape.load).T
@@ -151,7 +164,7 @@ def _states(motor: Motor, tape: Tape, path: Path) -> State:
     (along, acting), steps = _of_blocks(motor, tape), steps_in_sample(motor, tape)
     begins = jnp.zeros(load.shape, bool).at[0].set(tape.begins)
 
-    def advance(extra, sample):
+    def advance(extra: Extra, sample: OfSample) -> tuple[Extra, Extra]:
         begins, rest, current, speed, value, load, block = sample
         extra = jax.tree.map(lambda new, old: jnp.where(begins, new, old), rest, extra)
         here = jax.tree.map(lambda leaf: leaf[..., 0, block], along)
