@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 
@@ -25,6 +26,7 @@ from .files import replacing
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Leaf = jax.Array | np.ndarray
 
 # Without its newer emitter of kernels XLA compiles in two thirds of the time. What it makes is as fast but for dry
 # friction and teeth, which take a quarter longer.
@@ -94,7 +96,7 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
         except (pickle.PicklingError, AttributeError, TypeError):
             return alone(*args, **kwargs)
 
-        def of_arrays(*leaves):
+        def of_arrays(*leaves: Leaf) -> T:
             args, kwargs = eqx.combine(structure.unflatten(leaves), static)
             # not the function itself: traces within other compiled code are found again
             return cast(Callable, within)(*args, **kwargs)
@@ -128,7 +130,13 @@ def make_room() -> None:
         jax.clear_caches()
 
 
-def _key(function: Callable, options, leaves: Sequence, structure, static) -> str:
+def _key(
+    function: Callable,
+    options: dict[str, Any] | None,
+    leaves: Sequence[Leaf],
+    structure: Any,  # of the tree of arrays
+    static: Any,  # what there is besides
+) -> str:
     """The name of a program: of all that decides what it is."""
     kinds = [(x.shape, str(x.dtype), getattr(x, "weak_type", False)) for x in leaves]
     double = jax.config.read("jax_enable_x64")
@@ -166,11 +174,13 @@ def _find_lapack() -> None:
     jax.block_until_ready(jnp.linalg.cholesky(jnp.eye(1)))
 
 
-def _made(key: str, function: Callable, leaves: Sequence, options) -> Program:
+def _made(
+    key: str, function: Callable, leaves: Sequence[Leaf], options: dict[str, Any] | None
+) -> Program:
     """A program compiled now, and kept where it can be."""
     returned: list[Any] = []
 
-    def flat(*leaves):
+    def flat(*leaves: Leaf) -> list[Leaf]:
         arrays, others = eqx.partition(function(*leaves), eqx.is_array)
         out, structure = jax.tree.flatten(arrays)
         returned[:] = structure, others
@@ -202,7 +212,7 @@ def _found_by_jax() -> int:
 def _hits() -> Counter[int]:
     hits: Counter[int] = Counter()
 
-    def count(event: str, **_) -> None:
+    def count(event: str, **_: str | int) -> None:
         hits[get_ident()] += event == "/jax/compilation_cache/cache_hits"
 
     jax.monitoring.register_event_listener(count)

@@ -9,6 +9,6 @@ class InputError(ValueError):
     `ValueError`.
     """
 
-    def __init__(self, where: str, what: str, mend: str):
+    def __init__(self, where: str, what: str, mend: str) -> None:
         self.where, self.what, self.mend = where, what, mend
         super().__init__(f"{where}: {what}. {mend}")

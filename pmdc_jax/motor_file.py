@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -134,7 +134,9 @@ def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:
     return tuple(effects.values())
 
 
-def _numbers(where: str, given: object, wanted, of: str) -> dict[str, np.ndarray]:
+def _numbers(
+    where: str, given: object, wanted: Mapping[str, Any], of: str
+) -> dict[str, np.ndarray]:
     if not isinstance(given, dict):
         raise InputError(where, f"{of}: parameters are {given!r}", "Give an object of numbers")
     numbers = {}

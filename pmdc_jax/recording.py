@@ -77,7 +77,7 @@ class Recording:
     notes: tuple[Finding, ...] = field(default=(), kw_only=True)
     uneven: Recording | None = field(default=None, kw_only=True)
 
-    def __attrs_post_init__(self):
+    def __attrs_post_init__(self) -> None:
         # what was laid on an even clock was a sound record before
         for fault in faults(self.columns()) if self.uneven is None else ():
             sample = "" if fault.row is None else f"sample {fault.row + 1}"

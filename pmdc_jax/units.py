@@ -45,7 +45,7 @@ RPM = {"1/min", "min^-1", "min-1", "min⁻¹", "/min", "u/min", "upm", "r/min"}
 class UnitError(ValueError):
     """The unit of `quantity` is unknown or measures something else; the message says which."""
 
-    def __init__(self, quantity: str, why: str):
+    def __init__(self, quantity: str, why: str) -> None:
         self.quantity = quantity
         super().__init__(why)
 

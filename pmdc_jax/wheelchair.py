@@ -17,6 +17,7 @@ from .progress import ReportProgress, silent
 if TYPE_CHECKING:
     from .control.loop import Response
     from .control.tuning import Tuning
+    from .recording import Recording
 
 TABLE_1 = {"R": 0.157378, "L": 0.0003137, "Kb": 0.0492, "Kt": 0.0501, "J": 0.000466, "f": 0.0002546}
 PRINTED = Motor(**{name: np.asarray(TABLE_1[name]) for name in PARAMETERS}, effects=())
@@ -120,7 +121,7 @@ def reproduce(progress: ReportProgress | None = None) -> Paper:
     return Paper(recovered, reach(PRINTED, VOLTAGE), tunings, fastest, steps, as_printed)
 
 
-def load_test(seed: int = 0):
+def load_test(seed: int = 0) -> Recording:
     """The virtual load test: 24 V from rest, then the brake is tightened step by step; 1 ms, noisy sensors."""
     from .recording import Recording
     from .simulate import simulate

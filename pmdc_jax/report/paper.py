@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ def table_1(paper: Paper) -> tuple[list[str], list[list[str]]]:
     return headings, rows
 
 
-def _effort_row(name: str, paper: Paper, shown) -> list[str]:
+def _effort_row(name: str, paper: Paper, shown: Callable[[Recovered], str]) -> list[str]:
     row = [name, ""]
     for one in paper.recovered:
         row += [shown(one), ""]

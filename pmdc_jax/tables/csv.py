@@ -28,7 +28,7 @@ class CsvTable:
     read as seconds since the first of them.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path) -> None:
         self._path = path
         self._raw = _text(path)
         self._header = find_header(self._raw, path)

@@ -16,7 +16,7 @@ class MatTable:
     """Vectors of a MATLAB file, also those inside structures and matrices: a header is then the path to it, or the name
     that a signal of Simulink or ControlDesk has beside its numbers."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path) -> None:
         from scipy.io import loadmat
 
         self._path = path

@@ -14,7 +14,7 @@ from .cells import NUMBERS_ONLY, seconds_since_first
 class ParquetTable:
     """Columns of a Parquet file."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path) -> None:
         import polars as pl
 
         self._path = path
