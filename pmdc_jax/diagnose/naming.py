@@ -42,6 +42,8 @@ NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
 SWALLOWED = 1e-2
 # What is to take away most of a misfit foretells this share of it, at least
 FORETOLD = 0.05
+# So many noise variances left are no small misfit beside which a refit to first order finds its way
+LOST = 10.0
 # The simplest effect by which a rotor sticks
 DRY = "coulomb_friction"
 
@@ -237,8 +239,8 @@ class StepwiseSelection:
             if any(model and model.effects_at_bound for model in tried):
                 # no fuller form: a load larger than friction is no asymmetric friction
                 tried += self._with(current, found, shortlist(current, found, fuller=False))
-        if found.left < ALARM and not here and not tried:
-            tried += self._searched_with_friction(current, found)
+        if found.left < ALARM and not here:
+            tried += self._searched_with_friction(current, found, tried)
         return tried + harder
 
     def _is_enough(self, model: Model | None) -> bool:
@@ -249,14 +251,23 @@ class StepwiseSelection:
         found = self.assess(model)
         return found.left >= ALARM or found.is_trace(model)
 
-    def _searched_with_friction(self, current: Model, found: Assessment) -> list[Model | None]:
+    def _searched_with_friction(
+        self, current: Model, found: Assessment, tried: Sequence[Model | None]
+    ) -> list[Model | None]:
         """The motor with dry friction, searched for anew, if that may explain a misfit of which no first-order response
-        is clear, and leaves far less: a motor whose rotor sticks for long is far from one that is thought to creep."""
-        far = current.fit.fitness / FAR
-        by_gain = sorted(found.of_candidates, key=lambda s: -s.gain)
-        best = list(dict.fromkeys(effect_of(s) for s in by_gain))[:SHORTLIST]
+        is clear, or was the best that was `tried` and left it far from the noise, and now leaves far less: a motor
+        whose rotor sticks for long is far from one that is thought to creep."""
+        possible = [model for model in tried if model is not None and model.is_possible]
+        if possible:
+            nearest = min(possible, key=lambda m: m.fit.fitness)
+            best, noise = list(nearest.effects), LOST * current.given.problem.outputs
+        else:
+            by_gain = sorted(found.of_candidates, key=lambda s: -s.gain)
+            best = list(dict.fromkeys(effect_of(s) for s in by_gain))[:SHORTLIST]
+            nearest, noise = current, current.given.problem.outputs
         sticks = any(EFFECTS[effect].holds == "speed" for effect in best)
-        if not sticks or far < current.given.problem.outputs:  # not even a perfect fit would
+        far = nearest.fit.fitness / FAR
+        if not sticks or far < noise:  # not even a perfect fit would
             return []
         model = self.refits.sought(current, DRY)
         return [model] if model.fit.fitness < far else []

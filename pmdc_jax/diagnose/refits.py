@@ -118,7 +118,8 @@ class Refits:
         return {new: begins(next(e for e in current.motor.effects if e.name == old))}
 
     def sought(self, current: Model, effect: str) -> Model:
-        """The current model with one more effect, searched for without regard to how it was fitted."""
+        """The current model with one more effect, searched for without regard to how it was fitted; or as it was fitted
+        before, if that is better."""
         effects = (*current.effects, effect)
 
         def search() -> Model:
@@ -127,6 +128,8 @@ class Refits:
             given, found = searched(given, method, seed, searches=1)
             return model_of(effects, given, found.fit)
 
+        if (key := frozenset(effects)) in self.models:
+            return self._better_from(key, current, search)
         model = self._once(effects, current, search)
         assert model is not None
         return model

@@ -16,6 +16,10 @@ from ..simulate import LOCAL, RunUnknowns, Tape, sensitivities
 from .parameters import Parameters
 from .whitening import Whitening
 
+# A simulation of which a parameter moves any sample by so many times its noise, a change by rounding would move by
+# its noise: it has derivatives on paper alone, and counts as failed
+WILD = 1e12
+
 
 class Unknowns(NamedTuple):
     """What a refinement moves: search coordinates, and what each run does not tell."""
@@ -127,7 +131,9 @@ def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
     seen, jacobian = sensitivities(problem.parameters, unknowns.coordinates, tape, unknowns.runs)
     scale = tape.weight / problem.noise[:, None]
     jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]
-    return Evaluation(seen, (seen - tape.measured) * scale, jacobian)
+    residuals = (seen - tape.measured) * scale
+    wild = ~jnp.all(jnp.abs(jacobian) < WILD, (1, 2, 3)) & problem.fitted_runs[tape.run]
+    return Evaluation(seen, jnp.where(wild[:, None, None], jnp.inf, residuals), jacobian)
 
 
 # what is compiled quickly runs as fast where there are no effects, and up to a third longer where there are
