@@ -22,6 +22,7 @@ from benchmarks.naming.plant import Plant, simulate
 from pmdc_jax import InputError, identify
 from pmdc_jax.control.spread import drawn_motors
 from pmdc_jax.effects import EFFECTS
+from pmdc_jax.identify import problem as problems
 from pmdc_jax.identify.binary_ga import BinaryGA
 from pmdc_jax.identify.bounds import effect_bounds
 from pmdc_jax.identify.generalised_least_squares import last_fit, residuals_of
@@ -31,7 +32,7 @@ from pmdc_jax.identify.noise_model import whitener
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.polish import fit_run_unknowns, polish
 from pmdc_jax.identify.prepare import prepare
-from pmdc_jax.identify.problem import Problem, Unknowns, evaluate
+from pmdc_jax.identify.problem import Problem, Unknowns, _evaluated, evaluate
 from pmdc_jax.identify.refine import Optimum, refine
 from pmdc_jax.identify.results import results_of
 from pmdc_jax.identify.rotor_angle import with_rotor_angle
@@ -42,7 +43,7 @@ from pmdc_jax.identify.whitening import Whitening
 from pmdc_jax.motor import PARAMETERS
 from pmdc_jax.motor_file import Uncertainty
 from pmdc_jax.recording import Recording
-from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape
+from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape, sensitivities
 
 PAPER = vb.paper_motor()
 NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
@@ -650,6 +651,22 @@ def test_a_failed_simulation_is_no_optimum(x64, runs):
     end = refine(problem, wild)
     polished = polish(problem, end).optimum
     assert not polished.converged or polished.fitness < 3
+
+
+def test_a_simulation_that_rounding_would_move_has_failed(x64, runs, monkeypatch):
+    """Where a rotor chatters derivatives may reach 1e95: standard errors of nothing, were they believed."""
+    problem = problem_of(runs)
+    start = start_at(problem)
+
+    def chattering(*args):
+        seen, jacobian = sensitivities(*args)
+        return seen, jacobian.at[0].multiply(1e40)
+
+    assert np.isfinite(_evaluated(problem, start).residuals).all()
+    monkeypatch.setattr(problems, "sensitivities", chattering)
+    residuals = np.asarray(_evaluated(problem, start).residuals)
+    assert np.isinf(residuals[0]).all()
+    assert np.isfinite(residuals[1:]).all()
 
 
 COVERAGE = {

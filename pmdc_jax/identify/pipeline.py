@@ -17,7 +17,7 @@ from .identification import Identification
 from .noise_model import whitener
 from .parameters import effects_named
 from .prepare import prepare
-from .results import missed, results_of
+from .results import results_of
 from .solve import solve
 
 
@@ -61,6 +61,11 @@ def identify(
     given, polished = last_fit(given, plainly, plainly, white)
     found = results_of(given, solved._replace(fit=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
-    doubts = (*of_friction(friction, found), *missed(found.fit))
+    left = (
+        f"what the fit leaves of the {name} is {times:.2g} times its white noise: `pmdc diagnose` tells whether the "
+        "model lacks something, or the motor or a sensor was disturbed"
+        for name, times in found.missed.items()
+    )
+    doubts = (*of_friction(friction, found), *left)
     messages = (*found.messages, *doubts)
     return attrs.evolve(found, seconds=seconds, messages=messages, doubts=doubts)

@@ -158,13 +158,13 @@ def _weighed(problem: Problem, unknowns: Unknowns, known: Evaluation | None = No
     with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
         squares = np.square(np.asarray(evaluation.residuals)[problem.fitted_blocks]).sum((0, 2))
         noise, stretch = _own_noise(problem, squares)
-    scaled = _scaled(evaluation, stretch)
-    matrix = np.array(normal_matrix(scaled, problem.tape, problem.fitted_runs))
-    if problem.whitening is not None:
-        cost = float(np.log(np.maximum(squares.sum(), 1e-300)))
-    else:
-        over = squares * stretch**2 / np.maximum(problem.samples, 1.0)
-        cost = float(np.log(np.maximum(noise, 1e-300)).sum() + over.sum() / 2)
+        scaled = _scaled(evaluation, stretch)
+        matrix = np.array(normal_matrix(scaled, problem.tape, problem.fitted_runs))
+        if problem.whitening is not None:
+            cost = float(np.log(np.maximum(squares.sum(), 1e-300)))
+        else:
+            over = squares * stretch**2 / np.maximum(problem.samples, 1.0)
+            cost = float(np.log(np.maximum(noise, 1e-300)).sum() + over.sum() / 2)
     cost = cost if np.isfinite(cost) else np.inf
     return _Weighed(
         unknowns, scaled, noise, matrix, cost, float(squares.sum()) / problem.most_samples

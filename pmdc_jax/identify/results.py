@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -66,6 +66,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
         covariance=covariance,
         covariance_names=names,
         messages=_messages(given, solved, chosen is not polished),
+        missed=_missed(fit),
     )
 
 
@@ -238,7 +239,11 @@ def _fits(
 
 
 def _rmse(measured: np.ndarray | None, simulated: np.ndarray) -> float | None:
-    return None if measured is None else float(np.sqrt(np.nanmean(np.square(measured - simulated))))
+    return None if measured is None else _rms(measured - simulated)
+
+
+def _rms(signal: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(np.square(signal))))
 
 
 def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | None:
@@ -256,16 +261,13 @@ def _residuals(fit: Mapping[str, RunFit], name: str) -> list[np.ndarray]:
     return [m - s for m, s in pairs if m is not None and s is not None]
 
 
-def missed(fit: Mapping[str, RunFit]) -> Iterator[str]:
-    """What to say of outputs of which far more is left than the noise of their runs."""
+def _missed(fit: Mapping[str, RunFit]) -> dict[str, float]:
+    """The outputs of which far more is left than the noise of their runs: how many times as much."""
+    times = {}
     for name in ("current", "speed"):
         scaled = [e / white for e in _residuals(fit, name) if (white := white_noise([e]))]
-        times = np.sqrt(np.nanmean(np.square(np.concatenate(scaled)))) if scaled else 0.0
-        if times > MISSED:
-            yield (
-                f"what the fit leaves of the {name} is {times:.2g} times its white noise: `pmdc diagnose` tells "
-                "whether the model lacks something, or the motor or a sensor was disturbed"
-            )
+        times[name] = _rms(np.concatenate(scaled)) if scaled else 0.0
+    return {name: much for name, much in times.items() if much > MISSED}
 
 
 def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:

@@ -61,6 +61,8 @@ def verdict_sentences(diagnosis: Diagnosis) -> list[str]:
     sentences = tell[diagnosis.verdict](diagnosis)
     if diagnosis.effects:
         sentences += [_gap_sentence(diagnosis), _drift_sentence(diagnosis)]
+    if diagnosis.verdict != "not_in_library":
+        sentences.append(_slow_rest_sentence(diagnosis))
     return [sentence for sentence in sentences if sentence] + cautions(diagnosis.final)
 
 
@@ -287,9 +289,23 @@ def _gap_sentence(diagnosis: Diagnosis) -> str:
     gap = diagnosis.gap[role]
     what = role_word(role).capitalize()
     sentence = f"{what} error {significant(gap.before)} to {significant(gap.after)} times the noise"
-    if diagnosis.closed_fraction is None:
+    if diagnosis.closed_fraction is None or diagnosis.closed_fraction <= 0:
         return f"{sentence}."
     return f"{sentence}: {percent(100 * diagnosis.closed_fraction)} of the gap is closed."
+
+
+def _slow_rest_sentence(diagnosis: Diagnosis) -> str:
+    """That what counts as noise is not the sensors' alone, where it is not."""
+    rest = [
+        f"{significant(times)} times the white noise of the {name}"
+        for name, times in diagnosis.final.missed.items()
+    ]
+    if not rest:
+        return ""
+    return (
+        f"What is left counts as noise, but is {enumerate_words(rest)}: a torque that fluctuates by itself may do that,"
+        " and so may something else that is missing. Look at the residuals over time."
+    )
 
 
 class Drift(NamedTuple):
