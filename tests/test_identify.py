@@ -625,7 +625,7 @@ def test_the_rotor_turns_by_its_own_speed_and_not_by_that_of_a_slow_sensor(x64):
     logs = zip(parameters.names, parameters.logarithmic, strict=True)
     coordinates = [np.log(values[n]) if log else values[n] for n, log in logs]
     local = np.array([[truth["current_A"][0], speed[0], 0.0, 0.0, 0.0]])
-    unknowns = Unknowns(jnp.asarray(coordinates), jnp.asarray(local))
+    unknowns = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.asarray(local).T))
     fit = polish(given.problem, Optimum(unknowns, np.inf, (), False), steps=0)
     turn = np.asarray(with_rotor_angle(given.problem, fit).tape.turn).reshape(-1)
     angle = cumulative_simpson(speed, x=time, initial=0.0)

@@ -66,9 +66,25 @@ def test_a_mean_is_taken_for_what_it_is(kind):
     found = identify(recorded(kind), tie=[("Kt", "Kb")])
     means = [m for m in found.messages if "is a mean over" in m]
     assert [f"over {OVER[kind]}," in m for m in means] == [True] * (OVER[kind] is not None)
+    assert not [m for m in found.messages if "may be a mean" in m]
     for name in ("R", "L", "Kb", "J"):
         estimate = found.parameters[name]
         assert abs(estimate.value - QUICK[name]) < max(3.5 * estimate.stderr, 2e-3 * QUICK[name])
+
+
+def test_counts_of_a_motor_that_settles_within_a_sample_are_doubted():
+    """A toy motor behind an encoder of twelve lines, read every 20 ms."""
+    toy = Plant(R=1.2, L=3e-4, Kb=1.8e-3, Kt=1.8e-3, J=3e-8, f=2e-7)
+    rng, step, lines, runs = np.random.default_rng(9), 0.02, 12, []
+    for name, offset in (("about zero", 0.0), ("one way", 1.5)):
+        driven = prbs(rng, 10.0, step, amplitude=1.2, offset=offset, hold=0.2)
+        read = simulate(toy, *driven)
+        count = np.floor(read[:, 2] * lines / (2 * np.pi))
+        speed = np.diff(count, prepend=count[0]) * 2 * np.pi / lines / step
+        current = read[:, 0] + 0.02 * rng.standard_normal(len(speed))
+        runs.append(Recording(name, driven.time, driven.voltage, current, speed=speed))
+    found = identify(runs, unloaded=True, tie=[("Kt", "Kb")])
+    assert [m for m in found.messages if "may be a mean" in m]
 
 
 def late(runs: list[Recording], samples: int) -> list[Recording]:

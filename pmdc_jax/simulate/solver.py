@@ -98,9 +98,7 @@ class Propagator(NamedTuple):
 
 
 @eqx.filter_jit  # one trace serves all grids
-def propagator(
-    motor: Motor, step: Float[Array, ""], drive: Drive, straight: bool = False
-) -> Propagator:
+def propagator(motor: Motor, step: Held, drive: Drive, straight: bool = False) -> Propagator:
     """Exact step of the linear part over `step` seconds, and the weights for what the effects add; of teeth that touch,
     and beside it of such that do not. `straight` asks for what a drive needs that is not held."""
     A, B = _linear_part(motor, drive)
@@ -128,7 +126,7 @@ def _with_contact_response(
 
 def _by_linear_part(
     motor: Motor,
-    step: Float[Array, ""],
+    step: Held,
     A: Matrix,
     B: Float[Array, "n 2 *#batch"],
     straight: bool,

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_banded
 
+from ...motor import Motor
 from ...simulate import Tape
 from ..likelihood import LIKELIER, Samples, negative_log_likelihood
 from ..noise import quantum
@@ -31,6 +32,8 @@ COUNTED_IN_ALL = 1 / 7
 ENOUGH = 200
 # Shares of the highest frequency about half of it, near it, and next to it; and all that are high
 BANDS = ((0.4, 0.6), (0.9, 0.95), (0.98, 1.0), (0.4, 1.0))
+# A mean is undone where the mechanical time constant is so many samples long
+SMOOTH = 2.0
 # A mean over two samples has no more than this share of the power near the highest frequency next to it: in theory 1/40
 NONE = 1 / 8
 
@@ -89,6 +92,14 @@ def seems_averaged(given: Prepared) -> bool:
     """Whether the speeds are counts of an encoder whose noise is that of means."""
     counts = _in_counts(_speeds(given))
     return bool(counts) and counted_over(counts)[0] is not None
+
+
+def may_be_averaged(given: Prepared, motor: Motor) -> bool:
+    """Whether the noise is that of means, but the motor settles too fast for the fits to tell, or for the mean to be
+    undone: it is no smooth curve from sample to sample."""
+    settling = float(motor.R * motor.J / (motor.Kt * motor.Kb))
+    step = float(np.max(np.asarray(given.problem.tape.sample_time)))
+    return given.averaging is None and settling < SMOOTH * step and seems_averaged(given)
 
 
 def without_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
