@@ -618,7 +618,9 @@ def test_the_search_sees_what_the_free_run_sees(x64, name):
 STIFF = "R or L several times that of the linear part, on a stiff motor: diverges"
 CHAOS = "1 kN m at 200 periods a turn: what a start does to the end of a block is beyond any double"
 STIFF_TEETH = "teeth that ring hundreds of times in the shortest of steps: diverges"
-STIFF_DRAG = "a ship's drag on a small motor stops it within a millionth of the shortest step: diverges"
+STIFF_DRAG = (
+    "a ship's drag on a small motor stops it within a millionth of the shortest step: diverges"
+)
 STIFF_DAMPING = "a ship's damping without a spring, on a small motor: its exponential overflows"
 NOT_FINITE = {
     "quadratic_drag": STIFF_DRAG,
