@@ -20,6 +20,7 @@ from pmdc_jax.diagnose.diagnosis import (
     LearnedCurve,
     NextExperiment,
     Region,
+    breaks_electrical_equation,
 )
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate
@@ -68,6 +69,7 @@ def named(**changes) -> Diagnosis:
         "final": evolve(base, parameters=parameters),
         "p_nothing": 1e-30,
         "electrical_misfit": 1.02,
+        "breaks_electrical_equation": False,
         "seconds": {"total": 12.0},
     }
     return Diagnosis(**(fields | changes))
@@ -139,10 +141,32 @@ def test_nothing_found_says_what_would_have_been_seen():
 
 def test_what_no_torque_can_leave_in_words():
     left = "41.0 times what the noise of the sensors explains, and no torque can be why"
-    assert left in words(evolve(not_in_library(), electrical_misfit=41.0))
+    broken = evolve(not_in_library(), electrical_misfit=41.0, breaks_electrical_equation=True)
+    assert left in words(broken)
     assert "times what the noise" not in words(not_in_library())
     assert "no interval covers that" in words(not_in_library())
     assert "no interval covers that" not in words(named())
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "breaks"),
+    [
+        (1.0, 1.0, False),
+        (1.4, 1.4, False),  # a trace
+        (12.0, 2.6, False),  # a formula that is not quite nature's
+        (2.9, 2.6, True),  # what was added explains little of it
+        (40.0, 3.5, True),
+    ],
+)
+def test_what_is_left_in_the_electrical_equation_is_a_trace_or_explained(before, after, breaks):
+    assert breaks_electrical_equation(before, after) is breaks
+
+
+def test_what_is_left_beyond_white_noise_is_told():
+    shaken = evolve(named().final, missed={"current": 22.4, "speed": 19.6})
+    told = words(named(final=shaken))
+    assert "22.4 times the white noise of the current and 19.6 times the white noise of the" in told
+    assert "counts as noise" not in words(named())
 
 
 def test_rivals_and_the_run_that_decides_in_words():

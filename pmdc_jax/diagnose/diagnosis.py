@@ -16,6 +16,9 @@ Verdict = Literal["none_detected", "named", "ambiguous", "not_in_library"]
 # Sensors' own ways, and formulas that are not quite nature's, leave up to 1.4 times the noise in the electrical
 # equation; what is not in the library, such as a filter of the current, three times and more
 MAX_ELECTRICAL = 3.0
+# ... or more than a trace, and more than this share of what the motor without effects leaves: those that were added
+# are then not what is missing there
+TRACE_OF_ELECTRICAL, UNEXPLAINED_ELECTRICAL = 1.5, 0.5
 # Hold-outs that are missed by so many times what the fitted runs are show what those do not
 BEYOND = 2.5
 # ... or the effects that were added make them worse by this factor
@@ -105,18 +108,23 @@ class Diagnosis:
     p_nothing: float  # of the data if nothing were missing
     # what the electrical equation leaves over what the sensors' white noise would; see `balance.electrical_misfit`
     electrical_misfit: float
+    breaks_electrical_equation: (
+        bool  # whether that cannot come from any torque, nor from what was added
+    )
     seconds: Mapping[str, float]
-
-    @property
-    def breaks_electrical_equation(self) -> bool:
-        """Whether what is left cannot come from any torque."""
-        return self.electrical_misfit > MAX_ELECTRICAL
 
     @property
     def beyond_fitted(self) -> float | None:
         """By how many times more the hold-outs are missed than the fitted runs, where that is too much to be the same
         motor; else None."""
         return beyond_fitted(self.gap)
+
+
+def breaks_electrical_equation(before: float, after: float) -> bool:
+    """Whether what a motor leaves in the electrical equation, over the noise, is something missing, by what was left
+    before effects were added."""
+    excess = after**2 - 1 > UNEXPLAINED_ELECTRICAL * (before**2 - 1)
+    return after > MAX_ELECTRICAL or (after > TRACE_OF_ELECTRICAL and excess)
 
 
 def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:

@@ -22,7 +22,6 @@ from ..recording_file import Runs
 from .assessment import ALARM
 from .balance import electrical_misfit
 from .diagnosis import (
-    MAX_ELECTRICAL,
     Detectable,
     Diagnosis,
     EffectFound,
@@ -30,6 +29,7 @@ from .diagnosis import (
     LearnedCurve,
     Region,
     Verdict,
+    breaks_electrical_equation,
     unlike_held_out,
 )
 from .evidence import Block
@@ -86,7 +86,8 @@ def diagnose(
         naming = selection.without(naming, idle)
         final = _judged(naming, solved)
     electrical = electrical_misfit(naming.chosen)
-    verdict = "not_in_library" if electrical > MAX_ELECTRICAL else _verdict(naming)
+    breaks = breaks_electrical_equation(electrical_misfit(selection.base), electrical)
+    verdict = "not_in_library" if breaks else _verdict(naming)
     gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
     total = _total(gaps, base)
     if unlike_held_out(total):
@@ -111,6 +112,7 @@ def diagnose(
         final=final,
         p_nothing=naming.nothing,
         electrical_misfit=electrical,
+        breaks_electrical_equation=breaks,
         seconds=seconds,
     )
 

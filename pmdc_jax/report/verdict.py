@@ -121,7 +121,8 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
         sentences.append(
             "From sample to sample the current departs from where voltage and speed lead it by"
             f" {significant(diagnosis.electrical_misfit)} times what the noise of the sensors explains, and no torque"
-            " can be why: what is missing acts on voltage or current, or the recorded current was filtered or averaged."
+            " can be why: what is missing acts on voltage or current, as a supply does that sags where a duty times its"
+            " nominal voltage was recorded; or the recorded current was filtered or averaged."
         )
     if beyond := diagnosis.beyond_fitted:
         sentences.append(
