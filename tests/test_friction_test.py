@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from scipy.signal import lsim
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import Motor, identify
-from pmdc_jax.identify.friction_test import _load_filter, _response
+from pmdc_jax.identify.friction_test import Missing, _load_filter, _response, of_friction
+from pmdc_jax.identify.identification import Identification
 from pmdc_jax.recording import Recording
 from pmdc_jax.simulate import Tape
 
@@ -51,6 +53,22 @@ def test_friction_that_hides_in_the_viscous_one_is_told():
 @pytest.mark.parametrize("seed", range(3))
 def test_none_is_told_where_there_is_none(seed, torque):
     assert not said(identify(recorded(0.0, seed, **torque)).messages)
+
+
+@pytest.mark.parametrize(
+    ("error", "missed", "told"),
+    [(0.1, {}, ", and for want of it f is wrong"), (1.0, {"current": 4.6}, ": add"), (1.0, {}, "")],
+)
+def test_friction_is_told_where_a_parameter_makes_up_for_it_or_far_more_than_noise_is_left(
+    error, missed, told
+):
+    """An error of a fit that leaves far more than noise may be as large as what the friction moves."""
+    found = Mock(spec=Identification)
+    found.covariance, found.covariance_names = np.diag([1.0, error**2]), ("J", "f")
+    found.missed = missed
+    messages = list(of_friction(Missing(0.01, 27.0, np.array([0.01, -0.6])), found))
+    assert len(messages) == bool(told)
+    assert all(f"(27 standard errors){told}" in message for message in messages)
 
 
 def test_the_response_to_a_load_is_that_of_the_linear_motor(x64):

@@ -62,20 +62,27 @@ def missing_friction(given: Prepared, fit: Fit) -> Missing | None:
 
 
 def of_friction(missing: Missing | None, found: Identification) -> Iterator[str]:
-    """What to say of the friction that a fit lacks, if some parameter makes up for it by more than its own error."""
+    """What to say of the friction that a fit lacks, if some parameter makes up for it by more than its own error, or
+    the fit leaves far more than noise, and no error is to be believed."""
     if missing is None or found.covariance is None:
         return
-    errors = np.sqrt(np.diag(found.covariance))[
-        : len(missing.moved)
-    ]  # of the sought, not of the tied
+    # of the sought, not of the tied
+    errors = np.sqrt(np.diag(found.covariance))[: len(missing.moved)]
     moved = np.abs(missing.moved) / np.where(errors > 0, errors, np.inf)
     most = int(np.argmax(moved))
     if moved[most] > MAKES_UP:
-        yield (
-            f"dry friction of some {missing.friction_Nm:.2g} N m would explain part of what the fit leaves "
-            f"({missing.errors:.0f} standard errors), and for want of it {found.covariance_names[most]} is wrong "
-            f"by more than it says: add `--effect {DRY}`, or let `pmdc diagnose` find what is missing"
+        instead = (
+            f", and for want of it {found.covariance_names[most]} is wrong by more than it says"
         )
+    elif found.missed:
+        instead = ""
+    else:
+        return
+    yield (
+        f"dry friction of some {missing.friction_Nm:.2g} N m would explain part of what the fit leaves "
+        f"({missing.errors:.0f} standard errors){instead}: add `--effect {DRY}`, or let `pmdc diagnose` find what is "
+        "missing"
+    )
 
 
 def _rows(given: Prepared, fit: Fit) -> list[Series]:
