@@ -48,8 +48,8 @@ def slow_sampling(run: Recording) -> Iterator[Finding]:
         return
     current = edge.current[BEFORE_EDGE:] - edge.current[BEFORE_EDGE]
     if abs(current[1]) > 0.9 * np.max(np.abs(current)):
-        what = f"the current settles within one sample ({run.sample_time:.3g} s): L is hardly seen"
-        mend = "Sample faster than L / R to identify the inductance"
+        what = f"the current settles within one sample ({run.sample_time:.3g} s): L may hardly show"
+        mend = "Sample faster than L / R if the standard error of L is too large"
         yield Finding(run.name, "current", "note", what, "at voltage edges", mend)
 
 
