@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from ..compiled import quickly_compiled
 from ..effects import EFFECTS, AbstractEffect
+from ..identify.corrections.speed_averaging import may_be_averaged
 from ..identify.noise import is_coarse, quantum, resolution
 from ..motor import Motor
 from ..recording import Recording
@@ -35,6 +36,8 @@ KNOTS_IN_PERIOD = 25
 MOVING, SLOWEST = 0.02, 0.05
 # Of the largest voltage, what a converter of seven bits and more resolves
 OF_CONVERTER = 0.01
+# What a speed that may be a mean over the last sample cannot be told from
+LATE = {"speed_sensor_lag", "speed_sensor_delay"}
 # Columns that are simulated side by side, and numbers in all of them: the more, the more memory they take
 TOGETHER, AT_ONCE = 32, 2**23
 
@@ -89,9 +92,10 @@ class Library:
         tape = base.given.problem.tape
         measured = bool(np.any(np.asarray(tape.weight)[base.given.problem.fitted_blocks, 0]))
         known = measured or bool(np.any(np.asarray(tape.drive.current) > 0))
-        self.candidates = [
-            c for c in candidates(self.scales) if known or not EFFECTS[c.effect].needs_current
-        ]
+        left_out = {name for name, effect in EFFECTS.items() if effect.needs_current and not known}
+        if may_be_averaged(base.given, base.motor):
+            left_out |= LATE
+        self.candidates = [c for c in candidates(self.scales) if c.effect not in left_out]
         # errors that last look like a voltage that changes in time
         self.coarse = any(is_coarse(speed) for speed in _counted(base.given.training))
         # ... and of noise that the motor did not feel something is left
