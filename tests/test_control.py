@@ -39,7 +39,7 @@ from pmdc_jax.control.spread import drawn_motors, even_spread
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.motor_file import Uncertainty
-from pmdc_jax.simulate.solver import steps_within
+from pmdc_jax.simulate.propagator import steps_within
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 MOTOR = Motor(**PAPER)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from ..effects.base import State
 from ..motor import Drive, Motor
-from ..simulate.solver import propagator
+from ..simulate.propagator import propagator
 from .controllers import AbstractController, Memory, Number
 from .hardware import Hardware
 

@@ -12,7 +12,8 @@ from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
 from ..precision import double_precision
-from ..simulate.solver import Input, Propagator, held_step, propagator
+from ..simulate.propagator import Propagator, propagator
+from ..simulate.solver import Input, held_step
 from .controllers import Number
 from .metrics import BAND
 from .steady import steady_state

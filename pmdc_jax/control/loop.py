@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
-from ..simulate.solver import Input, held_step, propagator
+from ..simulate.propagator import propagator
+from ..simulate.solver import Input, held_step
 from .controllers import Number
 from .law import Law, LawState
 from .steady import steady_state

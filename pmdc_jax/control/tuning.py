@@ -17,7 +17,7 @@ from ..motor import Motor
 from ..motor_file import Uncertainty
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
-from ..simulate.solver import steps_within
+from ..simulate.propagator import steps_within
 from .classical import RULED, ziegler_nichols
 from .controllers import AbstractController
 from .descent import STARTS, best_coordinates

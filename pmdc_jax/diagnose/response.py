@@ -19,8 +19,9 @@ from ..effects import State
 from ..effects.base import Scalars
 from ..motor import Motor
 from ..simulate import Tape
+from ..simulate.propagator import Propagator, along_grids, pick_grid, steps_in_sample
 from ..simulate.shooting import outputs, reported
-from ..simulate.solver import Input, Propagator, along_grids, held_step, pick_grid, steps_in_sample
+from ..simulate.solver import Input, held_step
 
 Signal = Float[Array, "samples blocks"]
 Outputs = Float[Array, "samples 2 blocks"]

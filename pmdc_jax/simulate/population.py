@@ -16,17 +16,8 @@ from ..effects.base import Scalars, State
 from ..motor import Motor
 from ..threads import CORES, side_by_side
 from .exponential import Matrix, product
-from .solver import (
-    HeldInput,
-    Input,
-    Propagator,
-    Walk,
-    along_grids,
-    held_step,
-    pick_grid,
-    steps_in_sample,
-    walk,
-)
+from .propagator import Propagator, along_grids, pick_grid, steps_in_sample
+from .solver import HeldInput, Input, Walk, held_step, walk
 from .tape import BLOCK, Samples, Tape
 
 # Samples in a stride of linear motors, a power of two that divides a block: measured, 8 and 32 are slower.

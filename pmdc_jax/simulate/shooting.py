@@ -23,17 +23,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compiled import compiled
 from ..effects.base import State
 from ..motor import Motor
-from .solver import (
-    HeldInput,
-    Input,
-    Propagator,
-    Walk,
-    along_grids,
-    held_step,
-    pick_grid,
-    steps_in_sample,
-    walk,
-)
+from .propagator import Propagator, along_grids, pick_grid, steps_in_sample
+from .solver import HeldInput, Input, Walk, held_step, walk
 from .tape import BLOCK, Tape
 
 T = TypeVar("T")

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial, reduce
 from operator import add
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,21 +15,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
-from .exponential import Matrix, phi_functions, product
-from .switches import computed_once, contact_correction, contact_response, stick_or_reverse
+from .exponential import Matrix
+from .propagator import Held, Propagator, Slow, Vector, Weights, linear_states, state_of, vector
+from .switches import computed_once, contact_correction, stick_or_reverse
 
-if TYPE_CHECKING:
-    from .tape import Tape
-
-Held = Float[Array, "*#batch"]
 Time = float | Float[Array | np.ndarray, ""]  # of the solver: it counts steps
-Vector = tuple[Scalars, ...]  # current, speed, and the states of linear effects
-Slow = dict[str, Scalars]  # the states that are not in the linear part, by name
-
-# Steps into which a sample is divided at most
-FINEST = 32
-# Over one step what is not in the linear part lets a state fall by no more than exp(-1)
-STIFF = 1.0
 
 
 class Input(NamedTuple):
@@ -50,150 +39,6 @@ class Input(NamedTuple):
         if self.rise is None:
             return self
         return self._replace(value=self.at(middle), rise=share * self.rise)
-
-
-class Stages(NamedTuple):
-    """Weights of ETDRK4 for whatever is not linear."""
-
-    half: Matrix  # exp(A h / 2)
-    half_input: Matrix  # h / 2 phi_1(A h / 2)
-    half_minus_one: Matrix  # (exp(A h / 2) - 1) half_input
-    first: Matrix  # h (phi_1 - 3 phi_2 + 4 phi_3)
-    middle: Matrix  # h (2 phi_2 - 4 phi_3)
-    last: Matrix  # h (4 phi_3 - phi_2)
-
-
-class Weights(NamedTuple):
-    """By what the rest of a motor with effects acts over one step."""
-
-    push: Matrix  # h phi_1(A h)
-    linear: Matrix  # A
-    step: Float[Array, "*#batch"]  # s
-    stages: Stages | None = None  # where the rest changes within a step
-    # what the torque does that teeth begin or cease to pass within a step, in rad of twist, where there are teeth
-    contact: Float[Array, "powers n *#batch"] | None = None
-
-
-class Look(NamedTuple):
-    """To where within every sample a late sensor looks."""
-
-    along: Propagator  # a step up to there
-    share: Held  # of the sample, more than 0 and at most all of it
-
-
-class Propagator(NamedTuple):
-    """Everything about a motor and a step length that does not change from step to step.
-
-    x(h) = whole x + inputs u is exact for the linear motor. With effects the step is one of the equal parts of
-    a sample, and the inputs are part of the rest, for which there are `weights`.
-    """
-
-    whole: Matrix  # exp(A h)
-    inputs: Float[Array, "n 2 *#batch"]  # h phi_1(A h) B
-    weights: Weights | None = None
-    apart: Propagator | None = None  # the same while teeth do not touch
-    # h (phi_2 - phi_1 / 2)(A h): by what a drive acts that rises within a step, beyond what its mean does
-    ramp: Matrix | None = None
-    look: Look | None = None  # where a sensor is late
-
-
-@eqx.filter_jit  # one trace serves all grids
-def propagator(motor: Motor, step: Held, drive: Drive, straight: bool = False) -> Propagator:
-    """Exact step of the linear part over `step` seconds, and the weights for what the effects add; of teeth that touch,
-    and beside it of such that do not. `straight` asks for what a drive needs that is not held."""
-    A, B = _linear_part(motor, drive)
-    along = _by_linear_part(motor, step, A, B, straight)
-    teeth = motor.toothed
-    if teeth is None:
-        return along
-    assert teeth.contact_state is not None
-    open_teeth = motor.with_effects(e.without_contact() for e in motor.effects)
-    A_apart, _ = _linear_part(open_teeth, drive)
-    apart = _by_linear_part(motor, step, A_apart, B, straight)
-    push = (A - A_apart)[:, 2 + _linear_states(motor).index(teeth.contact_state)]
-    apart = _with_contact_response(apart, contact_response(A, push, step))
-    return _with_contact_response(along, contact_response(A_apart, push, step))._replace(
-        apart=apart
-    )
-
-
-def _with_contact_response(
-    along: Propagator, contact: Float[Array, "powers n *#batch"]
-) -> Propagator:
-    assert along.weights is not None
-    return along._replace(weights=along.weights._replace(contact=contact))
-
-
-def _by_linear_part(
-    motor: Motor,
-    step: Held,
-    A: Matrix,
-    B: Float[Array, "n 2 *#batch"],
-    straight: bool,
-) -> Propagator:
-    """The propagator of a motor whose linear part is A and B.
-
-    **Source**: ETDRK4, Cox, Matthews, Journal of Computational Physics 176 (2002), equations (26)-(29),
-    doi:10.1006/jcph.2002.6995.
-    """
-    if motor.affine:
-        _, (phi0, phi1, *phi2) = phi_functions(A * step, 2 if straight else 1)
-        inputs = step * product(phi1, B)
-        ramp = step * (phi2[0] - phi1 / 2) if straight else None
-        weights = None
-        if motor.effects:
-            weights = Weights(step * phi1, A, step * jnp.ones_like(motor.R))
-        return Propagator(phi0, inputs, weights, ramp=ramp)
-    (half0, half1, *_), (phi0, phi1, phi2, phi3) = phi_functions(A * step, 3)
-    half_input = step / 2 * half1
-    stages = Stages(
-        half=half0,
-        half_input=half_input,
-        half_minus_one=product(half0, half_input) - half_input,
-        first=step * (phi1 - 3 * phi2 + 4 * phi3),
-        middle=step * (2 * phi2 - 4 * phi3),
-        last=step * (4 * phi3 - phi2),
-    )
-    weights = Weights(step * phi1, A, step * jnp.ones_like(motor.R), stages)
-    return Propagator(phi0, step * product(phi1, B), weights)
-
-
-def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 *#batch"]]:
-    """A and B of the linear motor, with the states of its linear effects."""
-    A, B = motor.state_space(drive)
-    linear = tuple(e for effect in motor.effects if (e := effect.linear()) is not None)
-    if not linear:
-        return A, B
-    core = motor.with_effects(linear)
-    zero, one = jnp.zeros_like(motor.R), jnp.ones_like(motor.R)
-    count = 2 + len(core.states)
-    columns = []
-    for k in range(count):
-        state = _state(core, tuple(one if j == k else zero for j in range(count)), {})
-        columns.append(jnp.stack(_vector(core, core.derivative(state, zero, zero, drive))))
-    A = jnp.stack(columns, 1)
-    return A, jnp.concatenate([B, jnp.zeros_like(A[2:, :2])])
-
-
-def steps_in_sample(motor: Motor, tape: Tape) -> int | Int[Array, ""]:
-    """Into how many equal steps the samples of a tape are divided."""
-    current = jnp.max(jnp.abs(jnp.asarray(tape.measured)[:, 0]))
-    return steps_within(motor, tape.longest, current)
-
-
-def steps_within(motor: Motor, seconds: float, current: Scalars) -> int | Int[Array, ""]:
-    """Into how many equal steps that time is divided, so that none is longer than the effects allow at currents up to
-    `current` in A."""
-    allowed = [e.longest_step for e in motor.effects if e.holds or e.contact_state or not e.affine]
-    if not allowed:
-        return 1
-    least = min(max(round(seconds / min(allowed)), 1), FINEST)
-    rates = [rate for e in motor.effects if (rate := e.fastest_rate(motor, current)) is not None]
-    if not rates:
-        return least
-    # of a population, as most of it needs: what a wild one needs would hold up all
-    needed = jnp.ceil(jnp.median(reduce(jnp.maximum, rates)) * seconds / STIFF)
-    return jnp.clip(jnp.nan_to_num(needed, nan=FINEST), least, FINEST).astype(int)
 
 
 def held_step(
@@ -230,7 +75,7 @@ def _bend(motor: Motor, along: Propagator, acting: Input, state: State) -> Vecto
     """What a drive that rises on a straight line does in a step, beyond what its mean does."""
     assert along.ramp is not None, "a propagator for held drives"
     low, high = (
-        _vector(motor, motor.derivative(state, acting.at(end), acting.load, acting.drive))
+        vector(motor, motor.derivative(state, acting.at(end), acting.load, acting.drive))
         for end in (0.0, 1.0)
     )
     return _times(along.ramp, tuple(b - a for a, b in zip(low, high, strict=True)))
@@ -249,7 +94,7 @@ def _step(motor: Motor, along: Propagator, acting: Input, state: State) -> State
     assert weights is not None
     motor = motor.with_effects(e.averaged_over_step(state, weights.step) for e in motor.effects)
     rate, after = _unswitched(motor, along, weights, acting, state)
-    x, begun, moved = _vector(motor, state), _vector(motor, rate), _vector(motor, after)
+    x, begun, moved = vector(motor, state), vector(motor, rate), vector(motor, after)
     slow = _slow(motor, after)
     if teeth is not None and weights.contact is not None:
         mend = contact_correction(teeth, weights.step, weights.contact, state, rate, after)
@@ -260,7 +105,7 @@ def _step(motor: Motor, along: Propagator, acting: Input, state: State) -> State
             (1, "speed", 1 / now.J),
             (0, "current", acting.drive.voltage / now.L),
         ):
-            hold, ahead = motor.grip(holds, still), motor.grip(holds, _state(motor, moved, slow))
+            hold, ahead = motor.grip(holds, still), motor.grip(holds, state_of(motor, moved, slow))
             if hold is not None and ahead is not None:
                 push, decay = weights.push[:, row] * unit, -weights.linear[row, row] * weights.step
                 # a branch, though most blocks have something to mend: without it XLA computes the whole step anew
@@ -271,7 +116,7 @@ def _step(motor: Motor, along: Propagator, acting: Input, state: State) -> State
                     lambda grips, before, after, *_: after,
                     *((hold, ahead), x, moved, begun[row] / unit, push, decay),
                 )
-    return _state(motor, moved, slow)
+    return state_of(motor, moved, slow)
 
 
 def _unswitched(
@@ -280,19 +125,19 @@ def _unswitched(
     """The rate at which a step begins, and how it ends if dry elements and teeth go on as they began."""
     h, linear, always = weights.step, weights.linear, jnp.all(weights.step > 0)
     moving = (jnp.sign(state.current), jnp.sign(state.speed))
-    x, slow = _vector(motor, state), _slow(motor, state)
+    x, slow = vector(motor, state), _slow(motor, state)
 
     def rates(x: Vector, slow: Slow, when: float) -> tuple[Vector, Slow]:
-        now = _state(motor, x, slow)
+        now = state_of(motor, x, slow)
         rate = motor.derivative(now, acting.at(when), acting.load, acting.drive, moving)
-        return _vector(motor, rate), _slow(motor, rate)
+        return vector(motor, rate), _slow(motor, rate)
 
     if weights.stages is None:
         begun, s0 = computed_once(rates(x, slow, 0.5), always)
         moved = _add(x, _times(weights.push, begun))
         if acting.rise is not None:
             moved = _add(moved, _bend(motor, along, acting, state))
-        return _state(motor, begun, s0), _state(motor, moved, _shifted(slow, h, s0))
+        return state_of(motor, begun, s0), state_of(motor, moved, _shifted(slow, h, s0))
 
     def rest(x: Vector, slow: Slow, when: float) -> tuple[Vector, Slow]:
         """What the linear part leaves over, and the rates of the states that are not in it."""
@@ -308,7 +153,31 @@ def _unswitched(
     n3, s3 = rest(end, _shifted(slow, h, s2), 1.0)
     moved = _add(moved, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
     slow = _shifted(slow, h / 6, {k: s0[k] + 2 * (s1[k] + s2[k]) + s3[k] for k in slow})
-    return _state(motor, _add(n0, _times(linear, x)), s0), _state(motor, moved, slow)
+    return state_of(motor, _add(n0, _times(linear, x)), s0), state_of(motor, moved, slow)
+
+
+def _slow(motor: Motor, state: State) -> Slow:
+    """The states that are not in the linear part."""
+    linear = linear_states(motor)
+    return {name: x for name, x in state.extra.items() if name not in linear}
+
+
+def _shifted(slow: Slow, weight: Held, rates: Slow) -> Slow:
+    return {name: slow[name] + weight * rates[name] for name in slow}
+
+
+def _times(matrix: Matrix, x: Vector, onto: Vector | None = None) -> Vector:
+    """Matrix times vector, on top of another vector where one is given."""
+
+    def row(i: int) -> Scalars:
+        products = [matrix[i, j] * x_j for j, x_j in enumerate(x)]
+        return reduce(add, products) if onto is None else reduce(add, products[::-1], onto[i])
+
+    return tuple(row(i) for i in range(len(matrix)))
+
+
+def _add(*vectors: Vector) -> Vector:
+    return tuple(reduce(add, entries) for entries in zip(*vectors, strict=True))
 
 
 class Walk(NamedTuple):
@@ -371,68 +240,3 @@ def walk(solver: HeldInput, start: Walk, steps: int, saveat: diffrax.SaveAt) -> 
         throw=False,
     )
     return solution.ys
-
-
-def along_grids(motor: Motor, tape: Tape) -> Propagator:
-    """The propagator of one step on every grid of the tape, stacked in front."""
-    steps, delay = steps_in_sample(motor, tape), motor.speed_delay()
-
-    def of_grid(g: int) -> Propagator:
-        sample = jnp.asarray(tape.sample_time)[g]
-        drive = Drive(*(jnp.asarray(share)[g] for share in tape.drive))
-        straight = tape.rise is not None
-        along = propagator(motor, sample / steps, drive, straight)
-        if delay is None:
-            return along
-        samples = jnp.asarray(delay / sample)
-        share = 1 - (samples - jnp.floor(samples))
-        part = propagator(motor, share * sample / steps, drive, straight)
-        return along._replace(look=Look(part, share))
-
-    grids = map(of_grid, range(tape.sample_time.shape[0]))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *grids)
-
-
-def pick_grid(
-    grids: Propagator, tape: Tape, grid: Int[Array | np.ndarray, "..."]
-) -> tuple[Propagator, Drive]:
-    """Propagator and drive of one grid, or of one grid for each block."""
-    return jax.tree.map(lambda leaf: leaf[grid], (grids, tape.drive))
-
-
-def _times(matrix: Matrix, x: Vector, onto: Vector | None = None) -> Vector:
-    """Matrix times vector, on top of another vector where one is given."""
-
-    def row(i: int) -> Scalars:
-        products = [matrix[i, j] * x_j for j, x_j in enumerate(x)]
-        return reduce(add, products) if onto is None else reduce(add, products[::-1], onto[i])
-
-    return tuple(row(i) for i in range(len(matrix)))
-
-
-def _add(*vectors: Vector) -> Vector:
-    return tuple(reduce(add, entries) for entries in zip(*vectors, strict=True))
-
-
-def _linear_states(motor: Motor) -> list[str]:
-    """States that effects add to the linear part."""
-    linear = {name for e in motor.effects if e.linear() is not None for name in e.states}
-    return sorted(linear)
-
-
-def _vector(motor: Motor, state: State) -> Vector:
-    return (state.current, state.speed, *(state.extra[name] for name in _linear_states(motor)))
-
-
-def _slow(motor: Motor, state: State) -> Slow:
-    """The states that are not in the linear part."""
-    linear = _linear_states(motor)
-    return {name: x for name, x in state.extra.items() if name not in linear}
-
-
-def _state(motor: Motor, x: Vector, slow: Slow) -> State:
-    return State(x[0], x[1], slow | dict(zip(_linear_states(motor), x[2:], strict=True)))
-
-
-def _shifted(slow: Slow, weight: Held, rates: Slow) -> Slow:
-    return {name: slow[name] + weight * rates[name] for name in slow}

@@ -1,0 +1,215 @@
+"""What does not change from step to step of a motor whose input is held: how its linear part moves, exactly, by what
+weights the rest acts, and how long a step may be."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..effects.base import Scalars, State
+from ..motor import Drive, Motor
+from .exponential import Matrix, phi_functions, product
+from .switches import contact_response
+
+if TYPE_CHECKING:
+    from .tape import Tape
+
+Held = Float[Array, "*#batch"]
+Vector = tuple[Scalars, ...]  # current, speed, and the states of linear effects
+Slow = dict[str, Scalars]  # the states that are not in the linear part, by name
+
+# Steps into which a sample is divided at most
+FINEST = 32
+# Over one step what is not in the linear part lets a state fall by no more than exp(-1)
+STIFF = 1.0
+
+
+class Stages(NamedTuple):
+    """Weights of ETDRK4 for whatever is not linear."""
+
+    half: Matrix  # exp(A h / 2)
+    half_input: Matrix  # h / 2 phi_1(A h / 2)
+    half_minus_one: Matrix  # (exp(A h / 2) - 1) half_input
+    first: Matrix  # h (phi_1 - 3 phi_2 + 4 phi_3)
+    middle: Matrix  # h (2 phi_2 - 4 phi_3)
+    last: Matrix  # h (4 phi_3 - phi_2)
+
+
+class Weights(NamedTuple):
+    """By what the rest of a motor with effects acts over one step."""
+
+    push: Matrix  # h phi_1(A h)
+    linear: Matrix  # A
+    step: Float[Array, "*#batch"]  # s
+    stages: Stages | None = None  # where the rest changes within a step
+    # what the torque does that teeth begin or cease to pass within a step, in rad of twist, where there are teeth
+    contact: Float[Array, "powers n *#batch"] | None = None
+
+
+class Look(NamedTuple):
+    """To where within every sample a late sensor looks."""
+
+    along: Propagator  # a step up to there
+    share: Held  # of the sample, more than 0 and at most all of it
+
+
+class Propagator(NamedTuple):
+    """Everything about a motor and a step length that does not change from step to step.
+
+    x(h) = whole x + inputs u is exact for the linear motor. With effects the step is one of the equal parts of
+    a sample, and the inputs are part of the rest, for which there are `weights`.
+    """
+
+    whole: Matrix  # exp(A h)
+    inputs: Float[Array, "n 2 *#batch"]  # h phi_1(A h) B
+    weights: Weights | None = None
+    apart: Propagator | None = None  # the same while teeth do not touch
+    # h (phi_2 - phi_1 / 2)(A h): by what a drive acts that rises within a step, beyond what its mean does
+    ramp: Matrix | None = None
+    look: Look | None = None  # where a sensor is late
+
+
+@eqx.filter_jit  # one trace serves all grids
+def propagator(motor: Motor, step: Held, drive: Drive, straight: bool = False) -> Propagator:
+    """Exact step of the linear part over `step` seconds, and the weights for what the effects add; of teeth that touch,
+    and beside it of such that do not. `straight` asks for what a drive needs that is not held."""
+    A, B = _linear_part(motor, drive)
+    along = _by_linear_part(motor, step, A, B, straight)
+    teeth = motor.toothed
+    if teeth is None:
+        return along
+    assert teeth.contact_state is not None
+    open_teeth = motor.with_effects(e.without_contact() for e in motor.effects)
+    A_apart, _ = _linear_part(open_teeth, drive)
+    apart = _by_linear_part(motor, step, A_apart, B, straight)
+    push = (A - A_apart)[:, 2 + linear_states(motor).index(teeth.contact_state)]
+    apart = _with_contact_response(apart, contact_response(A, push, step))
+    return _with_contact_response(along, contact_response(A_apart, push, step))._replace(
+        apart=apart
+    )
+
+
+def _with_contact_response(
+    along: Propagator, contact: Float[Array, "powers n *#batch"]
+) -> Propagator:
+    assert along.weights is not None
+    return along._replace(weights=along.weights._replace(contact=contact))
+
+
+def _by_linear_part(
+    motor: Motor,
+    step: Held,
+    A: Matrix,
+    B: Float[Array, "n 2 *#batch"],
+    straight: bool,
+) -> Propagator:
+    """The propagator of a motor whose linear part is A and B.
+
+    **Source**: ETDRK4, Cox, Matthews, Journal of Computational Physics 176 (2002), equations (26)-(29),
+    doi:10.1006/jcph.2002.6995.
+    """
+    if motor.affine:
+        _, (phi0, phi1, *phi2) = phi_functions(A * step, 2 if straight else 1)
+        inputs = step * product(phi1, B)
+        ramp = step * (phi2[0] - phi1 / 2) if straight else None
+        weights = None
+        if motor.effects:
+            weights = Weights(step * phi1, A, step * jnp.ones_like(motor.R))
+        return Propagator(phi0, inputs, weights, ramp=ramp)
+    (half0, half1, *_), (phi0, phi1, phi2, phi3) = phi_functions(A * step, 3)
+    half_input = step / 2 * half1
+    stages = Stages(
+        half=half0,
+        half_input=half_input,
+        half_minus_one=product(half0, half_input) - half_input,
+        first=step * (phi1 - 3 * phi2 + 4 * phi3),
+        middle=step * (2 * phi2 - 4 * phi3),
+        last=step * (4 * phi3 - phi2),
+    )
+    weights = Weights(step * phi1, A, step * jnp.ones_like(motor.R), stages)
+    return Propagator(phi0, step * product(phi1, B), weights)
+
+
+def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 *#batch"]]:
+    """A and B of the linear motor, with the states of its linear effects."""
+    A, B = motor.state_space(drive)
+    linear = tuple(e for effect in motor.effects if (e := effect.linear()) is not None)
+    if not linear:
+        return A, B
+    core = motor.with_effects(linear)
+    zero, one = jnp.zeros_like(motor.R), jnp.ones_like(motor.R)
+    count = 2 + len(core.states)
+    columns = []
+    for k in range(count):
+        state = state_of(core, tuple(one if j == k else zero for j in range(count)), {})
+        columns.append(jnp.stack(vector(core, core.derivative(state, zero, zero, drive))))
+    A = jnp.stack(columns, 1)
+    return A, jnp.concatenate([B, jnp.zeros_like(A[2:, :2])])
+
+
+def along_grids(motor: Motor, tape: Tape) -> Propagator:
+    """The propagator of one step on every grid of the tape, stacked in front."""
+    steps, delay = steps_in_sample(motor, tape), motor.speed_delay()
+
+    def of_grid(g: int) -> Propagator:
+        sample = jnp.asarray(tape.sample_time)[g]
+        drive = Drive(*(jnp.asarray(share)[g] for share in tape.drive))
+        straight = tape.rise is not None
+        along = propagator(motor, sample / steps, drive, straight)
+        if delay is None:
+            return along
+        samples = jnp.asarray(delay / sample)
+        share = 1 - (samples - jnp.floor(samples))
+        part = propagator(motor, share * sample / steps, drive, straight)
+        return along._replace(look=Look(part, share))
+
+    grids = map(of_grid, range(tape.sample_time.shape[0]))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *grids)
+
+
+def pick_grid(
+    grids: Propagator, tape: Tape, grid: Int[Array | np.ndarray, "..."]
+) -> tuple[Propagator, Drive]:
+    """Propagator and drive of one grid, or of one grid for each block."""
+    return jax.tree.map(lambda leaf: leaf[grid], (grids, tape.drive))
+
+
+def steps_in_sample(motor: Motor, tape: Tape) -> int | Int[Array, ""]:
+    """Into how many equal steps the samples of a tape are divided."""
+    current = jnp.max(jnp.abs(jnp.asarray(tape.measured)[:, 0]))
+    return steps_within(motor, tape.longest, current)
+
+
+def steps_within(motor: Motor, seconds: float, current: Scalars) -> int | Int[Array, ""]:
+    """Into how many equal steps that time is divided, so that none is longer than the effects allow at currents up to
+    `current` in A."""
+    allowed = [e.longest_step for e in motor.effects if e.holds or e.contact_state or not e.affine]
+    if not allowed:
+        return 1
+    least = min(max(round(seconds / min(allowed)), 1), FINEST)
+    rates = [rate for e in motor.effects if (rate := e.fastest_rate(motor, current)) is not None]
+    if not rates:
+        return least
+    # of a population, as most of it needs: what a wild one needs would hold up all
+    needed = jnp.ceil(jnp.median(reduce(jnp.maximum, rates)) * seconds / STIFF)
+    return jnp.clip(jnp.nan_to_num(needed, nan=FINEST), least, FINEST).astype(int)
+
+
+def linear_states(motor: Motor) -> list[str]:
+    """States that effects add to the linear part."""
+    linear = {name for e in motor.effects if e.linear() is not None for name in e.states}
+    return sorted(linear)
+
+
+def vector(motor: Motor, state: State) -> Vector:
+    return (state.current, state.speed, *(state.extra[name] for name in linear_states(motor)))
+
+
+def state_of(motor: Motor, x: Vector, slow: Slow) -> State:
+    return State(x[0], x[1], slow | dict(zip(linear_states(motor), x[2:], strict=True)))
