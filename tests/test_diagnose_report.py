@@ -339,6 +339,14 @@ def test_drift_is_of_the_parameters_that_both_motors_have():
     assert found["R"] == 0
 
 
+def test_a_limit_of_the_search_is_nothing_to_move_from():
+    base = named().base
+    limit = evolve(base.parameters["f"], status="at_bound", stderr=None, ci95=None)
+    told = words(named(base=evolve(base, parameters={**base.parameters, "f": limit})))
+    assert "moved f by" in words(named())
+    assert "moved f by" not in told
+
+
 def test_the_next_experiment_can_be_played(tmp_path):
     path = tmp_path / "next.csv"
     assert write_experiment(ambiguous(), path)

@@ -317,6 +317,11 @@ class Drift(NamedTuple):
     after: Estimate
 
     @property
+    def is_known(self) -> bool:
+        """Whether the recordings determined it both times: a limit of the search is nothing to move from."""
+        return {self.before.status, self.after.status} <= {"identified", "tied"}
+
+    @property
     def percent(self) -> float | None:
         """By how much it moved."""
         if not self.before.value or self.after.value is None:
@@ -342,10 +347,11 @@ def drift_words(one: Drift) -> str:
 
 
 def _drift_sentence(diagnosis: Diagnosis) -> str:
-    far = [one for one in drifts(diagnosis) if abs(one.percent or 0.0) > MIN_DRIFT]
+    known = [one for one in drifts(diagnosis) if one.is_known]
+    far = [one for one in known if abs(one.percent or 0.0) > MIN_DRIFT]
     far = sorted(far, key=lambda one: -abs(one.percent or 0.0))[:3]
     if not far:
-        return f"No parameter of the motor moved by more than {MIN_DRIFT:g} %."
+        return f"No parameter that both fits determine moved by more than {MIN_DRIFT:g} %."
     drifted = enumerate_words([f"{one.name} by {drift_words(one)}" for one in far])
     return f"Adding it moved {drifted}."
 
