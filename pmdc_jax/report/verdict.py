@@ -340,8 +340,8 @@ def drifts(diagnosis: Diagnosis) -> list[Drift]:
 
 
 def drift_words(one: Drift) -> str:
-    """The change in per cent with its sign."""
-    if one.percent is None:
+    """The change in per cent with its sign; none of what one of both fits did not determine."""
+    if one.percent is None or not one.is_known:
         return percent(None)
     return ("+" if one.percent > 0 else "") + percent(one.percent)
 
