@@ -108,10 +108,13 @@ class Diagnosis:
     p_nothing: float  # of the data if nothing were missing
     # what the electrical equation leaves over what the sensors' white noise would; see `balance.electrical_misfit`
     electrical_misfit: float
-    breaks_electrical_equation: (
-        bool  # whether that cannot come from any torque, nor from what was added
-    )
+    electrical_misfit_before: float  # the same without effects
     seconds: Mapping[str, float]
+
+    @property
+    def breaks_electrical_equation(self) -> bool:
+        """Whether what is left can come neither from any torque nor from the effects that were added."""
+        return breaks_electrical_equation(self.electrical_misfit_before, self.electrical_misfit)
 
     @property
     def beyond_fitted(self) -> float | None:
@@ -121,10 +124,9 @@ class Diagnosis:
 
 
 def breaks_electrical_equation(before: float, after: float) -> bool:
-    """Whether what a motor leaves in the electrical equation, over the noise, is something missing, by what was left
-    before effects were added."""
-    excess = after**2 - 1 > UNEXPLAINED_ELECTRICAL * (before**2 - 1)
-    return after > MAX_ELECTRICAL or (after > TRACE_OF_ELECTRICAL and excess)
+    """See `Diagnosis.breaks_electrical_equation`; the misfits before and after effects were added."""
+    unexplained = after**2 - 1 > UNEXPLAINED_ELECTRICAL * (before**2 - 1)
+    return after > MAX_ELECTRICAL or (after > TRACE_OF_ELECTRICAL and unexplained)
 
 
 def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:

@@ -36,8 +36,6 @@ KNOTS_IN_PERIOD = 25
 MOVING, SLOWEST = 0.02, 0.05
 # Of the largest voltage, what a converter of seven bits and more resolves
 OF_CONVERTER = 0.01
-# What a speed that may be a mean over the last sample cannot be told from
-LATE = {"speed_sensor_lag", "speed_sensor_delay"}
 # Columns that are simulated side by side, and numbers in all of them: the more, the more memory they take
 TOGETHER, AT_ONCE = 32, 2**23
 
@@ -92,10 +90,14 @@ class Library:
         tape = base.given.problem.tape
         measured = bool(np.any(np.asarray(tape.weight)[base.given.problem.fitted_blocks, 0]))
         known = measured or bool(np.any(np.asarray(tape.drive.current) > 0))
-        left_out = {name for name, effect in EFFECTS.items() if effect.needs_current and not known}
-        if may_be_averaged(base.given, base.motor):
-            left_out |= LATE
-        self.candidates = [c for c in candidates(self.scales) if c.effect not in left_out]
+        # a mean over the last sample is late, too
+        averaged = may_be_averaged(base.given, base.motor)
+        told = {
+            name
+            for name, effect in EFFECTS.items()
+            if (known or not effect.needs_current) and not (averaged and effect.reports_late)
+        }
+        self.candidates = [c for c in candidates(self.scales) if c.effect in told]
         # errors that last look like a voltage that changes in time
         self.coarse = any(is_coarse(speed) for speed in _counted(base.given.training))
         # ... and of noise that the motor did not feel something is left

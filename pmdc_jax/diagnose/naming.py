@@ -260,12 +260,12 @@ class StepwiseSelection:
         possible = [model for model in tried if model is not None and model.is_possible]
         if possible:
             nearest = min(possible, key=lambda m: m.fit.fitness)
-            best, noise = list(nearest.effects), LOST * current.given.problem.outputs
+            suspects, noise = nearest.effects, LOST * current.given.problem.outputs
         else:
             by_gain = sorted(found.of_candidates, key=lambda s: -s.gain)
-            best = list(dict.fromkeys(effect_of(s) for s in by_gain))[:SHORTLIST]
+            suspects = tuple(dict.fromkeys(effect_of(s) for s in by_gain))[:SHORTLIST]
             nearest, noise = current, current.given.problem.outputs
-        sticks = any(EFFECTS[effect].holds == "speed" for effect in best)
+        sticks = any(EFFECTS[effect].holds == "speed" for effect in suspects)
         far = nearest.fit.fitness / FAR
         if not sticks or far < noise:  # not even a perfect fit would
             return []

@@ -85,8 +85,8 @@ def diagnose(
     while (idle := _idle(naming, final, selection.library)) is not None:
         naming = selection.without(naming, idle)
         final = _judged(naming, solved)
-    electrical = electrical_misfit(naming.chosen)
-    breaks = breaks_electrical_equation(electrical_misfit(selection.base), electrical)
+    before, electrical = (electrical_misfit(m) for m in (selection.base, naming.chosen))
+    breaks = breaks_electrical_equation(before, electrical)
     verdict = "not_in_library" if breaks else _verdict(naming)
     gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
     total = _total(gaps, base)
@@ -112,7 +112,7 @@ def diagnose(
         final=final,
         p_nothing=naming.nothing,
         electrical_misfit=electrical,
-        breaks_electrical_equation=breaks,
+        electrical_misfit_before=before,
         seconds=seconds,
     )
 

@@ -71,16 +71,14 @@ def of_friction(missing: Missing | None, found: Identification) -> Iterator[str]
     moved = np.abs(missing.moved) / np.where(errors > 0, errors, np.inf)
     most = int(np.argmax(moved))
     if moved[most] > MAKES_UP:
-        instead = (
-            f", and for want of it {found.covariance_names[most]} is wrong by more than it says"
-        )
+        wrong = f", and for want of it {found.covariance_names[most]} is wrong by more than it says"
     elif found.missed:
-        instead = ""
+        wrong = ""
     else:
         return
     yield (
         f"dry friction of some {missing.friction_Nm:.2g} N m would explain part of what the fit leaves "
-        f"({missing.errors:.0f} standard errors){instead}: add `--effect {DRY}`, or let `pmdc diagnose` find what is "
+        f"({missing.errors:.0f} standard errors){wrong}: add `--effect {DRY}`, or let `pmdc diagnose` find what is "
         "missing"
     )
 

@@ -47,6 +47,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
     alike = [information_of(problem, fit) for fit in lifted if fit is not None]
     info = max(info, *alike, key=lambda i: i.unseen_share.sum()) if alike else info
     best = chosen.optimum
+    motor = _plain(parameters(best.unknowns.coordinates))
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
     unknowns, ended = fit_run_unknowns(problem, best.unknowns)
@@ -54,7 +55,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
     names, covariance = parameters.with_tied(info.covariance)
     noise = {name: white_noise(_residuals(fit, name)) for name in ("current", "speed")}
     return Identification(
-        motor=_plain(parameters(best.unknowns.coordinates)),
+        motor=motor,
         parameters=_estimates(parameters, best, info, given, _intervals(problem, best, info)),
         unidentified_directions=explain(info.unseen, parameters, training),
         fit=fit,
@@ -66,9 +67,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
         findings=given.findings,
         covariance=covariance,
         covariance_names=names,
-        messages=_messages(
-            given, solved, parameters(best.unknowns.coordinates), chosen is not polished
-        ),
+        messages=_messages(given, solved, motor, chosen is not polished),
         missed=_missed(fit),
     )
 

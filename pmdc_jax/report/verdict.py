@@ -323,8 +323,8 @@ class Drift(NamedTuple):
 
     @property
     def percent(self) -> float | None:
-        """By how much it moved."""
-        if not self.before.value or self.after.value is None:
+        """By how much it moved, if that is known."""
+        if not self.is_known or not self.before.value or self.after.value is None:
             return None
         return 100 * (self.after.value / self.before.value - 1)
 
@@ -340,15 +340,14 @@ def drifts(diagnosis: Diagnosis) -> list[Drift]:
 
 
 def drift_words(one: Drift) -> str:
-    """The change in per cent with its sign; none of what one of both fits did not determine."""
-    if one.percent is None or not one.is_known:
+    """The change in per cent with its sign."""
+    if one.percent is None:
         return percent(None)
     return ("+" if one.percent > 0 else "") + percent(one.percent)
 
 
 def _drift_sentence(diagnosis: Diagnosis) -> str:
-    known = [one for one in drifts(diagnosis) if one.is_known]
-    far = [one for one in known if abs(one.percent or 0.0) > MIN_DRIFT]
+    far = [one for one in drifts(diagnosis) if abs(one.percent or 0.0) > MIN_DRIFT]
     far = sorted(far, key=lambda one: -abs(one.percent or 0.0))[:3]
     if not far:
         return f"No parameter that both fits determine moved by more than {MIN_DRIFT:g} %."

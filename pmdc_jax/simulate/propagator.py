@@ -208,8 +208,10 @@ def linear_states(motor: Motor) -> list[str]:
 
 
 def vector(motor: Motor, state: State) -> Vector:
+    """Current, speed and the states that effects add to the linear part."""
     return (state.current, state.speed, *(state.extra[name] for name in linear_states(motor)))
 
 
 def state_of(motor: Motor, x: Vector, slow: Slow) -> State:
+    """The state of such a vector and of the states that are not in the linear part."""
     return State(x[0], x[1], slow | dict(zip(linear_states(motor), x[2:], strict=True)))

@@ -97,9 +97,9 @@ def seems_averaged(given: Prepared) -> bool:
 def may_be_averaged(given: Prepared, motor: Motor) -> bool:
     """Whether the noise is that of means, but the motor settles too fast for the fits to tell, or for the mean to be
     undone: it is no smooth curve from sample to sample."""
-    settling = float(motor.R * motor.J / (motor.Kt * motor.Kb))
+    time_constant = float(motor.R * motor.J / (motor.Kt * motor.Kb))
     finest = float(np.min(np.asarray(given.problem.tape.sample_time)))
-    return given.averaging is None and settling < SMOOTH * finest and seems_averaged(given)
+    return given.averaging is None and time_constant < SMOOTH * finest and seems_averaged(given)
 
 
 def without_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
