@@ -76,25 +76,28 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
     these cannot be written and read; `options` of XLA.
     """
     # within compiled code there are no options but its own
-    within, alone = (
-        eqx.filter_jit(function, compiler_options=o)  # pyright: ignore[reportCallIssue]
-        for o in (None, options)
-    )
+    within = eqx.filter_jit(function)
+
+    @cache
+    def alone() -> Callable[P, T]:
+        known = _known(options)
+        return eqx.filter_jit(function, compiler_options=known)  # pyright: ignore[reportCallIssue]
+
     if "<" in function.__qualname__:
-        return alone
+        return alone()
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
             return within(*args, **kwargs)
         if programs() is None:
-            return alone(*args, **kwargs)
+            return alone()(*args, **kwargs)
         arrays, static = eqx.partition((args, kwargs), eqx.is_array)
         leaves, structure = jax.tree.flatten(arrays)
         try:
             key = _key(function, options, leaves, structure, static)
         except (pickle.PicklingError, AttributeError, TypeError):
-            return alone(*args, **kwargs)
+            return alone()(*args, **kwargs)
 
         def of_arrays(*leaves: Leaf) -> T:
             args, kwargs = eqx.combine(structure.unflatten(leaves), static)
@@ -113,6 +116,20 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
 def quickly_compiled(function: Callable[P, T]) -> Callable[P, T]:
     """`compiled` for what takes longer to compile than it ever runs."""
     return compiled(function, QUICKLY)
+
+
+def _known(options: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Those options that XLA has in this version: they come and go."""
+    return {k: v for k, v in options.items() if _is_known(k, v)} if options else None
+
+
+@cache
+def _is_known(option: str, value: bool | int) -> bool:
+    try:
+        jax.jit(jnp.negative).lower(0.0).compile({option: value})
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def make_room() -> None:
@@ -190,7 +207,7 @@ def _made(
     flat.__name__ = f"program_{key}"
     lowered = jax.jit(flat).lower(*leaves)
     found = _found_by_jax()  # what it finds for the small steps of a trace does not count
-    run = lowered.compile(options)
+    run = lowered.compile(_known(options))
     structure, others = returned
     if _found_by_jax() == found:  # what JAX had kept cannot be taken apart again
         try:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+from importlib.metadata import version
 
-# Most of the tests' time is compilation, and this takes a quarter of it away; see pmdc_jax/compiled.py.
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
+# Most of the tests' time is compilation, and this takes a quarter of it away; see pmdc_jax/compiled.py. Later versions
+# do not have it, and end the process where they find it.
+if version("jaxlib").startswith("0.10."):
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false"
 
 # First, so that the change to jaxtyping below is seen by nobody but the package under test.
 import diffrax  # noqa: F401

@@ -139,3 +139,11 @@ def test_where_a_system_does_not_say_nothing_is_done(tmp_path, monkeypatch):
     monkeypatch.setattr(compiled, "MAPS", tmp_path / "none")
     monkeypatch.setattr(jax, "clear_caches", lambda: pytest.fail("cleared"))
     compiled.make_room()
+
+
+def test_what_this_version_of_xla_does_not_know_is_left_out(x64, monkeypatch, tmp_path):
+    """JAX 0.11 came without an option of 0.10, and refuses to compile with it."""
+    calls = compiled.compiled(scaled_roots, {"xla_of_some_other_version": True})
+    for folder in ("", str(tmp_path)):
+        monkeypatch.setenv(PROGRAMS, folder)
+        assert np.asarray(calls(MATRIX, 1).values) == pytest.approx([1.0, 3.0])

@@ -27,8 +27,13 @@ TO_POWERS = np.linalg.inv(np.vander(SHARES, increasing=True))
 
 def computed_once(values: T, always: Bool[Array, ""]) -> T:
     """The same values, behind a branch that is always taken: XLA, which would compute them anew for each of all that
-    depends on them, computes them once. A play of teeth is simulated in half the time."""
-    return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
+    depends on them, computes them once. A play of teeth is simulated in half the time. An accelerator, which would
+    have to ask the processor what to do, computes them anew."""
+
+    def behind_a_branch(values: T) -> T:
+        return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
+
+    return jax.lax.platform_dependent(values, cpu=behind_a_branch, default=lambda v: v)
 
 
 def contact_response(
