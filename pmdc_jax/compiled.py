@@ -124,7 +124,7 @@ def _known(options: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 @cache
-def _is_known(option: str, value: bool | int) -> bool:
+def _is_known(option: str, value: Any) -> bool:
     try:
         jax.jit(jnp.negative).lower(0.0).compile({option: value})
     except jax.errors.JaxRuntimeError:
