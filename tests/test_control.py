@@ -109,7 +109,9 @@ def test_the_fastest_settling_brakes_in_time():
     target, volts = 20.0, 400.0
     R, L, Kb, Kt, J, f = PAPER.values()
     A, B = np.array([[-R / L, -Kb / L], [Kt / J, -f / J]]), np.array([1 / L, 0.0])
-    values, vectors = np.linalg.eig(A)
+    values, vectors = (
+        part.real for part in np.linalg.eig(A)
+    )  # both are real, also where NumPy's type is not
 
     def speeds(x, volts, times):
         rest = np.linalg.solve(A, -B * volts)
