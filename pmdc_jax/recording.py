@@ -41,6 +41,30 @@ class Finding:
     mend: str
 
 
+class Averaging(NamedTuple):
+    """Of what a recorded speed is the mean, as a difference of angles is: how much of it is that over the last sample,
+    and how much that over the next."""
+
+    last: float
+    next: float
+
+    def known_of(self, speed: np.ndarray) -> np.ndarray:
+        """Such a speed, NaN where samples would be averaged in which nothing was recorded."""
+        known = speed.copy()
+        known[: 1 if self.last else 0] = np.nan
+        known[len(known) - 1 if self.next else len(known) :] = np.nan
+        return known
+
+    def of(self, speed: np.ndarray) -> np.ndarray:
+        """What is recorded of a speed, (samples, ...), that goes straight from sample to sample."""
+        means = (speed[:-1] + speed[1:]) / 2
+        last, coming = np.concatenate([speed[:1], means]), np.concatenate([means, speed[-1:]])
+        return (1 - self.last - self.next) * speed + self.last * last + self.next * coming
+
+
+OVER_LAST, OVER_BOTH = Averaging(1.0, 0.0), Averaging(0.5, 0.5)
+
+
 def _samples(values: ArrayLike) -> np.ndarray:
     return np.asarray(values, dtype=float)
 
@@ -57,7 +81,8 @@ class Recording:
     and, None where not recorded, of the same shape: `voltage` V, `current` A, `speed` rad/s, `load`
     N m, `angle` rad, `temperature` degrees C, `torque` N m. `held`, whether the rotor was locked;
     `source`, the file; `ignored`, headers not used; `notes`, what was assumed while reading; `uneven`, the record
-    that this one lays on an even clock, None where it is a record itself.
+    that this one lays on an even clock, None where it is a record itself; `averaging`, of what the speed is the mean,
+    None where it is that of the moment.
 
     **Raises**: `InputError` where nothing drives the motor, or the arrays are no record of it.
     """
@@ -76,6 +101,7 @@ class Recording:
     ignored: tuple[str, ...] = field(default=(), kw_only=True)
     notes: tuple[Finding, ...] = field(default=(), kw_only=True)
     uneven: Recording | None = field(default=None, kw_only=True)
+    averaging: Averaging | None = field(default=None, kw_only=True)
 
     def __attrs_post_init__(self) -> None:
         # what was laid on an even clock was a sound record before

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from pmdc_jax.check import check
 from pmdc_jax.plausibility import speed_of
 from pmdc_jax.recording import Recording
-from pmdc_jax.simulate.uniform import speed_by_spline
+from pmdc_jax.simulate import uniform
 
 EXCITATIONS = ("steps", "prbs", "staircase", "triangle", "load_cycles", "spin_up")
 
@@ -202,7 +202,7 @@ def test_a_wrapped_angle_is_noted_and_goes_on(step):
     times = int(step * (len(run) - 1) / (2 * np.pi))
     assert found.severity == "note"
     assert f"starts again after each turn, {times} time" in found.what
-    for speed in (speed_by_spline(run.angle, run.time), speed_of(run)):
+    for speed in (uniform(run).speed[1:], speed_of(run)):
         np.testing.assert_allclose(speed, step / run.sample_time)
 
 

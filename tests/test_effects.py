@@ -14,13 +14,13 @@ import numpy as np
 import pint
 import pytest
 from attrs import evolve
-from scipy.integrate import solve_ivp
+from scipy.integrate import cumulative_trapezoid, solve_ivp
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.recording import Recording
+from pmdc_jax.recording import OVER_BOTH, OVER_LAST, Averaging, Recording
 from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape, free_run, sensitivities, squared_errors
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
@@ -292,6 +292,11 @@ def recordings(step: float = 1e-3, **changes) -> list[Recording]:
 RUNS = recordings()
 
 
+def averaged(runs: list[Recording], *means: Averaging | None) -> list[Recording]:
+    """The runs with speeds that are such means."""
+    return [evolve(run, averaging=mean) for run, mean in zip(runs, means, strict=True)]
+
+
 def simulated(motor: Motor, runs: list[Recording]) -> list[np.ndarray]:
     """Current and speed of every run, (samples, 2)."""
     tape = Tape.from_recordings(runs)
@@ -417,6 +422,47 @@ def test_agrees_with_an_independent_integrator(x64, name):
     found = relative_errors(simulated(with_effect(name), RUNS), expected)
     assert plain[1] > CASES[name].shows, "the effect hardly shows, so this test would prove nothing"
     assert found[0] < CASES[name].tolerance, found
+
+
+FINE = 50
+
+
+def mean_reference(name: str, run: Recording) -> np.ndarray:
+    """The speed of a run as the difference of angles that it is, these by the trapezoidal rule over fine samples."""
+    step = run.sample_time / FINE
+    finely = {c: np.repeat(getattr(run, c), FINE) for c in ("voltage", "load", "current", "speed")}
+    speed = reference(name, Recording("fine", step * np.arange(FINE * len(run)), **finely))[:, 1]
+    angle = cumulative_trapezoid(speed, dx=step, initial=0.0)[::FINE]
+    last = np.diff(angle) / run.sample_time
+    both = (last[:-1] + last[1:]) / 2
+    return (
+        np.append(np.nan, last)
+        if run.averaging == OVER_LAST
+        else np.pad(both, 1, constant_values=np.nan)
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        n
+        if n in QUICK | {"speed_sensor_delay", "constant_load"}
+        else pytest.param(n, marks=pytest.mark.slow)
+        for n in EFFECTS
+    ],
+)
+def test_mean_speeds_agree_with_an_independent_integrator(x64, name):
+    """As counters report them, over the last sample or two; at 2 ms, in which the voltage bends the motion."""
+    runs = averaged(recordings(2e-3), OVER_LAST, OVER_BOTH, OVER_LAST)
+    expected = np.concatenate([mean_reference(name, run) for run in runs])
+    found, sampled = (
+        np.concatenate(simulated(with_effect(name), of))[:, 1] for of in (runs, recordings(2e-3))
+    )
+    known, size = ~np.isnan(expected), np.nanmax(np.abs(expected))
+    assert np.abs(sampled - expected)[known].max() > 0.02 * size, "a mean like any sample"
+    # where something switches, the mean is mended along straight lines
+    worst = max(5 * CASES[name].tolerance, 2e-3 if name == "gear_backlash" else 0.0)
+    assert np.abs(found - expected)[known].max() < worst * size
 
 
 @pytest.mark.parametrize("name, most", [("cogging_torque", 0.1), ("torque_ripple", 3.0)])
@@ -569,13 +615,14 @@ def test_without_amplitude_it_is_the_linear_motor(x64, name):
 
 @each_simulated
 def test_sensitivities_are_central_differences(x64, name):
-    """By every parameter of motor and effect, and each run's own start and load offset."""
+    """By every parameter of motor and effect, and each run's own start and load offset; of speeds as they are and as
+    means."""
     bounds = {n: (x / 2, x * 2) for n, x in PAPER.items()}
     parameters = Parameters.of(bounds, [EFFECTS[name]])
     truth = PAPER | {f"{name}.{n}": x for n, x in CASES[name].values.items()}
     scales = zip(parameters.names, parameters.logarithmic, strict=True)
     at = np.array([np.log(truth[n]) if log else truth[n] for n, log in scales])
-    tape = Tape.from_recordings(RUNS)
+    tape = Tape.from_recordings(averaged(RUNS, OVER_LAST, None, OVER_BOTH))
     own = np.column_stack([tape.initial, np.full((tape.runs, 3), [0.01, 0.2, 0.02])])
     # away from zero, where a dry element has no derivative
     own[2:, :2] = 1.0, 5.0
@@ -608,7 +655,7 @@ def test_sensitivities_are_central_differences(x64, name):
 def test_the_search_sees_what_the_free_run_sees(x64, name):
     """Sums of squared errors of a population are those of its members; the search rounds delays to samples."""
     motor = with_effect(name, CASES[name].values | ({"delay_s": 3e-3} if "delay" in name else {}))
-    tape = Tape.from_recordings(RUNS)
+    tape = Tape.from_recordings(averaged(RUNS, OVER_LAST, None, OVER_LAST))
     seen = free_run(motor, tape)
     expected = (((seen - tape.measured) ** 2) * tape.weight).sum((0, 2))
     found = squared_errors(jax.tree.map(lambda x: np.full(2, x), motor), tape)

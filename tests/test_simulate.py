@@ -22,7 +22,7 @@ from benchmarks import virtual_bench as vb
 from pmdc_jax.clock import is_even
 from pmdc_jax.effects import CoulombFriction, ResistanceHeating
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.recording import Recording
+from pmdc_jax.recording import OVER_LAST, Recording
 from pmdc_jax.recording_file import write_recording
 from pmdc_jax.simulate import (
     RunUnknowns,
@@ -447,19 +447,23 @@ def test_uneven_runs_of_one_clock_share_a_grid():
 
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_speed_from_angle(wrapped):
+    """On an even clock the mean speed over every sample, on another one that of the moment."""
     time = 1e-3 * np.arange(400)
-    angle, speed = 30 * time + np.sin(20 * time), 30 + 20 * np.cos(20 * time)
-    measured = angle % (2 * np.pi) if wrapped else angle
-    even = uniform(Recording("r", time, np.ones(400), angle=measured))
-    np.testing.assert_allclose(even.speed, speed, atol=1e-6 * np.abs(speed).max())
+    stamps = time + 2e-4 * np.sin(np.arange(400))
 
+    def angle(t):
+        return 30 * t + np.sin(20 * t)
 
-def test_speed_from_an_angle_sampled_slowly_lags_no_more_than_a_speed():
-    """Sixteen samples a period: a difference over two samples would lose 2.5 % of the amplitude."""
-    time = np.arange(400) / 16
-    angle, speed = np.sin(2 * np.pi * time), 2 * np.pi * np.cos(2 * np.pi * time)
-    even = uniform(Recording("r", time, np.ones(400), angle=angle))
-    np.testing.assert_allclose(even.speed[8:-8], speed[8:-8], atol=2e-3 * np.abs(speed).max())
+    def measured(t):
+        return angle(t) % (2 * np.pi) if wrapped else angle(t)
+
+    even = uniform(Recording("r", time, np.ones(400), angle=measured(time)))
+    assert even.averaging == OVER_LAST and np.isnan(even.speed[0])
+    np.testing.assert_allclose(even.speed[1:], np.diff(angle(time)) / 1e-3, rtol=1e-9)
+    uneven = uniform(Recording("r", stamps, np.ones(400), angle=measured(stamps))).recorded
+    assert uneven.averaging is None
+    speed = 30 + 20 * np.cos(20 * stamps)
+    np.testing.assert_allclose(uneven.speed[2:-2], speed[2:-2], rtol=1e-4)
 
 
 def test_missing_angles_are_missing_speeds():

@@ -11,9 +11,9 @@ from scipy.interpolate import CubicSpline
 from benchmarks.naming.plant import Plant, simulate
 from benchmarks.virtual_bench import prbs, staircase
 from pmdc_jax import diagnose, identify
-from pmdc_jax.identify.corrections.speed_averaging import LAST, TWO, counted_over, differenced_over
+from pmdc_jax.identify.corrections.speed_averaging import counted_over, differenced_over
 from pmdc_jax.identify.noise import quantum
-from pmdc_jax.recording import Recording
+from pmdc_jax.recording import OVER_BOTH, OVER_LAST, Recording
 
 # a motor that speeds up within a few samples
 QUICK = {"R": 0.5, "L": 0.001, "Kb": 0.05, "Kt": 0.05, "J": 5e-5, "f": 1e-4}
@@ -48,11 +48,11 @@ def recorded(kind: str) -> list[Recording]:
 
 
 OVER = {
-    "counts of two samples": TWO.over,
-    "counts of the last sample": LAST.over,
+    "counts of two samples": "the last and the next sample",
+    "counts of the last sample": "the last sample",
     "tachometer": None,
     "rounded": None,
-    "angle alone": None,  # the derivative of a spline has no noise at the highest frequency either
+    "angle alone": None,  # whose differences nobody has to be told of
 }
 
 
@@ -66,7 +66,6 @@ def test_a_mean_is_taken_for_what_it_is(kind):
     found = identify(recorded(kind), tie=[("Kt", "Kb")])
     means = [m for m in found.messages if "is a mean over" in m]
     assert [f"over {OVER[kind]}," in m for m in means] == [True] * (OVER[kind] is not None)
-    assert not [m for m in found.messages if "may be a mean" in m]
     for name in ("R", "L", "Kb", "J"):
         estimate = found.parameters[name]
         assert abs(estimate.value - QUICK[name]) < max(3.5 * estimate.stderr, 2e-3 * QUICK[name])
@@ -86,13 +85,17 @@ def of_a_toy() -> list[Recording]:
     return runs
 
 
-def test_counts_of_a_motor_that_settles_within_a_sample_are_doubted():
+def test_counts_of_a_motor_that_settles_within_a_sample_are_means():
+    """Taken for speeds of the moment they make R half as large again."""
     found = identify(of_a_toy(), unloaded=True, tie=[("Kt", "Kb")])
-    assert [m for m in found.messages if "may be a mean" in m]
+    assert [m for m in found.messages if "is a mean over the last sample" in m]
+    for name, truth in {"R": 1.2, "Kb": 1.8e-3, "J": 3e-8}.items():
+        estimate = found.parameters[name]
+        assert abs(estimate.value - truth) < 3.5 * estimate.stderr < 0.15 * truth
 
 
 @pytest.mark.slow
-def test_nothing_is_late_where_a_speed_may_be_a_mean():
+def test_nothing_is_late_where_a_speed_is_a_mean():
     """The half of a sample by which such a mean is late was named a delay of the sensor."""
     found = diagnose(of_a_toy(), unloaded=True, tie=[("Kt", "Kb")])
     assert found.verdict == "none_detected"
@@ -113,20 +116,20 @@ def test_counts_show_by_their_noise_what_they_are_the_mean_of():
     rng = np.random.default_rng(3)
     speed = 300 * ndimage.gaussian_filter1d(rng.standard_normal(12000), 20.0)
     counts = np.floor(np.cumsum(speed))
-    assert counted_over([np.diff(counts)]) == (LAST, -np.inf)
+    assert counted_over([np.diff(counts)]) == (OVER_LAST, -np.inf)
     mean, enough = counted_over([counts[2:] - counts[:-2]])
-    assert mean is TWO and enough < 0
+    assert mean == OVER_BOTH and enough < 0
     assert counted_over([np.round(speed)])[0] is None
     # noise may be as strong, but is so at all frequencies: the motion itself must tell
     mean, enough = counted_over([np.round(speed + NOISE * rng.standard_normal(12000))])
-    assert mean is LAST and np.isfinite(enough)
+    assert mean == OVER_LAST and np.isfinite(enough)
 
 
 def test_only_differences_over_two_samples_have_nothing_at_the_highest_frequency():
     rng = np.random.default_rng(4)
     speed = 300 * ndimage.gaussian_filter1d(rng.standard_normal(4000), 2.0)
     angle = np.cumsum(speed) + rng.standard_normal(4000)
-    assert differenced_over([angle[2:] - angle[:-2]])[0] is TWO
+    assert differenced_over([angle[2:] - angle[:-2]])[0] == OVER_BOTH
     for other in (np.diff(angle), speed + rng.standard_normal(4000), np.repeat(speed[::20], 20)):
         assert differenced_over([other])[0] is None
     assert differenced_over([])[0] is None
@@ -141,26 +144,6 @@ def test_counts_of_no_whole_number_of_lines_may_be_late_for_any_reason():
     runs = recorded("counts of the last sample")
     stretched = [attrs.evolve(r, speed=1.0001 * r.speed) for r in runs]
     assert not any("mean over" in m for m in identify(stretched).messages)
-
-
-def test_undoing_a_mean_over_two_gives_any_signal_back():
-    signal = np.random.default_rng(0).standard_normal(50)
-    mean = signal.copy()
-    mean[1:-1] = (signal[:-2] + 4 * signal[1:-1] + signal[2:]) / 6
-    np.testing.assert_allclose(TWO.of(signal), mean, rtol=1e-12)
-    np.testing.assert_allclose(TWO.undone(mean), signal, rtol=1e-12)
-
-
-@pytest.mark.parametrize("sensed", [TWO, LAST])
-def test_undoing_a_mean_gives_a_smooth_signal_back(sensed):
-    """But for the ends, to third order: of a tenth of a radian a sample, less than a thousandth of its curvature."""
-    signal = np.sin(0.1 * np.arange(200))
-    middle = slice(10, -10)
-    np.testing.assert_allclose(sensed.undone(sensed.of(signal))[middle], signal[middle], atol=1e-5)
-    angle = -np.cos(0.1 * np.arange(-1, 201)) / 0.1
-    mean = {TWO: (angle[2:] - angle[:-2]) / 2, LAST: angle[1:-1] - angle[:-2]}[sensed]
-    np.testing.assert_allclose(sensed.of(signal)[middle], mean[middle], atol=1e-5)
-    np.testing.assert_allclose(sensed.undone(mean)[middle], signal[middle], atol=1e-5)
 
 
 def test_steps_of_counts_over_a_time_are_steps():
@@ -180,8 +163,8 @@ def test_steps_of_printed_counts_are_known_to_more_digits_than_one_has():
 
 
 @pytest.mark.parametrize("known_by", ["angle", "difference"])
-def test_a_spline_is_mended_where_steps_bend_the_motion(known_by):
-    """Exact angles by the matrix exponential, sampled slowly: the spline alone is off by 0.27 rad/s and more."""
+def test_differences_of_angles_are_as_exact_where_steps_bend_the_motion(known_by):
+    """Exact angles by the matrix exponential, sampled slowly: a spline is off by 0.27 rad/s and more."""
     plant, step = QUICK | {"L": 3e-4}, 2e-3
     rng = np.random.default_rng(11)
     voltage = np.repeat(rng.uniform(-12, 12, 60), 25)
@@ -199,7 +182,7 @@ def test_a_spline_is_mended_where_steps_bend_the_motion(known_by):
     measured = current + 0.02 * rng.standard_normal(len(current))
     run = Recording("steps", time, voltage, measured, load=0 * time, **motion)
     found = identify([run], tie=[("Kt", "Kb")])
-    assert found.fit["steps"].speed_rmse < 0.05
+    assert found.fit["steps"].speed_rmse < 1e-3
     for name in ("R", "L", "Kb", "J"):
         assert found.parameters[name].value == pytest.approx(plant[name], rel=2e-3)
 

@@ -16,6 +16,7 @@ from ..identify.generalised_least_squares import residuals_of, series_of
 from ..identify.noise import resolution_noise, white_noise
 from ..identify.noise_model import Series
 from ..motor import Drive, Motor
+from ..recording import OVER_LAST
 from .model import Model
 
 # Fewer samples of a run tell nothing
@@ -71,6 +72,8 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     if pairs.sum() < ENOUGH:
         return None
     kept, before, after, volt = _step(model.motor, drive, tape.sample_time_of(run))
+    if given.runs[run].averaging == OVER_LAST:  # the mean over that very step
+        before, after = 0.0, before + after
     i, w = left.T
     rest = i[1:] - kept * i[:-1] - before * w[:-1] - after * w[1:]
     mean, change = (simulated[1:] + simulated[:-1]) / 2, np.diff(simulated[:, :1], axis=0)

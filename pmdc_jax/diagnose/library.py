@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from ..compiled import quickly_compiled
 from ..effects import EFFECTS, AbstractEffect
-from ..identify.corrections.speed_averaging import may_be_averaged
 from ..identify.noise import is_coarse, quantum, resolution
 from ..motor import Motor
 from ..recording import Recording
@@ -90,13 +89,7 @@ class Library:
         tape = base.given.problem.tape
         measured = bool(np.any(np.asarray(tape.weight)[base.given.problem.fitted_blocks, 0]))
         known = measured or bool(np.any(np.asarray(tape.drive.current) > 0))
-        # a mean over the last sample is late, too
-        averaged = may_be_averaged(base.given, base.motor)
-        told = {
-            name
-            for name, effect in EFFECTS.items()
-            if (known or not effect.needs_current) and not (averaged and effect.reports_late)
-        }
+        told = {name for name, effect in EFFECTS.items() if known or not effect.needs_current}
         self.candidates = [c for c in candidates(self.scales) if c.effect in told]
         # errors that last look like a voltage that changes in time
         self.coarse = any(is_coarse(speed) for speed in _counted(base.given.training))
@@ -183,7 +176,7 @@ def _small(
     def change(values: Mapping[str, Float[Array | np.ndarray, ""]]) -> tuple[Outputs, Outputs]:
         motor = bare.with_effects([effect(**values)])
         if effect.equation == "sensor":
-            seen = sensed(motor, tape, path)
+            seen = sensed(motor, bare, tape, path)
             return jnp.zeros_like(seen), seen
         kicked = kicks(motor, bare, tape, path)
         return kicked, jnp.zeros_like(kicked)

@@ -20,8 +20,8 @@ from ..effects.base import Scalars
 from ..motor import Motor
 from ..simulate import Tape
 from ..simulate.propagator import Propagator, along_grids, pick_grid, steps_in_sample
-from ..simulate.shooting import outputs, reported
-from ..simulate.solver import Input, held_step
+from ..simulate.sensing import outputs, reported
+from ..simulate.solver import Input, held_step, held_step_and_mean
 
 Signal = Float[Array, "samples blocks"]
 Outputs = Float[Array, "samples 2 blocks"]
@@ -69,13 +69,21 @@ def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
 
 
 @compiled
-def sensed(motor: Motor, tape: Tape, path: Path) -> Outputs:
-    """By how much the sensors of `motor` report something else than the path."""
+def sensed(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
+    """By how much the sensors of `motor` report something else of the path than those of `bare`."""
+    return _seen_on(motor, tape, path) - _seen_on(bare, tape, path)
+
+
+@compiled  # one trace of the bare motor serves all effects
+def _seen_on(motor: Motor, tape: Tape, path: Path) -> Outputs:
+    """What the motor's sensors report of the path."""
     along, acting = _of_blocks(motor, tape)
     state, steps = _states(motor, tape, path), steps_in_sample(motor, tape)
-    seen = outputs(motor, along, acting, state, steps)
-    late = reported(motor, tape, seen.transpose(2, 0, 1))
-    return late.transpose(2, 1, 0) - jnp.stack([path.current, path.speed], 1)
+    mean = None
+    if along.mean is not None:
+        _, mean = held_step_and_mean(motor, along, acting, state, steps)
+    seen = outputs(motor, along, acting, state, steps, mean)
+    return reported(motor, tape, seen.transpose(2, 0, 1)).transpose(2, 1, 0)
 
 
 @compiled
@@ -101,6 +109,7 @@ def respond(
     """
     along, _ = _of_blocks(motor, tape)
     whole = along.whole[:, :, 0]
+    stuck = path.held.astype(kicks.dtype)
 
     def step(
         x: Columns,
@@ -111,7 +120,6 @@ def respond(
         # a rotor that sticks forgets
         return after.at[1].multiply(1.0 - held[:, None]), x
 
-    stuck = path.held.astype(kicks.dtype)
     zero = jnp.zeros(kicks.shape[1:])
     end, driven = jax.lax.scan(step, zero, (kicks, stuck))
     basis = jnp.broadcast_to(jnp.eye(2)[:, None, :], (2, kicks.shape[2], 2))
@@ -127,7 +135,19 @@ def respond(
 
     blocks = (jnp.asarray(tape.begins), through.transpose(1, 0, 2), end.transpose(1, 0, 2))
     starts = jax.lax.scan(follow, jnp.zeros((2, kicks.shape[3])), blocks)[1]
-    return driven + jnp.einsum("sibj,bjc->sibc", free, starts)
+    response = driven + jnp.einsum("sibj,bjc->sibc", free, starts)
+    if along.mean is None:
+        return response
+    # what kicks comes evenly over the sample
+    mean = jnp.einsum("jsb,sjbc->sbc", along.mean.whole[1], response) + kicks[:, 1] / 2
+    moving = mean * (1.0 - stuck[:, :, None])
+    seen = jnp.concatenate([response, moving[:, None]], 1)
+    as_reported = jax.vmap(
+        lambda column: reported(motor, tape, column.transpose(2, 1, 0)).transpose(2, 1, 0),
+        in_axes=-1,
+        out_axes=-1,
+    )
+    return as_reported(seen)
 
 
 def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Input]:

@@ -90,8 +90,6 @@ class AbstractEffect(eqx.Module):
     variable: ClassVar[Literal["speed", "current", "voltage", "angle"] | None] = None
     # its size is in amperes, and says something only where the current was measured
     needs_current: ClassVar[bool] = False
-    # it makes the reported speed late
-    reports_late: ClassVar[bool] = False
     # which state a dry element holds at zero
     holds: ClassVar[Literal["speed", "current"] | None] = None
     # the state by which its teeth come to touch and part

@@ -23,7 +23,6 @@ class SpeedSensorLag(AbstractEffect):
     formula: ClassVar = "dy/dt = (w - y) / tau"
     equation: ClassVar = "sensor"
     states: ClassVar = ("reported_speed",)
-    reports_late: ClassVar = True
     affine: ClassVar = True
     ranges: ClassVar = {"time_constant_s": ParameterRange("s", 1e-6, 10.0)}
 
@@ -58,7 +57,6 @@ class SpeedSensorDelay(AbstractEffect):
     label: ClassVar = "Delay of the speed sensor"
     formula: ClassVar = "y(t) = w(t - delay)"
     equation: ClassVar = "sensor"
-    reports_late: ClassVar = True
     affine: ClassVar = True
     ranges: ClassVar = {"delay_s": ParameterRange("s", 1e-6, 1.0)}
 

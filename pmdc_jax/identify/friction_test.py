@@ -95,7 +95,10 @@ def _rows(given: Prepared, fit: Fit) -> list[Series]:
     for run, residual in zip(training_runs(given), residuals_of(given, fit), strict=True):
         speed = np.asarray(fit.evaluation.seen)[tape.blocks_of(run), 1].ravel()
         _, outputs = residual.kind
-        friction = _response(filters[tape.grid_of(run)], np.sign(speed))[:, list(outputs)]
+        friction = _response(filters[tape.grid_of(run)], np.sign(speed))
+        if (averaging := given.runs[run].averaging) is not None:
+            friction[:, 1] = averaging.of(friction[:, 1])
+        friction = friction[:, list(outputs)]
         derivatives = series_of(tape, run, J).values
         columns = (derivatives[..., :count], friction, derivatives[..., count:], residual.values)
         sized = [c if c.ndim == 3 else c[..., None] for c in columns]

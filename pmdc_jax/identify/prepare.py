@@ -17,7 +17,7 @@ from ..clock import evenly_stamped
 from ..effects import AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS
-from ..recording import OUTPUTS_TOO, Finding, Recording
+from ..recording import OUTPUTS_TOO, Averaging, Finding, Recording
 from ..recording_file import Runs, recordings_of
 from ..simulate import Tape, uniform
 from ..unmeasured import without_unmeasured
@@ -29,7 +29,6 @@ from .problem import Problem
 
 if TYPE_CHECKING:
     from .corrections.input_timing import Timing
-    from .corrections.speed_averaging import Averaging
 
 
 class Prepared(NamedTuple):
@@ -42,12 +41,12 @@ class Prepared(NamedTuple):
     known: Mapping[str, float]
     ties: tuple[tuple[str, str], ...]
     problem: Problem
-    # which runs have a speed by a spline through their angles
+    # which runs have a speed by their angles
     differentiated: tuple[bool, ...] = ()
     # what was corrected of the records; see `corrections`
     # ... by run: standard deviation of what was taken out of the record of its drive, for the motor did not feel it
     input_noise: Mapping[str, float] = MappingProxyType({})
-    # ... what the speeds were means of
+    # ... of what the speeds are means
     averaging: Averaging | None = None
     # ... when the voltages act, if not from their sample to the next
     timing: Timing | None = None

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..motor import PARAMETERS, Motor
-from ..recording import Recording
+from ..recording import OVER_BOTH, OVER_LAST, Recording
 from ..simulate import RunUnknowns, Tape
 from ..threads import side_by_side
-from .corrections.speed_averaging import may_be_averaged
 from .identifiability import SHARE, explain
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import white_noise
@@ -30,6 +29,8 @@ TIE_ITERATIONS = 3
 MISSED = 2.0
 # Of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
+# Over what a speed may be a mean
+MEANS = {OVER_LAST: "the last sample", OVER_BOTH: "the last and the next sample"}
 # A parameter is unseen alone if so much of it is unseen at all
 ALONE = 0.99
 # ... and large enough to show if it changes the outputs by this share of what the strongest one does
@@ -67,7 +68,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
         findings=given.findings,
         covariance=covariance,
         covariance_names=names,
-        messages=_messages(given, solved, motor, chosen is not polished),
+        messages=_messages(given, solved, chosen is not polished),
         missed=_missed(fit),
     )
 
@@ -272,7 +273,7 @@ def _missed(fit: Mapping[str, RunFit]) -> dict[str, float]:
     return {name: much for name, much in times.items() if much > MISSED}
 
 
-def _messages(given: Prepared, solved: Solved, motor: Motor, tied: bool) -> tuple[str, ...]:
+def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:
     messages = [
         f"{run.name}: the {run.drive} holds {given.input_noise[run.name]:.3g} {UNITS[run.drive]} of noise that the "
         "motor did not feel: it was taken out"
@@ -284,12 +285,7 @@ def _messages(given: Prepared, solved: Solved, motor: Motor, tied: bool) -> tupl
         messages.append(f"the voltage {acts}: it is taken for that")
     if given.averaging:
         messages.append(
-            f"the speed is a mean over {given.averaging.over}, as differences of an angle are: it is taken for that"
-        )
-    if may_be_averaged(given, motor):
-        messages.append(
-            "the speed may be a mean over the last sample, as counted differences of an angle are, and the motor "
-            "settles too fast to tell: then R, L and J are wrong, and any lag or delay of the speed. Sample faster"
+            f"the speed is a mean over {MEANS[given.averaging]}, as differences of an angle are: it is taken for that"
         )
     if solved.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")

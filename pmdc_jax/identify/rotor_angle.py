@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -19,14 +21,14 @@ MEDIAN = 0.4549
 
 
 def of_rotor(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
-    """Current and speed of the rotor itself, A and rad/s, where its sensors make something else of them: a free run."""
-    effects = problem.parameters.effects
-    if all(effect.equation != "sensor" for effect in effects):
+    """Current and speed of the rotor itself, A and rad/s, where something else of them is reported: a free run."""
+    effects, tape = problem.parameters.effects, problem.tape
+    if tape.averaging is None and all(effect.equation != "sensor" for effect in effects):
         return fit.evaluation.seen
     unknowns = fit.unknowns
     motor = problem.parameters(unknowns.coordinates)
     bare = motor.with_effects(effect for effect in motor.effects if effect.equation != "sensor")
-    return free_run(bare, problem.tape, unknowns.runs)
+    return free_run(bare, replace(tape, averaging=None), unknowns.runs)
 
 
 def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:

@@ -17,11 +17,10 @@ from .bounds import effect_bounds
 from .corrections.input_noise import without_input_noise
 from .corrections.input_timing import (
     likelier_timings,
-    negative_log_likelihood_as_recorded,
+    negative_log_likelihood_within,
     with_timing,
 )
-from .corrections.speed_averaging import without_averaging
-from .corrections.spline_error import without_spline_error
+from .corrections.speed_averaging import clearly_averaged, with_averaging
 from .corrections.step_times import with_step_times
 from .corrections.uneven_sampling import on_clock
 from .identification import Search
@@ -62,7 +61,7 @@ def solve(
 
     **Returns**: the problem as `searched` leaves it, and then whatever takes out such a thing, and the fit.
     """
-    recorded = given
+    recorded = given = clearly_averaged(given)
     given, solved = _corrected(*searched(given, search, seed, progress))
     timings = likelier_timings(given, solved.fit)
     acting = [with_timing(recorded, timing) for timing in timings]
@@ -73,15 +72,14 @@ def solve(
         found.append((runs, ended._replace(fit=fit)))
     if not otherwise:
         return found[0]
-    return min(found, key=lambda ended: negative_log_likelihood_as_recorded(ended[0], ended[1].fit))
+    return min(found, key=lambda ended: negative_log_likelihood_within(ended[0], ended[1].fit))
 
 
 # Of every set of runs, in this order: what is uneven hides all else, and a mean is told by a noise that is the sensor's
 CORRECTIONS: tuple[Callable[[Prepared, Fit], tuple[Prepared, Fit]], ...] = (
     on_clock,
     without_input_noise,
-    without_averaging,
-    without_spline_error,
+    with_averaging,
 )
 
 

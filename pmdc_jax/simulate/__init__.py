@@ -44,7 +44,7 @@ def simulate(motor: Motor, recording: Run) -> Recording:
     """
     motor = jax.tree.map(jnp.asarray, motor)
     (recording,) = recordings_of(recording, to_simulate=True)
-    even = uniform(recording)
+    even = attrs.evolve(uniform(recording), averaging=None)
     tape = Tape.from_recordings([even], unloaded=True)
     outputs = free_run(motor, tape)
     seen = np.stack([tape.samples_of(0, outputs[:, c], len(even)) for c in range(2)], 1)

@@ -17,7 +17,7 @@ from ..motor import Motor
 from ..threads import CORES, side_by_side
 from .exponential import Matrix, product
 from .propagator import Propagator, along_grids, pick_grid, steps_in_sample
-from .solver import HeldInput, Input, Walk, held_step, walk
+from .solver import HeldInput, Input, Walk, held_step_and_mean, walk
 from .tape import BLOCK, Samples, Tape
 
 # Samples in a stride of linear motors, a power of two that divides a block: measured, 8 and 32 are slower.
@@ -64,6 +64,38 @@ def _errors(motors: Motor, tape: Tape, share: Int[Array | np.ndarray, ""], share
         # a slice that is merged into the arithmetic costs it its vector instructions
         motors = jax.tree.unflatten(jax.tree.structure(motors), jax.lax.optimization_barrier(mine))
     return _errors_with_effects(motors, tape) if motors.effects else _errors_of_linear(motors, tape)
+
+
+def _with_its_sample(tape: Tape) -> tuple[Samples, Samples, Float[Array, " blocks"] | None]:
+    """What was measured, and its weights, with every mean speed over a sample at that sample instead of the next; and
+    which blocks have such speeds, None where none has. One over two samples is in time as it is."""
+    if tape.averaging is None:
+        return tape.measured, tape.weight, None
+    over_last = jnp.where(jnp.asarray(tape.averaging)[:, 0] == 1, 1.0, 0.0)[tape.run]
+
+    # nobody recorded the mean over the last sample of a run
+    ends = jnp.append(jnp.asarray(tape.begins)[1:], True)
+
+    def moved(signal: Samples) -> Float[Array, "blocks 2 samples"]:
+        signal = jnp.asarray(signal)
+        speed = signal[:, 1].reshape(-1)
+        sooner = jnp.append(speed[1:], 0.0).reshape(signal[:, 1].shape)
+        sooner = sooner.at[:, -1].multiply(jnp.where(ends, 0.0, 1.0))
+        return signal.at[:, 1].set(jnp.where(over_last[:, None] > 0, sooner, signal[:, 1]))
+
+    return moved(tape.measured), moved(tape.weight), over_last
+
+
+def _seen_speed(
+    speed: Scalars,
+    mean: Scalars | None,
+    over_last: Float[Array, " blocks"] | None,
+    block: Int[Array, ""],
+) -> Scalars:
+    """The speed of a sample, or the mean over it, as the block reports it."""
+    if mean is None or over_last is None:
+        return speed
+    return speed + over_last[block] * (mean - speed)
 
 
 # Where motors are, and their squared errors of current and speed so far
@@ -117,12 +149,13 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
     """
     grids = along_grids(motors, tape)
     strides, rows = jax.vmap(_stride)(grids), BLOCK // STRIDE
+    measured, weights, over_last = _with_its_sample(tape)
 
     def advance(carry: Walk, block: Int[Array, ""]) -> Walk:
         grid = jnp.asarray(tape.grid)[block]
         _, drive = pick_grid(grids, tape, grid)
         along = jax.tree.map(lambda leaf: _repeated(_taken(leaf, grid), rows), grids)
-        samples = (tape.value[block], tape.load[block], tape.measured[block], tape.weight[block])
+        samples = (tape.value[block], tape.load[block], measured[block], weights[block])
         initial = motors.initial_state(*tape.initial[tape.run[block]])
         begins = tape.begins[block]
         state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
@@ -142,11 +175,12 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
         ) -> tuple[Gathered, None]:
             state, errors = carry
             value, load, measured, weight = samples
-            seen = (state.current, state.speed)
+            after, mean = held_step_and_mean(motors, along, Input(drive, value, load), state)
+            seen = (state.current, _seen_speed(state.speed, mean and mean.speed, over_last, block))
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
-            return (held_step(motors, along, Input(drive, value, load), state), errors), None
+            return (after, errors), None
 
         (_, errors), _ = jax.lax.scan(sample, (starts, carry.seen), by_sample, unroll=STRIDE)
         return Walk(end, errors)
@@ -182,7 +216,8 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
     """One share of motors with effects, from sample to sample."""
     grids, steps = along_grids(motors, tape), steps_in_sample(motors, tape)
     delay = motors.speed_delay()
-    speeds, weights = (jnp.asarray(x)[:, 1].reshape(-1) for x in (tape.measured, tape.weight))
+    measured, weights, over_last = _with_its_sample(tape)
+    speeds, of_speeds = (jnp.asarray(x)[:, 1].reshape(-1) for x in (measured, weights))
     ends = BLOCK * jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs), side="right")
 
     def advance(carry: Walk, block: Int[Array, ""]) -> Walk:
@@ -205,12 +240,17 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
                 inside = late < ends[tape.run[block]]
                 late = jnp.minimum(late, len(speeds) - 1)
                 measured = (measured[0], speeds[late])
-                weight = (weight[0], jnp.where(inside, weights[late], 0.0))
-            seen = motors.sensors(state)
+                weight = (weight[0], jnp.where(inside, of_speeds[late], 0.0))
+            acting = Input(drive, value, load)
+            after, mean = held_step_and_mean(motors, along, acting, state, steps)
+            current, speed = motors.sensors(state)
+            seen = (
+                current,
+                _seen_speed(speed, mean and motors.sensors(mean)[1], over_last, block),
+            )
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
-            after = held_step(motors, along, Input(drive, value, load), state, steps)
             return (after, errors), None
 
         run = tape.run[block]
@@ -221,8 +261,8 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
         samples = (
             tape.value[block],
             tape.load[block],
-            tape.measured[block].T,
-            tape.weight[block].T,
+            measured[block].T,
+            weights[block].T,
             block * BLOCK + jnp.arange(BLOCK),
         )
         (state, errors), _ = jax.lax.scan(sample, (state, carry.seen), samples)

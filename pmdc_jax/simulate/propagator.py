@@ -3,6 +3,7 @@ weights the rest acts, and how long a step may be."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -52,6 +53,19 @@ class Weights(NamedTuple):
     contact: Float[Array, "powers n *#batch"] | None = None
 
 
+class Mean(NamedTuple):
+    """By what the mean of a state over a step is made: all that makes its end, with phi_(k + 1) for every phi_k, and so
+    as exact. The last three of a motor whose rest changes within a step."""
+
+    whole: Matrix  # phi_1(A h)
+    inputs: Float[Array, "n 2 *#batch"]  # h phi_2(A h) B
+    push: Matrix  # h phi_2(A h)
+    ramp: Matrix | None = None  # h (phi_3 - phi_2 / 2)(A h)
+    first: Matrix | None = None  # h (phi_2 - 3 phi_3 + 4 phi_4)
+    middle: Matrix | None = None  # h (2 phi_3 - 4 phi_4)
+    last: Matrix | None = None  # h (4 phi_4 - phi_3)
+
+
 class Look(NamedTuple):
     """To where within every sample a late sensor looks."""
 
@@ -73,21 +87,25 @@ class Propagator(NamedTuple):
     # h (phi_2 - phi_1 / 2)(A h): by what a drive acts that rises within a step, beyond what its mean does
     ramp: Matrix | None = None
     look: Look | None = None  # where a sensor is late
+    mean: Mean | None = None  # where a speed is reported as a mean
 
 
 @eqx.filter_jit  # one trace serves all grids
-def propagator(motor: Motor, step: Held, drive: Drive, straight: bool = False) -> Propagator:
+def propagator(
+    motor: Motor, step: Held, drive: Drive, straight: bool = False, averaged: bool = False
+) -> Propagator:
     """Exact step of the linear part over `step` seconds, and the weights for what the effects add; of teeth that touch,
-    and beside it of such that do not. `straight` asks for what a drive needs that is not held."""
+    and beside it of such that do not. `straight` asks for what a drive needs that is not held, `averaged` for the mean
+    of the state."""
     A, B = _linear_part(motor, drive)
-    along = _by_linear_part(motor, step, A, B, straight)
+    along = _by_linear_part(motor, step, A, B, straight, averaged)
     teeth = motor.toothed
     if teeth is None:
         return along
     assert teeth.contact_state is not None
     open_teeth = motor.with_effects(e.without_contact() for e in motor.effects)
     A_apart, _ = _linear_part(open_teeth, drive)
-    apart = _by_linear_part(motor, step, A_apart, B, straight)
+    apart = _by_linear_part(motor, step, A_apart, B, straight, averaged)
     push = (A - A_apart)[:, 2 + linear_states(motor).index(teeth.contact_state)]
     apart = _with_contact_response(apart, contact_response(A, push, step))
     return _with_contact_response(along, contact_response(A_apart, push, step))._replace(
@@ -108,32 +126,50 @@ def _by_linear_part(
     A: Matrix,
     B: Float[Array, "n 2 *#batch"],
     straight: bool,
+    averaged: bool,
 ) -> Propagator:
     """The propagator of a motor whose linear part is A and B.
 
     **Source**: ETDRK4, Cox, Matthews, Journal of Computational Physics 176 (2002), equations (26)-(29),
     doi:10.1006/jcph.2002.6995.
     """
-    if motor.affine:
-        _, (phi0, phi1, *phi2) = phi_functions(A * step, 2 if straight else 1)
-        inputs = step * product(phi1, B)
-        ramp = step * (phi2[0] - phi1 / 2) if straight else None
-        weights = None
-        if motor.effects:
-            weights = Weights(step * phi1, A, step * jnp.ones_like(motor.R))
-        return Propagator(phi0, inputs, weights, ramp=ramp)
-    (half0, half1, *_), (phi0, phi1, phi2, phi3) = phi_functions(A * step, 3)
-    half_input = step / 2 * half1
-    stages = Stages(
-        half=half0,
-        half_input=half_input,
-        half_minus_one=product(half0, half_input) - half_input,
-        first=step * (phi1 - 3 * phi2 + 4 * phi3),
-        middle=step * (2 * phi2 - 4 * phi3),
-        last=step * (4 * phi3 - phi2),
-    )
-    weights = Weights(step * phi1, A, step * jnp.ones_like(motor.R), stages)
-    return Propagator(phi0, step * product(phi1, B), weights)
+    staged = not motor.affine
+    known = 3 if staged else 2 if straight else 1
+    (half0, half1, *_), phi = phi_functions(A * step, known + averaged)
+    push, ramp = step * phi[1], step * (phi[2] - phi[1] / 2) if straight and not staged else None
+    mean = _mean(step, phi, B, straight, staged) if averaged else None
+    weights = None
+    if motor.effects:
+        weights = Weights(push, A, step * jnp.ones_like(motor.R))
+    if staged:
+        half_input = step / 2 * half1
+        stages = Stages(
+            half0, half_input, product(half0, half_input) - half_input, *_rest(step, phi)
+        )
+        assert weights is not None
+        weights = weights._replace(stages=stages)
+    return Propagator(phi[0], step * product(phi[1], B), weights, ramp=ramp, mean=mean)
+
+
+def _rest(step: Held, phi: Sequence[Matrix]) -> tuple[Matrix, Matrix, Matrix]:
+    """By what the stages of ETDRK4 act: the first one, those in the middle, and the last."""
+    first = step * (phi[1] - 3 * phi[2] + 4 * phi[3])
+    return first, step * (2 * phi[2] - 4 * phi[3]), step * (4 * phi[3] - phi[2])
+
+
+def _mean(
+    step: Held,
+    phi: Sequence[Matrix],
+    B: Float[Array, "n 2 *#batch"],
+    straight: bool,
+    staged: bool,
+) -> Mean:
+    push = step * phi[2]
+    mean = Mean(phi[1], product(push, B), push)
+    if staged:
+        first, middle, last = _rest(step, phi[1:])
+        return mean._replace(first=first, middle=middle, last=last)
+    return mean._replace(ramp=step * (phi[3] - phi[2] / 2)) if straight else mean
 
 
 def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 *#batch"]]:
@@ -160,13 +196,13 @@ def along_grids(motor: Motor, tape: Tape) -> Propagator:
     def of_grid(g: int) -> Propagator:
         sample = jnp.asarray(tape.sample_time)[g]
         drive = Drive(*(jnp.asarray(share)[g] for share in tape.drive))
-        straight = tape.rise is not None
-        along = propagator(motor, sample / steps, drive, straight)
+        how = (tape.rise is not None, tape.averaging is not None)
+        along = propagator(motor, sample / steps, drive, *how)
         if delay is None:
             return along
         samples = jnp.asarray(delay / sample)
         share = 1 - (samples - jnp.floor(samples))
-        part = propagator(motor, share * sample / steps, drive, straight)
+        part = propagator(motor, share * sample / steps, drive, *how)
         return along._replace(look=Look(part, share))
 
     grids = map(of_grid, range(tape.sample_time.shape[0]))

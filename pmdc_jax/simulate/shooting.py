@@ -24,7 +24,8 @@ from ..compiled import compiled
 from ..effects.base import State
 from ..motor import Motor
 from .propagator import Propagator, along_grids, pick_grid, steps_in_sample
-from .solver import HeldInput, Input, Walk, held_step, walk
+from .sensing import outputs, reported, reports_of
+from .solver import HeldInput, Input, Walk, held_step_and_mean, walk
 from .tape import BLOCK, Tape
 
 T = TypeVar("T")
@@ -133,7 +134,7 @@ def sensitivities(
     through = jnp.einsum("sncb,bnp->scbp", by_start, d_starts)
     direct = _among_columns(jnp.moveaxis(passed.d_seen[:, : count + 1], 1, -1), count)
     d_seen = (direct + through).transpose(2, 1, 0, 3)
-    if motor.speed_delay() is None:
+    if motor.speed_delay() is None and tape.averaging is None:
         return seen.transpose(2, 1, 0), d_seen
     seen, d_seen = _along_columns(
         lambda motor, seen: reported(motor, tape, seen),
@@ -265,8 +266,9 @@ def _pass(
             motor: Motor, along: Propagator, state: State, load: Float[Array, " blocks"]
         ) -> tuple[State, Float[Array, "outputs blocks"]]:
             acting = Input(drive, value[k], load, rises)
-            after = _turned(state, held_step(motor, along, acting, state, steps), turn[k])
-            return after, outputs(motor, along, acting, state, steps)
+            after, mean = held_step_and_mean(motor, along, acting, state, steps)
+            seen = outputs(motor, along, acting, state, steps, mean)
+            return _turned(state, after, turn[k]), seen
 
         (state, seen), (d_state, d_seen) = _along_columns(
             look_and_step, (motor, along, state, load[k]), (d_motor, d_along, d_state, d_load)
@@ -280,7 +282,7 @@ def _pass(
         .set(jnp.eye(states)[:, :, None])
     )
     d_state = jax.vmap(lambda column: _unpack(motor, column))(identity)
-    reports = 2 if along.look is None else 3
+    reports = reports_of(along)
     seen = (jnp.zeros((reports, len(starts))), jnp.zeros((columns, reports, len(starts))))
     saveat = diffrax.SaveAt(
         subs=[
@@ -383,33 +385,6 @@ def _stitch_tangents(
     blocks = (jnp.asarray(tape.begins), at_begin, passed.end, by_start, starts, by_own)
     nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), at_begin)
     return jax.lax.scan(follow, nothing, blocks)[1]
-
-
-def outputs(
-    motor: Motor, along: Propagator, acting: Input, state: State, steps: int | Int[Array, ""]
-) -> Float[Array, "outputs ..."]:
-    """Reported current and speed, and for a late sensor the speed where it looks within the sample that follows."""
-    current, speed = motor.sensors(state)
-    if along.look is None:
-        return jnp.stack([current, speed])
-    part, share = along.look
-    there = held_step(motor, part, acting.part(share / 2, share), state, steps)
-    return jnp.stack([current, speed, motor.sensors(there)[1]])
-
-
-def reported(
-    motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]
-) -> Float[Array, "blocks 2 samples"]:
-    """Current and speed, the latter as late as the motor's sensor reports it; before a run began, as it began."""
-    delay = motor.speed_delay()
-    if delay is None:
-        return seen
-    speed, within = (seen[:, k].reshape(-1) for k in (1, 2))
-    step = jnp.repeat(jnp.asarray(tape.sample_time)[tape.grid], BLOCK)
-    first = jnp.repeat(jnp.searchsorted(jnp.asarray(tape.run), tape.run) * BLOCK, BLOCK)
-    at = jnp.arange(len(speed)) - 1 - jnp.floor(delay / step).astype(int)
-    late = jnp.where(at < first, speed[first], within[jnp.maximum(at, 0)])
-    return jnp.stack([seen[:, 0], late.reshape(seen[:, 0].shape)], 1)
 
 
 def _blocks_last(along: Propagator, axis: int) -> Propagator:

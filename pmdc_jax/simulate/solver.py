@@ -16,8 +16,18 @@ from jaxtyping import Array, Bool, Float, Int
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
 from .exponential import Matrix
-from .propagator import Held, Propagator, Slow, Vector, Weights, linear_states, state_of, vector
-from .switches import computed_once, contact_correction, stick_or_reverse
+from .propagator import (
+    Held,
+    Mean,
+    Propagator,
+    Slow,
+    Vector,
+    Weights,
+    linear_states,
+    state_of,
+    vector,
+)
+from .switches import computed_once, contact_correction, mended_mean, stick_or_reverse
 
 Time = float | Float[Array | np.ndarray, ""]  # of the solver: it counts steps
 
@@ -55,33 +65,72 @@ def held_step(
     they then did. A step in which a held state crosses zero, or teeth touch or part, is then mended (`switches`), so
     that friction sticks at exactly zero and a gear knocks without any smoothing.
     """
+    return held_step_and_mean(motor, along, acting, state, steps)[0]
+
+
+def held_step_and_mean(
+    motor: Motor,
+    along: Propagator,
+    acting: Input,
+    state: State,
+    steps: int | Int[Array, ""] = 1,
+) -> tuple[State, State | None]:
+    """The state one sample later as by `held_step`, and its mean over this sample, as exact but where something
+    switches within a step: None where `along` is not made for it."""
     if along.weights is None:
-        # the state last: two fused multiply-adds, where a sum of sums would take an addition more
-        driven = _times(along.inputs, (acting.value, acting.load))
-        if acting.rise is not None:
-            driven = _add(driven, _bend(motor, along, acting, state))
-        current, speed = _times(along.whole, (state.current, state.speed), driven)
-        return State(current, speed, state.extra)
+        return _linear_step(motor, along, acting, state)
     if isinstance(steps, int) and steps == 1:
         return _step(motor, along, acting, state)
 
-    def step(k: int | Int[Array, ""], now: State) -> State:
-        return _step(motor, along, acting.part((k + 0.5) / steps, 1 / steps), now)
+    def step(
+        k: int | Int[Array, ""], walked: tuple[State, State | None]
+    ) -> tuple[State, State | None]:
+        now, total = walked
+        after, mean = _step(motor, along, acting.part((k + 0.5) / steps, 1 / steps), now)
+        return after, jax.tree.map(lambda so_far, more: so_far + more / steps, total, mean)
 
-    return jax.lax.fori_loop(0, steps, step, state)
+    nothing = None if along.mean is None else jax.tree.map(lambda x: 0.0 * x, state)
+    return jax.lax.fori_loop(0, steps, step, (state, nothing))
 
 
-def _bend(motor: Motor, along: Propagator, acting: Input, state: State) -> Vector:
-    """What a drive that rises on a straight line does in a step, beyond what its mean does."""
-    assert along.ramp is not None, "a propagator for held drives"
+def _linear_step(
+    motor: Motor, along: Propagator, acting: Input, state: State
+) -> tuple[State, State | None]:
+    x, inputs = (state.current, state.speed), (acting.value, acting.load)
+    bend = None if acting.rise is None else _bend(motor, acting, state)
+
+    def reached(made_by: Propagator | Mean) -> Vector:
+        driven = _times(made_by.inputs, inputs)
+        if bend is not None:
+            driven = _add(driven, _times(_known(made_by.ramp), bend))
+        # the state last: two fused multiply-adds, where a sum of sums would take an addition more
+        return _times(made_by.whole, x, driven)
+
+    current, speed = reached(along)
+    after = State(current, speed, state.extra)
+    if along.mean is None:
+        return after, None
+    current, speed = reached(along.mean)
+    return after, State(current, speed, state.extra)
+
+
+def _bend(motor: Motor, acting: Input, state: State) -> Vector:
+    """By what the rates of a step differ between its ends, of a drive that rises on a straight line."""
     low, high = (
         vector(motor, motor.derivative(state, acting.at(end), acting.load, acting.drive))
         for end in (0.0, 1.0)
     )
-    return _times(along.ramp, tuple(b - a for a, b in zip(low, high, strict=True)))
+    return tuple(b - a for a, b in zip(low, high, strict=True))
 
 
-def _step(motor: Motor, along: Propagator, acting: Input, state: State) -> State:
+def _known(matrix: Matrix | None) -> Matrix:
+    assert matrix is not None, "a propagator made for less"
+    return matrix
+
+
+def _step(
+    motor: Motor, along: Propagator, acting: Input, state: State
+) -> tuple[State, State | None]:
     teeth = motor.toothed
     if teeth is not None:
         touching = teeth.teeth(state).touch
@@ -93,7 +142,7 @@ def _step(motor: Motor, along: Propagator, acting: Input, state: State) -> State
     weights = along.weights
     assert weights is not None
     motor = motor.with_effects(e.averaged_over_step(state, weights.step) for e in motor.effects)
-    rate, after = _unswitched(motor, along, weights, acting, state)
+    rate, after, mean = _unswitched(motor, along, weights, acting, state)
     x, begun, moved = vector(motor, state), vector(motor, rate), vector(motor, after)
     slow = _slow(motor, after)
     if teeth is not None and weights.contact is not None:
@@ -116,14 +165,18 @@ def _step(motor: Motor, along: Propagator, acting: Input, state: State) -> State
                     lambda grips, before, after, *_: after,
                     *((hold, ahead), x, moved, begun[row] / unit, push, decay),
                 )
-    return state_of(motor, moved, slow)
+    if mean is not None:
+        mend = mended_mean(state.speed, after.speed, moved[1])
+        mean = mean._replace(speed=mean.speed + mend)
+    return state_of(motor, moved, slow), mean
 
 
 def _unswitched(
     motor: Motor, along: Propagator, weights: Weights, acting: Input, state: State
-) -> tuple[State, State]:
-    """The rate at which a step begins, and how it ends if dry elements and teeth go on as they began."""
+) -> tuple[State, State, State | None]:
+    """The rate at which a step begins, and how it ends and its mean if dry elements and teeth go on as they began."""
     h, linear, always = weights.step, weights.linear, jnp.all(weights.step > 0)
+    mean, averaging = None, along.mean
     moving = (jnp.sign(state.current), jnp.sign(state.speed))
     x, slow = vector(motor, state), _slow(motor, state)
 
@@ -134,10 +187,16 @@ def _unswitched(
 
     if weights.stages is None:
         begun, s0 = computed_once(rates(x, slow, 0.5), always)
+        bend = None if acting.rise is None else _bend(motor, acting, state)
         moved = _add(x, _times(weights.push, begun))
-        if acting.rise is not None:
-            moved = _add(moved, _bend(motor, along, acting, state))
-        return state_of(motor, begun, s0), state_of(motor, moved, _shifted(slow, h, s0))
+        if bend is not None:
+            moved = _add(moved, _times(_known(along.ramp), bend))
+        if averaging is not None:
+            means = _add(x, _times(averaging.push, begun))
+            if bend is not None:
+                means = _add(means, _times(_known(averaging.ramp), bend))
+            mean = state_of(motor, means, slow)
+        return state_of(motor, begun, s0), state_of(motor, moved, _shifted(slow, h, s0)), mean
 
     def rest(x: Vector, slow: Slow, when: float) -> tuple[Vector, Slow]:
         """What the linear part leaves over, and the rates of the states that are not in it."""
@@ -151,9 +210,16 @@ def _unswitched(
     n2, s2 = rest(_add(halfway, _times(half_input, n1)), _shifted(slow, h / 2, s1), 0.5)
     end = _add(moved, _times(2 * half_input, n2), _times(half_minus_one, n0))
     n3, s3 = rest(end, _shifted(slow, h, s2), 1.0)
-    moved = _add(moved, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
+    between = _add(n1, n2)
+    moved = _add(moved, _times(first, n0), _times(middle, between), _times(last, n3))
+    if averaging is not None:
+        whole, _, _, _, *stages = averaging
+        parts = zip((whole, *stages), (x, n0, between, n3), strict=True)
+        means = _add(*(_times(_known(matrix), part) for matrix, part in parts))
+        mean = state_of(motor, means, _slow(motor, state))
     slow = _shifted(slow, h / 6, {k: s0[k] + 2 * (s1[k] + s2[k]) + s3[k] for k in slow})
-    return state_of(motor, _add(n0, _times(linear, x)), s0), state_of(motor, moved, slow)
+    begun = state_of(motor, _add(n0, _times(linear, x)), s0)
+    return begun, state_of(motor, moved, slow), mean
 
 
 def _slow(motor: Motor, state: State) -> Slow:

@@ -141,6 +141,20 @@ def stick_or_reverse(
     return tuple(mended)
 
 
+def mended_mean(before: Scalars, unmended: Scalars, mended: Scalars) -> Scalars:
+    """By how much the mean speed over a step changes as its end is mended.
+
+    The change grows on a straight line from where the speed would come to zero; the same from half the step on, where
+    something else switches.
+
+    **Arguments**: the speed as the step begins, and as it ends without and with what switches.
+    """
+    crosses = before * unmended <= 0
+    fall = jnp.where(crosses & (before != 0), before - unmended, 1.0)
+    left = jnp.where(crosses, 1.0 - before / fall, 0.5)
+    return left / 2 * (mended - unmended)
+
+
 def _breakaway_excess(hold: Grip, begun: Scalars, mean: Scalars) -> Scalars:
     """What is left over, as a mean over the step, of a force beyond what holds a state at zero.
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..motor import Drive
+from ..recording import OVER_LAST
 from .uneven import flows_on, mean_and_rise, pieces_of
 
 if TYPE_CHECKING:
@@ -54,6 +55,8 @@ class Tape(eqx.Module):
     longest: float = eqx.field(static=True)
     # by how much what drives rises over each sample; None where all that drives is held
     rise: Float[Samples, "blocks samples"] | None = None
+    # how much of a reported speed is its mean over the last sample, and over the next; None where all of it is as it is
+    averaging: Float[Samples, "runs 2"] | None = None
 
     @classmethod
     def from_recordings(
@@ -73,6 +76,7 @@ class Tape(eqx.Module):
         """
         runs = [_Run(recording, straight) for recording in recordings]
         rises = straight or any(recording.uneven is not None for recording in recordings)
+        averaged = any(recording.averaging is not None for recording in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
         spare = _power_of_two(len(runs)) - len(runs)
         blocks = _round_up(sum(run.blocks for run in runs) + spare)
@@ -107,9 +111,9 @@ class Tape(eqx.Module):
         # what is filled up begins anew in every block, so that nobody waits for it to be joined
         tape["begins"][first:], tape["turn"][first:] = True, 0.0
 
-        def of_runs(values: Iterable[float]) -> np.ndarray:
+        def of_runs(values: Iterable[float | Sequence[float]]) -> np.ndarray:
             known = np.array(list(values))
-            return np.append(known, np.zeros(spare, known.dtype))
+            return np.append(known, np.zeros((spare, *known.shape[1:]), known.dtype), axis=0)
 
         kinds, free = np.array([drive for _, drive, _ in grids]), np.array([f for *_, f in grids])
         return cls(
@@ -120,6 +124,7 @@ class Tape(eqx.Module):
                 free=np.where(free, 1.0, 0.0),
             ),
             initial=np.array([run.initial for run in runs] + spare * [(0.0, 0.0)]),
+            averaging=of_runs(r.averaging or (0.0, 0.0) for r in recordings) if averaged else None,
             load_unknown=of_runs(
                 r.load is None and not unloaded and not r.held for r in recordings
             ),
@@ -165,8 +170,11 @@ class _Run:
         missing = np.full(self.length, np.nan)
         self.load = np.zeros(self.length) if recording.load is None else recording.load
         self.current, self.speed = missing, missing
+        self.averaging = recording.averaging
         if recording.speed is not None:
             self.speed = recording.speed
+        if self.averaging is not None:
+            self.speed = self.averaging.known_of(self.speed)
         drive = recording.drive
         if drive == "voltage" and recording.current is not None:
             self.current = recording.current
@@ -185,6 +193,8 @@ class _Run:
         """Angle over each sample in rad, NaN where the speed is not known."""
         sample_time, *_ = self.grid
         ahead = np.append(self.speed[1:], self.speed[-1])
+        if self.averaging == OVER_LAST:
+            return sample_time * ahead
         return sample_time * (self.speed + ahead) / 2
 
     def fill(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from ..angle import unwrapped
 from ..clock import GAP, is_even
 from ..errors import InputError
-from ..recording import Recording
+from ..recording import OVER_LAST, Recording
 
 # An even clock ticks no more often than so many times for every sample
 MOST = 20
@@ -19,7 +19,8 @@ ALIKE = 0.98
 def uniform(recording: Recording) -> Recording:
     """The recording on a uniform grid of time, with speed in place of angle.
 
-    Evenly sampled recordings keep their samples. Otherwise whatever drives and the load, which hold between
+    Evenly sampled recordings keep their samples, and have the mean speed over every sample where only the angle was
+    measured. Otherwise whatever drives and the load, which hold between
     samples, are averaged over each interval of the grid, so that no volt-second is lost, and the outputs are
     interpolated linearly; inside gaps, and past the end, they are missing (NaN). The record goes along as `uneven`.
     A rotor that stands still throughout is held: there is nothing to learn from its speed.
@@ -28,10 +29,15 @@ def uniform(recording: Recording) -> Recording:
     """
     if recording.stands_still:
         recording = attrs.evolve(recording, speed=None, angle=None, held=True)
+    time, even = recording.time, is_even(recording.time)
     if recording.speed is None and recording.angle is not None:
-        recording = attrs.evolve(recording, speed=speed_by_spline(recording.angle, recording.time))
-    time = recording.time
-    if is_even(time):
+        angle, _ = unwrapped(recording.angle)
+        if even:
+            speed = np.diff(angle, prepend=np.nan) / recording.sample_time
+            recording = attrs.evolve(recording, speed=speed, averaging=OVER_LAST)
+        else:
+            recording = attrs.evolve(recording, speed=_slope(angle, time))
+    if even:
         return attrs.evolve(recording, time=np.linspace(time[0], time[-1], len(time)))
     grid = _even_clock(time)
     held = {"voltage": recording.voltage, "load": recording.load, "torque": recording.torque}
@@ -86,12 +92,11 @@ def _interpolate(time: np.ndarray, samples: np.ndarray, grid: np.ndarray) -> np.
     return values
 
 
-def speed_by_spline(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
+def _slope(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
     """The derivative of a cubic spline, rad/s: a difference would be a mean over two steps, which looks like a lag."""
     from scipy.interpolate import CubicSpline  # late, for it takes long to load
 
     known = ~np.isnan(angle)
-    going_on, _ = unwrapped(angle)
     speed = np.full_like(angle, np.nan)
-    speed[known] = CubicSpline(time[known], going_on[known])(time[known], 1)
+    speed[known] = CubicSpline(time[known], angle[known])(time[known], 1)
     return speed

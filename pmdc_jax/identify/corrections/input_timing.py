@@ -24,7 +24,7 @@ from ..likelihood import LIKELIER, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import normal_matrix
-from .speed_averaging import as_recorded, of_averaged, seems_averaged, without_averaging
+from .speed_averaging import as_sampled, seems_averaged, with_averaging, without_ends
 from .uneven_sampling import on_clock
 
 # Another timing is not even asked where the misfit shows less than this share of half a sample
@@ -62,12 +62,12 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
 
     @cache
     def unlikely_with(timing: Timing) -> float:
-        other = as_recorded(with_timing(given, timing))
+        other = as_sampled(with_timing(given, timing))
         nearer = polish(other.problem, fit.optimum)
         # what is a mean over the last sample, and what is late, only a fit in time can tell
-        return negative_log_likelihood_as_recorded(*without_averaging(*on_clock(other, nearer)))
+        return negative_log_likelihood_within(*with_averaging(*on_clock(other, nearer)))
 
-    enough = negative_log_likelihood_as_recorded(given, fit) - LIKELIER
+    enough = negative_log_likelihood_within(given, fit) - LIKELIER
     asked = [t for t in OTHERWISE if hidden or (t.ahead < 0) == (early < 0)]
     clearly = [timing for timing in asked if unlikely_with(timing) < enough]
     if all(run.load is None for run in given.training):
@@ -75,10 +75,10 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
     return [min(t, t._replace(load=True), key=unlikely_with) for t in clearly]
 
 
-def negative_log_likelihood_as_recorded(given: Prepared, fit: Fit) -> float:
-    """How unlikely a fit makes the runs as recorded, but for their first samples: nobody can foretell these where a
-    voltage acts later."""
-    return negative_log_likelihood(_without_first(as_recorded(given)), fit, of_averaged(given))
+def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:
+    """How unlikely a fit makes the runs, but for their ends: nobody can foretell a beginning where a voltage acts
+    later."""
+    return negative_log_likelihood(without_ends(given), fit)
 
 
 def _early(given: Prepared, fit: Fit) -> float:
@@ -110,15 +110,8 @@ def with_timing(given: Prepared, timing: Timing) -> Prepared:
     tape = replace(tape, value=value, load=load, rise=rise)
     problem = replace(given.problem, tape=tape)
     acting = given._replace(runs=runs, problem=problem, timing=timing)
-    return _without_first(acting) if timing.ahead < 0 else acting
-
-
-def _without_first(given: Prepared) -> Prepared:
-    """The runs less what was measured at their first samples: how each is at its second one is then its own."""
-    tape = given.problem.tape
-    weight = np.array(tape.weight)
-    weight[np.asarray(tape.begins), :, 0] = 0.0
-    return given.with_tape(weight=jnp.asarray(weight))
+    # how each is at its second sample is then its own
+    return without_ends(acting) if timing.ahead < 0 else acting
 
 
 def _acting(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:

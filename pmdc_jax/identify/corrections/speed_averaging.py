@@ -1,23 +1,23 @@
 """A speed that is a difference of angles, and so a mean over one sample or two: taken for what it is.
 
 Where the motor speeds up or slows down within some samples such a mean is late, or rounds its motion as a soft shaft
-might. The noise of the angles shows which one it is, and in case of doubt the fits to the one and to the other. It is
-undone: the derivative of a cubic spline through the same angles is the speed that has this mean.
+might. The noise of the angles shows which one it is, and in case of doubt the fits to the one and to the other. The
+simulation then reports the same mean.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
+import attrs
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import solve_banded
 
-from ...motor import Motor
+from ...recording import OVER_BOTH, OVER_LAST, Averaging
 from ...simulate import Tape
-from ..likelihood import LIKELIER, Samples, negative_log_likelihood
+from ..likelihood import LIKELIER, negative_log_likelihood
 from ..noise import quantum
 from ..polish import Fit, polish
 from ..prepare import Prepared
@@ -32,60 +32,12 @@ COUNTED_IN_ALL = 1 / 7
 ENOUGH = 200
 # Shares of the highest frequency about half of it, near it, and next to it; and all that are high
 BANDS = ((0.4, 0.6), (0.9, 0.95), (0.98, 1.0), (0.4, 1.0))
-# A mean is undone where the mechanical time constant is so many samples long
-SMOOTH = 2.0
+# By how much smaller an inductance is tried, in natural logarithms
+SMALLER = 3.0
+# Current and speed among the outputs, and the latter alone
+BOTH, SPEED = slice(None), slice(1, None)
 # A mean over two samples has no more than this share of the power near the highest frequency next to it: in theory 1/40
 NONE = 1 / 8
-
-
-class Averaging(NamedTuple):
-    """What a sensor may make of a speed, to third order in the sample time, and how to undo it.
-
-    The samples at both ends are as given, or nearly so.
-    """
-
-    over: str  # of what it is a mean, if of anything
-    of: Callable[[Samples], Samples]
-    undone: Callable[[Samples], Samples]
-
-
-def _over_two(speed: Samples) -> Samples:
-    mean = np.convolve(speed, [1 / 6, 4 / 6, 1 / 6], "same")
-    mean[[0, -1]] = speed[[0, -1]]
-    return mean
-
-
-def two_undone(mean: Samples) -> Samples:
-    bands = np.repeat([[1 / 6], [4 / 6], [1 / 6]], len(mean), axis=1)
-    bands[1, [0, -1]], bands[0, 1], bands[2, -2] = 1.0, 0.0, 0.0
-    return solve_banded((1, 1), bands, mean)
-
-
-def _over_last(speed: Samples) -> Samples:
-    around = np.concatenate([speed[:1], speed[:1], speed, speed[-1:]])
-    return np.convolve(around, [-1 / 24, 13 / 24, 13 / 24, -1 / 24], "valid")
-
-
-def _last_undone(mean: Samples) -> Samples:
-    """Two means over one sample are one over two; the last sample goes on as straight as the one before it."""
-    ahead = np.append(mean[1:], 2 * mean[-1] - mean[-2:-1].sum())
-    return two_undone((mean + ahead) / 2)
-
-
-TWO = Averaging("the last and the next sample", _over_two, two_undone)
-LAST = Averaging("the last sample", _over_last, _last_undone)
-LATE = Averaging("", lambda x: np.append(x[:1], x[:-1]), lambda x: np.append(x[1:], x[-1:]))
-
-
-def of_averaged(given: Prepared) -> Callable[[Samples], Samples]:
-    """What the sensors of runs made of their speeds, as far as it was undone."""
-    return given.averaging.of if given.averaging else lambda speed: speed
-
-
-def as_recorded(given: Prepared) -> Prepared:
-    """The runs with their outputs as recorded, whatever was undone."""
-    measured = jnp.asarray(Tape.from_recordings(given.runs).measured)
-    return given.with_tape(measured=measured)._replace(averaging=None)
 
 
 def seems_averaged(given: Prepared) -> bool:
@@ -94,37 +46,97 @@ def seems_averaged(given: Prepared) -> bool:
     return bool(counts) and counted_over(counts)[0] is not None
 
 
-def may_be_averaged(given: Prepared, motor: Motor) -> bool:
-    """Whether the noise is that of means, but the motor settles too fast for the fits to tell, or for the mean to be
-    undone: it is no smooth curve from sample to sample."""
-    time_constant = float(motor.R * motor.J / (motor.Kt * motor.Kb))
-    finest = float(np.min(np.asarray(given.problem.tape.sample_time)))
-    return given.averaging is None and time_constant < SMOOTH * finest and seems_averaged(given)
+def clearly_averaged(given: Prepared) -> Prepared:
+    """The runs with their speeds taken for means over the last sample where the noise leaves no doubt that they are.
+
+    Of a current it takes one to tell a mean that is late from an inductance.
+    """
+    counts = _in_counts(_speeds(given))
+    mean, enough = counted_over(counts) if counts else (None, 0.0)
+    sure = mean is not None and np.isneginf(enough) and given.problem.samples[0] > 0
+    return _averaged(without_ends(given, SPEED), mean) if sure else given
 
 
-def without_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
-    """The runs with the speed itself where a mean was recorded, and the fit to them.
+def with_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+    """The runs with their speeds taken for means where that is what was recorded, and the fit to them.
 
     A mean over the last sample is told from a delay only if the speed is counted, and from an inductance only beside
     a current; and a speed that comes later than a mean would is late for another reason.
 
     **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if no mean was found.
     """
+    if given.averaging:
+        return given, fit
     speeds = _speeds(given)
     counts = _in_counts(speeds)
     mean, enough = counted_over(counts) if counts else differenced_over([s for s, _ in speeds])
-    if mean is None or (mean is LAST and not given.problem.samples[0] > 0):
+    if mean is None or (mean == OVER_LAST and not given.problem.samples[0] > 0):
         return given, fit
-    undone, better = _without(given, fit, mean)
-    left = negative_log_likelihood(given, better, mean.of)
-    if not negative_log_likelihood(given, fit) - left > enough:
+    inner = without_ends(given, SPEED)
+    averaged, better = _fitted(_averaged(inner, mean), fit)
+    left = negative_log_likelihood(averaged, better)
+    if not negative_log_likelihood(inner, fit) - left > enough:
         return given, fit
     if not counts:
-        # a mean over two samples is in time as it is; undone, it has another noise than what is but late
-        last, late = (_without(given, fit, other)[1] for other in (LAST, LATE))
-        if negative_log_likelihood(given, last, LAST.of) < left or late.fitness < fit.fitness:
+        # a mean over two samples is in time as it is, and has another noise than what is but late
+        last = negative_log_likelihood(*_fitted(_averaged(inner, OVER_LAST), fit))
+        if last < left or _fitted(_sooner(inner), fit)[1].fitness < fit.fitness:
             return given, fit
-    return undone, better
+    return averaged, better
+
+
+def as_sampled(given: Prepared) -> Prepared:
+    """The runs with the speeds that were recorded as such taken for those of the moment."""
+    return _averaged(given, None) if given.averaging else given
+
+
+def without_ends(given: Prepared, outputs: slice = BOTH) -> Prepared:
+    """The runs less what was measured of some outputs at their first and last samples, where a mean or a voltage that
+    acts at another time may be of what nobody recorded."""
+    tape = given.problem.tape
+    weight = np.array(tape.weight)
+    for k, run in enumerate(given.runs):
+        first = int(np.argmax(tape.blocks_of(k)))
+        for sample in (0, len(run) - 1):
+            block, at = divmod(sample, weight.shape[2])
+            weight[first + block, outputs, at] = 0.0
+    return given.with_tape(weight=jnp.asarray(weight))
+
+
+def _averaged(given: Prepared, averaging: Averaging | None) -> Prepared:
+    """The runs with their speeds taken for such means, or for those of the moment."""
+    runs = [
+        attrs.evolve(run, averaging=averaging) if run.speed is not None and not ours else run
+        for run, ours in zip(given.runs, given.differentiated, strict=True)
+    ]
+    laid = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, follow=True))
+    averaged = given.with_tape(averaging=laid.averaging, turn=laid.turn)
+    return averaged._replace(runs=runs, averaging=averaging)
+
+
+def _sooner(given: Prepared) -> Prepared:
+    """The runs with their speeds a sample sooner."""
+    runs = [
+        run if run.speed is None else attrs.evolve(run, speed=np.append(run.speed[1:], np.nan))
+        for run in given.runs
+    ]
+    laid = Tape.from_recordings(runs)
+    weight = jnp.asarray(given.problem.tape.weight * laid.weight)
+    return given.with_tape(measured=jnp.asarray(laid.measured), weight=weight)
+
+
+def _fitted(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+    """The runs, and the fit to them from another one on, or with a small inductance: a large one may have made up for
+    half a sample."""
+    parameters, unknowns = given.problem.parameters, fit.unknowns
+    starts = [fit.optimum]
+    if "L" in parameters.names and given.averaging == OVER_LAST:
+        L = parameters.names.index("L")
+        less = jnp.maximum(unknowns.coordinates[L] - SMALLER, parameters.lower[L])
+        coordinates = unknowns.coordinates.at[L].set(less)
+        starts.append(fit.optimum._replace(unknowns=unknowns._replace(coordinates=coordinates)))
+    ends = [polish(given.problem, start) for start in starts]
+    return given, min(ends, key=lambda end: end.fitness)
 
 
 def counted_over(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
@@ -139,17 +151,17 @@ def counted_over(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]
     middle, high, highest, in_all = _powers(counts)
     if highest > COUNTED:
         clearly = highest > np.sqrt(2.0) * max(middle, COUNTED)
-        return LAST, -np.inf if clearly else -LIKELIER
+        return OVER_LAST, -np.inf if clearly else -LIKELIER
     if in_all > COUNTED_IN_ALL and not highest < NONE * high:
-        return LAST, LIKELIER
-    return TWO if highest < NONE * high else None, -LIKELIER
+        return OVER_LAST, LIKELIER
+    return OVER_BOTH if highest < NONE * high else None, -LIKELIER
 
 
 def differenced_over(speeds: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
     """The same of other speeds: nothing of differences over two samples is at the highest frequency, but of any other
     signal with noise or steps there is as much as near it."""
     _, high, highest, _ = _powers(speeds) if speeds else (0.0, 0.0, 0.0, 0.0)
-    return TWO if highest < NONE * high else None, LIKELIER
+    return OVER_BOTH if highest < NONE * high else None, LIKELIER
 
 
 def _powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
@@ -166,21 +178,6 @@ def _powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
         white = power[1:] / (2 * np.sin(np.pi * share / 2)) ** 4
         powers.append([white[(low < share) & (share < high)].mean() for low, high in BANDS])
     return np.mean(powers, axis=0)
-
-
-def _without(given: Prepared, fit: Fit, averaging: Averaging) -> tuple[Prepared, Fit]:
-    """The runs with the speed of which a mean was recorded, and the fit to them."""
-    tape = given.problem.tape
-    measured = np.array(tape.measured)
-    for run in range(tape.runs):
-        mine = tape.blocks_of(run)
-        known = np.asarray(tape.weight)[mine, 1].ravel() > 0
-        if known.sum() > 2 and not given.differentiated[run]:
-            speed = measured[mine, 1].ravel()
-            speed[known] = averaging.undone(speed[known])
-            measured[mine, 1] = speed.reshape(-1, measured.shape[2])
-    undone = given.with_tape(measured=jnp.asarray(measured))._replace(averaging=averaging)
-    return undone, polish(undone.problem, fit.optimum)
 
 
 def _speeds(given: Prepared) -> list[tuple[np.ndarray, float]]:

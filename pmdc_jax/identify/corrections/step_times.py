@@ -16,13 +16,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import expm
 
-from ...recording import Recording
+from ...recording import Averaging, Recording
 from ...simulate.tape import BLOCK
 from ..likelihood import LIKELIER, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem
-from .speed_averaging import of_averaged
 
 # A step is so many times what the voltage does from sample to sample around it, and this share of its range
 STANDS_OUT, LARGE = 10.0, 0.05
@@ -68,10 +67,7 @@ def with_step_times(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
             steps, _ = _moved(placed.problem, better, steps)
         placed = _placed(given, better, steps)
         better = polish(placed.problem, better.optimum)
-    sensed = of_averaged(given)
-    gained = negative_log_likelihood(given, fit, sensed) - negative_log_likelihood(
-        given, better, sensed
-    )
+    gained = negative_log_likelihood(given, fit) - negative_log_likelihood(given, better)
     return (placed, better) if gained > enough else (given, fit)
 
 
@@ -152,6 +148,8 @@ def _responses(
     for k, (at, height, share) in enumerate(zip(*steps, strict=True)):
         begun = expm(A * step * np.clip(share, 0.0, 1.0)) @ B[:, 0] * step * height
         responses[at:, :, k] = after[: length - at] @ begun
+    if tape.averaging is not None:
+        responses[:, 1] = Averaging(*np.asarray(tape.averaging)[run]).of(responses[:, 1])
     return np.moveaxis(responses.reshape(length // BLOCK, BLOCK, 2, len(steps.at)), 1, 2)
 
 

@@ -1,0 +1,85 @@
+"""What is reported of a simulated motor: by a sensor that is late, or as a mean over a sample, as differences of angles
+are."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ..effects.base import Scalars, State
+from ..motor import Motor
+from .propagator import Propagator
+from .solver import Input, held_step_and_mean
+from .tape import BLOCK, Tape
+
+
+def outputs(
+    motor: Motor,
+    along: Propagator,
+    acting: Input,
+    state: State,
+    steps: int | Int[Array, ""],
+    mean: State | None = None,
+) -> Float[Array, "outputs ..."]:
+    """Reported current and speed, and what else a report of the latter may be made of.
+
+    For a late sensor the speed where it looks within the sample that follows; of a speed that is reported as a mean
+    that over this sample, of the `mean` state there, and its part up to where a late sensor looks.
+    """
+    seen = [*motor.sensors(state)]
+    part_mean = None
+    if along.look is not None:
+        part, share = along.look
+        within = acting.part(share / 2, share)
+        there, part_mean = held_step_and_mean(motor, part, within, state, steps)
+        seen.append(motor.sensors(there)[1])
+    if mean is not None:
+        seen.append(motor.sensors(mean)[1])
+    if along.look is not None and part_mean is not None:
+        seen.append(along.look.share * motor.sensors(part_mean)[1])
+    return jnp.stack(seen)
+
+
+def reports_of(along: Propagator) -> int:
+    """How many `outputs` there are."""
+    late, averaged = along.look is not None, along.mean is not None
+    return 2 + late + averaged + (late and averaged)
+
+
+def reported(
+    motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]
+) -> Float[Array, "blocks 2 samples"]:
+    """Current and speed of these `outputs`, the latter as late as the motor's sensor reports it, and as the mean that
+    the tape says; before a run began, as it began."""
+    delay = motor.speed_delay()
+    if delay is None and tape.averaging is None:
+        return seen
+    speed, *others = (seen[:, k].reshape(-1) for k in range(1, seen.shape[1]))
+    first = jnp.repeat(jnp.searchsorted(jnp.asarray(tape.run), tape.run) * BLOCK, BLOCK)
+    begun, last = speed[first], jnp.arange(len(speed)) - 1
+
+    def sample(values: Scalars, k: Int[Array, " all"], before: Scalars) -> Float[Array, " all"]:
+        return jnp.where(k < first, before, values[jnp.clip(k, 0, len(speed) - 1)])
+
+    share = None
+    if delay is not None:
+        within, *others = others
+        behind = delay / jnp.repeat(jnp.asarray(tape.sample_time)[tape.grid], BLOCK)
+        last = last - jnp.floor(behind).astype(int)
+        share = 1 - (behind - jnp.floor(behind))
+        speed = sample(within, last, begun)
+    if tape.averaging is not None:
+        mean, *parts = others
+
+        def ending_within(k: Int[Array, " all"]) -> Float[Array, " all"]:
+            """The mean over one sample's time until a late sensor looks within sample k, or this ends."""
+            if share is None:
+                return sample(mean, k, begun)
+            (part,) = parts
+            left = sample(mean - part, k - 1, (1 - share) * begun)
+            return left + sample(part, k, share * begun)
+
+        over_last, over_next = jnp.repeat(jnp.asarray(tape.averaging)[tape.run], BLOCK, axis=0).T
+        sampled = (1 - over_last - over_next) * speed
+        speed = sampled + over_last * ending_within(last) + over_next * ending_within(last + 1)
+    return jnp.stack([seen[:, 0], speed.reshape(seen[:, 0].shape)], 1)
