@@ -42,7 +42,7 @@ from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape, free_run
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
-SCALES = Scales(10.0, 300.0, 10.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0)
+SCALES = Scales(10.0, 300.0, 10.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0, 500.0)
 
 
 def promises_of(gains: dict[str, float], unexplained: float) -> Assessment:
@@ -191,11 +191,15 @@ def test_a_motor_that_cannot_be_simulated_suggests_no_run(x64):
 
 
 def test_only_waves_that_records_show_are_tried():
-    """At 40 rad/s, of samples of 20 ms, one of seven periods comes round in one and an eighth."""
+    """At 40 rad/s, of samples of 20 ms, one of seven periods comes round in one and an eighth; and over a tenth of a
+    turn one of ten comes round once."""
     seldom = SCALES._replace(slow=40.0, sample_time=0.02)
     tried = TRIALS["cogging_torque"].columns
     assert [c.columns[0]["periods"] for c in tried("", seldom)] == list(range(1, 8))
     assert max(c.columns[0]["periods"] for c in tried("", SCALES)) == 48
+    short = SCALES._replace(travel=0.1 * 2 * np.pi)
+    assert min(c.columns[0]["periods"] for c in tried("", short)) == 10
+    assert tried("", SCALES._replace(travel=0.0)) == []
 
 
 @pytest.mark.parametrize("simple", [s for s, form in FULLER.items() if form.reduced])

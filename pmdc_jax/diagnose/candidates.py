@@ -35,6 +35,7 @@ class Scales(NamedTuple):
     inertia: float  # kg m^2
     sample_time: float  # s
     duration: float  # s
+    travel: float  # rad, through which the rotor turns in one run
 
 
 class Candidate(NamedTuple):
@@ -184,9 +185,9 @@ def _periodic(field: str, size: Callable[[Scales], float], *others: Values) -> R
             columns = tuple({field: small, "phase_rad": p, **shape} for p in (0.0, np.pi / 2))
             return Candidate(name, columns, (small, small), build, field, own_phase=True)
 
-        # what comes round within a sample even where the motor is slow, no record shows
+        # what comes round within a sample even where the motor is slow, or not once, no record shows
         most = 2 * np.pi / (scales.slow * scales.sample_time)
-        shown = [periods for periods in PERIODS if periods < most]
+        shown = [p for p in PERIODS if p < most and p * scales.travel >= 2 * np.pi]
         return [candidate(periods, other) for other in others or ({},) for periods in shown]
 
     return rows

@@ -267,4 +267,6 @@ def _scales(base: Model) -> Scales:
     longest = max(run.time[-1] - run.time[0] for run in base.given.training)
     driven = bool(np.all(np.asarray(tape.drive.torque) > 0))
     torque = value if driven else float(motor.Kt) * current
-    return Scales(current, speed, slow, value, torque, float(motor.J), step, float(longest))
+    return Scales(
+        current, speed, slow, value, torque, float(motor.J), step, float(longest), base.travel
+    )

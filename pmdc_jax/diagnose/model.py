@@ -44,9 +44,24 @@ class Model:
 
     @property
     def is_possible(self) -> bool:
-        """Whether it can be simulated, and nature allows what its effects were fitted to be."""
+        """Whether it can be simulated, nature allows what its effects were fitted to be, and what is to repeat itself
+        does."""
         simulated = np.isfinite(self.fit.fitness)
-        return bool(simulated) and all(effect.is_possible() for effect in self.motor.effects)
+        physical = all(effect.is_possible() for effect in self.motor.effects)
+        return bool(simulated) and physical and self._comes_round
+
+    @property
+    def _comes_round(self) -> bool:
+        """Whether a run goes through a whole period of each torque that repeats itself as the rotor turns: of less, any
+        torque that differs from place to place may look like a part."""
+        waves = [effect.repeats_after().get("angle", 0.0) for effect in self.motor.effects]
+        return not any(waves) or bool(max(waves) <= self.travel)
+
+    @property
+    def travel(self) -> float:
+        """Through which range of angles, rad, the rotor turns in a training run, at most."""
+        angle, tape = np.asarray(self.path.angle), self.given.problem.tape
+        return float(max(np.ptp(angle[:, tape.blocks_of(run)]) for run in self.training))
 
     @property
     def effects_at_bound(self) -> set[str]:
