@@ -456,12 +456,14 @@ def test_a_converter_resolves_what_all_values_are_multiples_of(values, step):
 
 
 def test_whitening_is_its_formula_sample_by_sample():
-    """Two runs in three blocks, the second without current and with a sample missing."""
+    """Two runs in three blocks, the second without current and with a sample missing; of the first one, the speed is
+    known from the second sample on."""
     rng = np.random.default_rng(1)
     run, samples = np.array([0, 0, 1]), 128
     weight = np.ones((3, 2, samples))
     weight[2, 0] = 0.0
     weight[2, 1, 50] = 0.0
+    weight[0, 1, 0] = 0.0
     filters = [0.3 * rng.normal(size=(4, 2, 2)), np.zeros((2, 2, 2))]
     filters[1][:, 1, 1] = [0.5, -0.2]
     scales = [np.array([[2.0, 0.1], [0.1, 0.5]]), np.diag([0.0, 3.0])]

@@ -20,8 +20,8 @@ CHUNK = 32
 class Whitening(eqx.Module):
     """A filter for every run, r'(t) = S (r(t) - sum_k A_k r(t - k)), that leaves unit variance and no correlation.
 
-    Before a run begins there is no residual: its initial state is fitted, so nothing has added up by then. Without
-    these first samples nothing would tell of that state.
+    Before a run begins, or was measured, there is no residual: its initial state is fitted, so nothing has added up by
+    then. Without these first samples nothing would tell of that state.
 
     **Source**: Aitken, Proceedings of the Royal Society of Edinburgh 55 (1936); Ljung, "System Identification",
     2nd edition, section 7.4.
@@ -47,9 +47,10 @@ class Whitening(eqx.Module):
         usable = np.zeros(known.shape)
         for index, A in enumerate(filters):
             mine, counts = np.asarray(run) == index, np.any(scales[index], axis=0)
-            whole = known[mine].reshape(-1, 2)[:, counts].all(1)
-            before = np.ones(len(A), bool)
-            whole = remembered(np.append(before, whole), len(A))[len(A) :]
+            measured = known[mine].reshape(-1, 2)[:, counts]
+            begun = np.logical_or.accumulate(measured.all(1))
+            before = np.append(np.ones(len(A), bool), measured.all(1) | ~begun)
+            whole = remembered(before, len(A))[len(A) :] & measured.any(1)
             usable[mine] = (whole[:, None] * counts).reshape(-1, *known.shape[1:])
         return cls(jnp.asarray(bands), jnp.asarray(np.moveaxis(usable, 2, 1)))
 
