@@ -7,6 +7,7 @@ amplitude of the effect. No measured signal is ever differentiated.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -83,7 +84,14 @@ def _seen_on(motor: Motor, tape: Tape, path: Path) -> Outputs:
     if along.mean is not None:
         _, mean = held_step_and_mean(motor, along, acting, state, steps)
     seen = outputs(motor, along, acting, state, steps, mean)
-    return reported(motor, tape, seen.transpose(2, 0, 1)).transpose(2, 1, 0)
+    return _reported_in_time(motor, tape, jnp.moveaxis(seen, 0, 1))
+
+
+def _reported_in_time(
+    motor: Motor, tape: Tape, seen: Float[Array, "samples outputs blocks"]
+) -> Outputs:
+    """What is reported of outputs in the order of time."""
+    return reported(motor, tape, seen.transpose(2, 1, 0)).transpose(2, 1, 0)
 
 
 @compiled
@@ -109,7 +117,6 @@ def respond(
     """
     along, _ = _of_blocks(motor, tape)
     whole = along.whole[:, :, 0]
-    stuck = path.held.astype(kicks.dtype)
 
     def step(
         x: Columns,
@@ -120,6 +127,7 @@ def respond(
         # a rotor that sticks forgets
         return after.at[1].multiply(1.0 - held[:, None]), x
 
+    stuck = path.held.astype(kicks.dtype)
     zero = jnp.zeros(kicks.shape[1:])
     end, driven = jax.lax.scan(step, zero, (kicks, stuck))
     basis = jnp.broadcast_to(jnp.eye(2)[:, None, :], (2, kicks.shape[2], 2))
@@ -142,12 +150,7 @@ def respond(
     mean = jnp.einsum("jsb,sjbc->sbc", along.mean.whole[1], response) + kicks[:, 1] / 2
     moving = mean * (1.0 - stuck[:, :, None])
     seen = jnp.concatenate([response, moving[:, None]], 1)
-    as_reported = jax.vmap(
-        lambda column: reported(motor, tape, column.transpose(2, 1, 0)).transpose(2, 1, 0),
-        in_axes=-1,
-        out_axes=-1,
-    )
-    return as_reported(seen)
+    return jax.vmap(partial(_reported_in_time, motor, tape), in_axes=-1, out_axes=-1)(seen)
 
 
 def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Input]:

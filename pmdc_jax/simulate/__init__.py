@@ -44,6 +44,7 @@ def simulate(motor: Motor, recording: Run) -> Recording:
     """
     motor = jax.tree.map(jnp.asarray, motor)
     (recording,) = recordings_of(recording, to_simulate=True)
+    # whatever was recorded of the speed, what is simulated is that of the moment
     even = attrs.evolve(uniform(recording), averaging=None)
     tape = Tape.from_recordings([even], unloaded=True)
     outputs = free_run(motor, tape)

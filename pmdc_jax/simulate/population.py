@@ -9,7 +9,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..compiled import compiled
 from ..effects.base import Scalars, State
@@ -66,13 +66,12 @@ def _errors(motors: Motor, tape: Tape, share: Int[Array | np.ndarray, ""], share
     return _errors_with_effects(motors, tape) if motors.effects else _errors_of_linear(motors, tape)
 
 
-def _with_its_sample(tape: Tape) -> tuple[Samples, Samples, Float[Array, " blocks"] | None]:
+def _with_its_sample(tape: Tape) -> tuple[Samples, Samples, Bool[Array, " blocks"] | None]:
     """What was measured, and its weights, with every mean speed over a sample at that sample instead of the next; and
     which blocks have such speeds, None where none has. One over two samples is in time as it is."""
     if tape.averaging is None:
         return tape.measured, tape.weight, None
-    over_last = jnp.where(jnp.asarray(tape.averaging)[:, 0] == 1, 1.0, 0.0)[tape.run]
-
+    over_last = (jnp.asarray(tape.averaging)[:, 0] == 1)[tape.run]
     # nobody recorded the mean over the last sample of a run
     ends = jnp.append(jnp.asarray(tape.begins)[1:], True)
 
@@ -81,7 +80,7 @@ def _with_its_sample(tape: Tape) -> tuple[Samples, Samples, Float[Array, " block
         speed = signal[:, 1].reshape(-1)
         sooner = jnp.append(speed[1:], 0.0).reshape(signal[:, 1].shape)
         sooner = sooner.at[:, -1].multiply(jnp.where(ends, 0.0, 1.0))
-        return signal.at[:, 1].set(jnp.where(over_last[:, None] > 0, sooner, signal[:, 1]))
+        return signal.at[:, 1].set(jnp.where(over_last[:, None], sooner, signal[:, 1]))
 
     return moved(tape.measured), moved(tape.weight), over_last
 
@@ -89,13 +88,13 @@ def _with_its_sample(tape: Tape) -> tuple[Samples, Samples, Float[Array, " block
 def _seen_speed(
     speed: Scalars,
     mean: Scalars | None,
-    over_last: Float[Array, " blocks"] | None,
+    over_last: Bool[Array, " blocks"] | None,
     block: Int[Array, ""],
 ) -> Scalars:
     """The speed of a sample, or the mean over it, as the block reports it."""
     if mean is None or over_last is None:
         return speed
-    return speed + over_last[block] * (mean - speed)
+    return jnp.where(over_last[block], mean, speed)
 
 
 # Where motors are, and their squared errors of current and speed so far
@@ -244,10 +243,8 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
             acting = Input(drive, value, load)
             after, mean = held_step_and_mean(motors, along, acting, state, steps)
             current, speed = motors.sensors(state)
-            seen = (
-                current,
-                _seen_speed(speed, mean and motors.sensors(mean)[1], over_last, block),
-            )
+            mean_speed = mean and motors.sensors(mean)[1]
+            seen = (current, _seen_speed(speed, mean_speed, over_last, block))
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )

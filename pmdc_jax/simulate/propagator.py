@@ -134,21 +134,27 @@ def _by_linear_part(
     doi:10.1006/jcph.2002.6995.
     """
     staged = not motor.affine
-    known = 3 if staged else 2 if straight else 1
-    (half0, half1, *_), phi = phi_functions(A * step, known + averaged)
-    push, ramp = step * phi[1], step * (phi[2] - phi[1] / 2) if straight and not staged else None
-    mean = _mean(step, phi, B, straight, staged) if averaged else None
-    weights = None
-    if motor.effects:
-        weights = Weights(push, A, step * jnp.ones_like(motor.R))
+    ramps = straight and not staged  # stages see how a drive rises
+    (half0, half1, *_), phi = phi_functions(A * step, (3 if staged else 1 + ramps) + averaged)
+    stages = weights = None
     if staged:
         half_input = step / 2 * half1
-        stages = Stages(
-            half0, half_input, product(half0, half_input) - half_input, *_rest(step, phi)
-        )
-        assert weights is not None
-        weights = weights._replace(stages=stages)
-    return Propagator(phi[0], step * product(phi[1], B), weights, ramp=ramp, mean=mean)
+        half_minus_one = product(half0, half_input) - half_input
+        stages = Stages(half0, half_input, half_minus_one, *_rest(step, phi))
+    if motor.effects:
+        weights = Weights(step * phi[1], A, step * jnp.ones_like(motor.R), stages)
+    return Propagator(
+        phi[0],
+        step * product(phi[1], B),
+        weights,
+        ramp=_ramp(step, phi) if ramps else None,
+        mean=_mean(step, phi[1:], B, ramps, staged) if averaged else None,
+    )
+
+
+def _ramp(step: Held, phi: Sequence[Matrix]) -> Matrix:
+    """By what a drive acts that rises within a step, beyond what its mean does."""
+    return step * (phi[2] - phi[1] / 2)
 
 
 def _rest(step: Held, phi: Sequence[Matrix]) -> tuple[Matrix, Matrix, Matrix]:
@@ -161,15 +167,13 @@ def _mean(
     step: Held,
     phi: Sequence[Matrix],
     B: Float[Array, "n 2 *#batch"],
-    straight: bool,
+    ramps: bool,
     staged: bool,
 ) -> Mean:
-    push = step * phi[2]
-    mean = Mean(phi[1], product(push, B), push)
-    if staged:
-        first, middle, last = _rest(step, phi[1:])
-        return mean._replace(first=first, middle=middle, last=last)
-    return mean._replace(ramp=step * (phi[3] - phi[2] / 2)) if straight else mean
+    """The mean over a step, by `phi` from phi_1 on in place of phi_0."""
+    push = step * phi[1]
+    ramp = _ramp(step, phi) if ramps else None
+    return Mean(phi[0], product(push, B), push, ramp, *(_rest(step, phi) if staged else ()))
 
 
 def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 *#batch"]]:

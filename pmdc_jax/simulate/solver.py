@@ -210,13 +210,15 @@ def _unswitched(
     n2, s2 = rest(_add(halfway, _times(half_input, n1)), _shifted(slow, h / 2, s1), 0.5)
     end = _add(moved, _times(2 * half_input, n2), _times(half_minus_one, n0))
     n3, s3 = rest(end, _shifted(slow, h, s2), 1.0)
-    between = _add(n1, n2)
-    moved = _add(moved, _times(first, n0), _times(middle, between), _times(last, n3))
+
+    def on_top(of: Vector, first: Matrix, middle: Matrix, last: Matrix) -> Vector:
+        """The stages on top of what the linear part does."""
+        return _add(of, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
+
+    moved = on_top(moved, first, middle, last)
     if averaging is not None:
-        whole, _, _, _, *stages = averaging
-        parts = zip((whole, *stages), (x, n0, between, n3), strict=True)
-        means = _add(*(_times(_known(matrix), part) for matrix, part in parts))
-        mean = state_of(motor, means, _slow(motor, state))
+        by_stage = map(_known, (averaging.first, averaging.middle, averaging.last))
+        mean = state_of(motor, on_top(_times(averaging.whole, x), *by_stage), slow)
     slow = _shifted(slow, h / 6, {k: s0[k] + 2 * (s1[k] + s2[k]) + s3[k] for k in slow})
     begun = state_of(motor, _add(n0, _times(linear, x)), s0)
     return begun, state_of(motor, moved, slow), mean

@@ -42,42 +42,35 @@ NONE = 1 / 8
 
 def seems_averaged(given: Prepared) -> bool:
     """Whether the speeds are counts of an encoder whose noise is that of means."""
-    counts = _in_counts(_speeds(given))
-    return bool(counts) and counted_over(counts)[0] is not None
+    mean, _, counted = _mean_by_noise(given)
+    return counted and mean is not None
 
 
 def clearly_averaged(given: Prepared) -> Prepared:
-    """The runs with their speeds taken for means over the last sample where the noise leaves no doubt that they are.
-
-    Of a current it takes one to tell a mean that is late from an inductance.
-    """
-    counts = _in_counts(_speeds(given))
-    mean, enough = counted_over(counts) if counts else (None, 0.0)
-    sure = mean is not None and np.isneginf(enough) and given.problem.samples[0] > 0
+    """The runs with their speeds taken for means over the last sample where the noise leaves no doubt that they are."""
+    mean, enough, _ = _mean_by_noise(given)
+    sure = mean is not None and np.isneginf(enough)
     return _averaged(without_ends(given, SPEED), mean) if sure else given
 
 
 def with_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with their speeds taken for means where that is what was recorded, and the fit to them.
 
-    A mean over the last sample is told from a delay only if the speed is counted, and from an inductance only beside
-    a current; and a speed that comes later than a mean would is late for another reason.
+    A speed that comes later than a mean would is late for another reason.
 
     **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if no mean was found.
     """
     if given.averaging:
         return given, fit
-    speeds = _speeds(given)
-    counts = _in_counts(speeds)
-    mean, enough = counted_over(counts) if counts else differenced_over([s for s, _ in speeds])
-    if mean is None or (mean == OVER_LAST and not given.problem.samples[0] > 0):
+    mean, enough, counted = _mean_by_noise(given)
+    if mean is None:
         return given, fit
     inner = without_ends(given, SPEED)
     averaged, better = _fitted(_averaged(inner, mean), fit)
     left = negative_log_likelihood(averaged, better)
     if not negative_log_likelihood(inner, fit) - left > enough:
         return given, fit
-    if not counts:
+    if not counted:
         # a mean over two samples is in time as it is, and has another noise than what is but late
         last = negative_log_likelihood(*_fitted(_averaged(inner, OVER_LAST), fit))
         if last < left or _fitted(_sooner(inner), fit)[1].fitness < fit.fitness:
@@ -137,6 +130,21 @@ def _fitted(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
         starts.append(fit.optimum._replace(unknowns=unknowns._replace(coordinates=coordinates)))
     ends = [polish(given.problem, start) for start in starts]
     return given, min(ends, key=lambda end: end.fitness)
+
+
+def _mean_by_noise(given: Prepared) -> tuple[Averaging | None, float, bool]:
+    """Of what the speeds are the mean by their noise, if of anything; how much likelier that must make them, as
+    `counted_over` has it; and whether they are counts.
+
+    A mean over the last sample is told from a delay only if the speed is counted, and from an inductance only beside
+    a current.
+    """
+    speeds = _speeds(given)
+    counts = _in_counts(speeds)
+    mean, enough = counted_over(counts) if counts else differenced_over([s for s, _ in speeds])
+    if mean == OVER_LAST and not given.problem.samples[0] > 0:
+        mean = None
+    return mean, enough, bool(counts)
 
 
 def counted_over(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
