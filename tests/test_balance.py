@@ -20,12 +20,17 @@ MOTOR = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS} | {"brush
 SLOW_TORQUE = vb.Noise(0.1, 0.5, torque_Nm=0.05, torque_correlation_s=0.3)
 
 
-def fitted(averaged_A: int = 1) -> Model:
-    """A motor with brushes in slow torque noise, its recorded current a mean over so many samples."""
+def fitted(averaged_A: int = 1, rough: float = 0.0) -> Model:
+    """A motor with brushes in slow torque noise, its recorded current a mean over so many samples, its voltage off by
+    a share of itself as `rough` as that."""
     rng, runs = np.random.default_rng(11), []
     excitations = {"prbs": vb.prbs(rng, 2.0), "triangle": vb.slow_triangle(2.0)}
     for name, excitation in excitations.items():
-        columns = vb.record(vb.BenchMotor(**MOTOR), excitation, rng, SLOW_TORQUE)
+        felt = excitation.voltage * (1 + rough * rng.standard_normal(len(excitation.time)))
+        columns = vb.record(
+            vb.BenchMotor(**MOTOR), excitation._replace(voltage=felt), rng, SLOW_TORQUE
+        )
+        columns["voltage_V"] = excitation.voltage
         time, voltage, current, speed = (
             columns[q] for q in ("time_s", "voltage_V", "current_A", "speed_rad_s")
         )
@@ -39,6 +44,11 @@ def fitted(averaged_A: int = 1) -> Model:
 @pytest.mark.usefixtures("x64")
 def test_brushes_that_hold_the_current_take_up_any_voltage():
     assert electrical_misfit(fitted()) < 1.5
+
+
+@pytest.mark.usefixtures("x64")
+def test_a_bridge_whose_pulses_do_not_end_with_the_samples_lacks_no_effect():
+    assert electrical_misfit(fitted(rough=0.2)) < 1.5
 
 
 @pytest.mark.usefixtures("x64")

@@ -23,6 +23,10 @@ from .model import Model
 ENOUGH = 50
 # A current is none by chance from so many times the noise of its sensor on
 CLEAR = 4.0
+# Errors of sensors are in two steps that follow each other, and what pulses of a bridge put into a step that does not
+# end with one of them is in no other: what is in steps so far apart, by more standard errors than chance brings, is what
+# the equation lacks
+APART, CHANCE = range(2, 9), 3.0
 
 
 class _Balance(NamedTuple):
@@ -39,6 +43,7 @@ def electrical_misfit(model: Model) -> float:
 
     With residuals i and w of current and speed, R i + L di/dt + Kb w = 0 between two samples, w on a straight line. R,
     L, Kb and the drop of brushes are those that leave least: torques that fluctuate lead the fit of a free run astray.
+    Added to the noise is what steps some samples `APART` have in common: a voltage that is rough lacks no effect.
     """
     if model.is_exact:
         return 1.0
@@ -52,8 +57,14 @@ def electrical_misfit(model: Model) -> float:
         return 1.0
     rest, columns = map(np.concatenate, zip(*balances, strict=True))
     better = np.linalg.lstsq(columns, rest, rcond=None)[0]
-    left = [np.mean(np.square(b.rest - b.by_parameters @ better)) for b in balances]
-    return float(np.sqrt(max(1.0, *left)))
+    return float(np.sqrt(1 + max(_lasting(b.rest - b.by_parameters @ better) for b in balances)))
+
+
+def _lasting(rest: Float[np.ndarray, " samples"]) -> float:
+    """The largest product of two values some samples apart, on average, less what chance makes it."""
+    products = [rest[apart:] * rest[:-apart] for apart in APART]
+    clear = [abs(p.mean()) - CHANCE * p.std() / np.sqrt(len(p)) for p in products]
+    return float(max(0.0, *clear))
 
 
 def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
