@@ -160,11 +160,15 @@ class StepwiseSelection:
 
     def _by_likeliest_effect(self, current: Model, found: Assessment) -> Model | None:
         """The current model with the effect that promises most, however little, if it settles what no formula explains:
-        beside one that was fitted wrongly for want of it, it does more than it promises."""
-        if not 0 < len(current.effects) < MOST or found.left >= ALARM or found.is_formula(current):
+        beside one that was fitted wrongly for want of it, it does more than it promises, and so does one of a few on
+        its own where parameters have gone far to make up for two."""
+        if len(current.effects) == MOST or found.left >= ALARM or found.is_formula(current):
             return None
-        others = [s for s in clear(found) if effect_of(s) not in current.effects]
-        most = sorted(others, key=lambda s: -s.gain)[:1]
+        if current.effects:
+            others = [s for s in clear(found) if effect_of(s) not in current.effects]
+            most = sorted(others, key=lambda s: -s.gain)[:1]
+        else:
+            most = shortlist(current, found)
         better = self._better(current, found, self._with(current, found, most))
         return better if better and self._leaves_little(current, better) else None
 

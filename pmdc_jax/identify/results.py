@@ -14,7 +14,7 @@ from ..simulate import RunUnknowns, Tape
 from ..threads import side_by_side
 from .identifiability import SHARE, explain
 from .identification import Estimate, Identification, Role, RunFit, Status
-from .noise import white_noise
+from .noise import resolution_noise, white_noise
 from .parameters import Parameters, unit_of
 from .polish import Fit, fit_run_unknowns, polish
 from .prepare import Prepared
@@ -54,7 +54,10 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
     unknowns, ended = fit_run_unknowns(problem, best.unknowns)
     fit = _fits(given.runs, given.roles, problem.tape, np.asarray(ended.seen), unknowns.runs)
     names, covariance = parameters.with_tied(info.covariance)
-    noise = {name: white_noise(_residuals(fit, name)) for name in ("current", "speed")}
+    noise = {
+        name: white_noise([left for _, left in _measured_and_left(fit, name)])
+        for name in ("current", "speed")
+    }
     return Identification(
         motor=motor,
         parameters=_estimates(parameters, best, info, given, _intervals(problem, best, info)),
@@ -257,18 +260,23 @@ def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | 
     return float(100 * (1 - error / spread)) if spread > 0 else None
 
 
-def _residuals(fit: Mapping[str, RunFit], name: str) -> list[np.ndarray]:
-    """What the fit leaves of an output in every run that has it."""
+def _measured_and_left(fit: Mapping[str, RunFit], name: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """An output as measured, and what the fit leaves of it, in every run that has it."""
     runs = [f for f in fit.values() if f.role == "train"]
     pairs = [(getattr(f, name), getattr(f, f"{name}_simulated")) for f in runs]
-    return [m - s for m, s in pairs if m is not None and s is not None]
+    return [(m, m - s) for m, s in pairs if m is not None and s is not None]
 
 
 def _missed(fit: Mapping[str, RunFit]) -> dict[str, float]:
     """The outputs of which far more is left than the noise of their runs: how many times as much."""
     times = {}
     for name in ("current", "speed"):
-        scaled = [e / white for e in _residuals(fit, name) if (white := white_noise([e]))]
+        scaled = [
+            # most of what is left of a motor at rest does not change, however coarse its encoder
+            left / max(white, resolution_noise([measured]))
+            for measured, left in _measured_and_left(fit, name)
+            if (white := white_noise([left]))
+        ]
         times[name] = _rms(np.concatenate(scaled)) if scaled else 0.0
     return {name: much for name, much in times.items() if much > MISSED}
 
