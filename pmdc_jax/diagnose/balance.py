@@ -24,8 +24,8 @@ ENOUGH = 50
 # A current is none by chance from so many times the noise of its sensor on
 CLEAR = 4.0
 # Errors of sensors are in two steps that follow each other, and what pulses of a bridge put into a step that does not
-# end with one of them is in no other: what is in steps so far apart, by more standard errors than chance brings, is what
-# the equation lacks
+# end with one of them is in no other: what is in steps so far apart, by more standard errors than chance brings, is
+# what the equation lacks
 APART, CHANCE = range(2, 9), 3.0
 
 

@@ -22,6 +22,7 @@ from ..identify.prepare import Prepared
 from ..identify.refine import Optimum
 from ..identify.rotor_angle import of_rotor, with_rotor_angle
 from ..identify.solve import polish_with_angle
+from ..identify.uncertainty import FLAT
 from ..motor import Motor
 from .response import Path, path_of
 
@@ -64,10 +65,18 @@ class Model:
         return float(max(np.ptp(angle[:, tape.blocks_of(run)]) for run in self.training))
 
     @property
-    def effects_at_bound(self) -> set[str]:
-        """The effects of which a parameter is held at its bound."""
+    def effects_at_end(self) -> set[str]:
+        """The effects of which a parameter is held at its bound, or has gone where no run sees it."""
         names = self.given.problem.parameters.names
-        return {names[k].partition(".")[0] for k in self.fit.at_bound} & set(self.effects)
+        ended = [names[k] for k in self.fit.at_bound] + [n for n in names if self.is_lost(n)]
+        return {name.partition(".")[0] for name in ended} & set(self.effects)
+
+    def is_lost(self, name: str) -> bool:
+        """Whether a parameter has gone where no run sees it, so that nothing leads it back."""
+        problem = self.given.problem
+        jacobian = np.asarray(self.fit.evaluation.jacobian)[problem.fitted_blocks]
+        seen = jacobian[..., problem.parameters.names.index(name)]
+        return float(np.square(seen).sum()) < 1 / FLAT**2
 
     @property
     def dry(self) -> float:

@@ -240,7 +240,7 @@ class StepwiseSelection:
         tried = []
         if found.asks_for_more():
             tried += self._with(current, found, shortlist(current, found))
-            if any(model and model.effects_at_bound for model in tried):
+            if any(model and model.effects_at_end for model in tried):
                 # no fuller form: a load larger than friction is no asymmetric friction
                 tried += self._with(current, found, shortlist(current, found, fuller=False))
         if found.left < ALARM and not here:

@@ -18,7 +18,7 @@ from ..identify.prepare import Prepared
 from ..identify.problem import Unknowns
 from ..identify.refine import Optimum
 from ..identify.solve import POOR, Solved, searched
-from ..identify.uncertainty import FLAT, information_of
+from ..identify.uncertainty import information_of
 from ..progress import ReportProgress
 from ..threads import side_by_side, side_by_side_until
 from .candidates import TRIALS, Values
@@ -283,7 +283,7 @@ class Refits:
         coordinates = []
         for name, log in zip(parameters.names, parameters.logarithmic, strict=True):
             effect, _, field = name.partition(".")
-            if name in before and not (field and self._lost(current, name)):
+            if name in before and not (field and current.is_lost(name)):
                 coordinates.append(before[name])
             else:
                 value = values.get(effect, self.begun.get(effect, {}))[field]
@@ -292,14 +292,6 @@ class Refits:
         runs = unknowns.runs._replace(angle=unknowns.runs.angle + angles)
         start = Unknowns(jnp.asarray(inside), runs)
         return given, Optimum(start, np.inf, (), False)
-
-    def _lost(self, model: Model, name: str) -> bool:
-        """Whether an effect's parameter has gone where no run sees it, so that nothing leads it back."""
-        column = model.given.problem.parameters.names.index(name)
-        seen = np.asarray(model.fit.evaluation.jacobian)[
-            model.given.problem.fitted_blocks, ..., column
-        ]
-        return float(np.square(seen).sum()) < 1 / FLAT**2
 
 
 def _with_another(here: tuple[str, ...], effect: str) -> tuple[str, ...]:
