@@ -242,6 +242,28 @@ def test_a_rotor_that_sticks_for_long_is_found_by_searching_anew():
 
 
 @pytest.mark.slow
+def test_a_load_that_is_larger_than_friction_drives_the_motor_backwards():
+    """As a hoist at rest: a friction that is none in one direction comes near, and a filter of so short runs takes for
+    noise what it leaves."""
+    motor = {"R": 4.0, "L": 2e-3, "Kb": 0.012, "Kt": 0.012, "J": 1e-6, "f": 1.5e-6}
+    dry, weight = 3e-3, 4e-3
+    plant = Plant(**motor, friction_forward_Nm=dry, friction_backward_Nm=dry, load_Nm=weight)
+    rng, time, runs = np.random.default_rng(31), 0.01 * np.arange(600), []
+    for name, voltage in {
+        "steps": np.repeat(rng.choice([0.0, 3.6, 6.0, 8.4, 10.8], 24), 25),
+        "ramp": np.interp(time, [0.0, 1.0, 4.0, 6.0], [0.0, 0.0, 10.8, 3.2]),
+    }.items():
+        excitation, bench = vb.Excitation(time, voltage, 0 * time), Bench({}, encoder_lines=256)
+        columns = record(plant, excitation, rng, vb.Noise(0.01, 0.0), bench)
+        runs.append(Recording(name, *(columns[q] for q in QUANTITIES)))
+    found = diagnose(runs, unloaded=True, tie=[("Kt", "Kb")])
+    assert found.verdict == "named"
+    by_name = {effect.name: effect.parameters["torque_Nm"].value for effect in found.effects}
+    assert by_name == pytest.approx({"coulomb_friction": dry, "constant_load": weight}, rel=0.01)
+    assert found.final.missed == {}  # as much is left as encoder and current sensor make
+
+
+@pytest.mark.slow
 def test_a_bearing_that_seizes_is_no_coulomb_friction():
     """Torque noise is slow too, but does not turn with the direction of motion."""
     plant = Plant(**PAPER, seizing_Nm=0.04, seizing_from_s=1.0)

@@ -44,8 +44,8 @@ SWALLOWED = 1e-2
 FORETOLD = 0.05
 # So many noise variances left are no small misfit beside which a refit to first order finds its way
 LOST = 10.0
-# The simplest effect by which a rotor sticks
-DRY = "coulomb_friction"
+# The simplest effect by which a rotor sticks, what looks like it and a load together, and that load
+DRY, ONE_SIDED, LOAD = "coulomb_friction", "asymmetric_friction", "constant_load"
 
 
 class Naming(NamedTuple):
@@ -260,7 +260,8 @@ class StepwiseSelection:
     ) -> list[Model | None]:
         """The motor with dry friction, searched for anew, if that may explain a misfit of which no first-order response
         is clear, or was the best that was `tried` and left it far from the noise, and now leaves far less: a motor
-        whose rotor sticks for long is far from one that is thought to creep."""
+        whose rotor sticks for long is far from one that is thought to creep. With a load, too, where friction was to
+        be none in one direction: a load that is larger than friction drives the rotor that way."""
         possible = [model for model in tried if model is not None and model.is_possible]
         if possible:
             nearest = min(possible, key=lambda m: m.fit.fitness)
@@ -273,8 +274,10 @@ class StepwiseSelection:
         far = nearest.fit.fitness / FAR
         if not sticks or far < noise:  # not even a perfect fit would
             return []
-        model = self.refits.sought(current, DRY)
-        return [model] if model.fit.fitness < far else []
+        searched = [self.refits.sought(current, DRY)]
+        if ONE_SIDED in nearest.effects_at_end:
+            searched.append(self.refits.sought(searched[0], LOAD))
+        return [model for model in searched if model.fit.fitness < far]
 
     def _in_other_form(
         self, model: Model, found: Assessment, added: set[str]

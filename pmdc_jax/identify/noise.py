@@ -56,8 +56,8 @@ def resolution(values: Float[np.ndarray, " values"]) -> float:
 
 
 def quantum(steps: Float[np.ndarray, " steps"]) -> float:
-    """The step of which all steps are multiples, zero if there is none."""
-    sizes = np.abs(steps)
+    """The step of which all steps are multiples, zero if there is none; those that are not known do not count."""
+    sizes = np.abs(steps[~np.isnan(steps)])
     # a number divided by another one differs from itself by its last bits
     sizes = sizes[sizes > ROUNDING * np.max(sizes, initial=0.0)]
     if not len(sizes):
