@@ -42,6 +42,8 @@ NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
 SWALLOWED = 1e-2
 # What is to take away most of a misfit foretells this share of it, at least
 FORETOLD = 0.05
+# A simpler form leaves at most so many times the squares, as they are
+HARDLY_MORE = 1.5
 # So many noise variances left are no small misfit beside which a refit to first order finds its way
 LOST = 10.0
 # The simplest effect by which a rotor sticks, what looks like it and a load together, and that load
@@ -407,11 +409,14 @@ class StepwiseSelection:
 
     def _does_as_well(self, simpler: Model, model: Model) -> bool:
         """Whether a simpler form of an effect, chosen while another one was still missing, does as well by now: but for
-        less than what neither explains."""
+        less than what neither explains; or leaves nothing to its own filter, and hardly more with no filter between."""
         rich, plain = (
             self.comparison.left(m, self.comparison.white(model)).criterion
             for m in (model, simpler)
         )
         rest = self.assess(model)
         margin = MARGIN + (rest.clearest.gain if rest.left < ALARM else 0.0)
-        return bool(plain < rich + margin) or self.assess(simpler).left >= ALARM
+        if plain < rich + margin:
+            return True
+        hardly_more = simpler.fit.fitness < HARDLY_MORE * model.fit.fitness
+        return bool(hardly_more and self.assess(simpler).left >= ALARM)
