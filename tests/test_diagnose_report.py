@@ -130,6 +130,13 @@ def test_a_named_effect_in_words():
     assert "static_Nm" not in told
 
 
+def test_it_is_told_where_the_equation_is_off_that_lacked_something():
+    """However far parameters that make up for it have brought the other one out of balance."""
+    louder = Region("electrical", "current", (0.0, 4.0), 90.0)
+    told = words(named(where=(louder, *named().where)))
+    assert "disagree in the mechanical equation, below 20.0 rad/s" in told
+
+
 def test_nothing_found_says_what_would_have_been_seen():
     told = words(none_detected())
     assert "No missing effect was detected" in told

@@ -213,8 +213,10 @@ def _equation_and_variable(region: Region) -> tuple[str, str]:
 
 
 def _disagreement_sentence(diagnosis: Diagnosis) -> str:
-    where = disagreement(diagnosis.where, diagnosis.base.fit)
-    return f"Simulation and measurement disagree {where}."
+    # parameters that make up for what is missing bring the other equation out of balance, too
+    of = {"electrical" if e.equation == "input" else e.equation for e in diagnosis.effects}
+    regions = [region for region in diagnosis.where if region.equation in of] or diagnosis.where
+    return f"Simulation and measurement disagree {disagreement(regions, diagnosis.base.fit)}."
 
 
 def _effects_in_words(diagnosis: Diagnosis) -> str:
