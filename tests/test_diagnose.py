@@ -117,6 +117,7 @@ class Undecided(StepwiseSelection):
 
     assess = staticmethod(lambda model: Mock(spec=Assessment, unexplained=np.inf))
     _by_unfiltered_misfit = staticmethod(lambda *models: None)
+    _by_likeliest_effect = staticmethod(lambda *models: None)
     _best = staticmethod(lambda tried, white: tried[0])
     _eliminated = staticmethod(lambda model: model)
     _explains_more_than_a_formula = staticmethod(lambda *models: True)
@@ -153,6 +154,27 @@ def test_what_only_mends_a_formula_does_not_hide_what_plain_squares_find():
 def test_what_promises_little_by_plain_squares_is_not_tried(gains, least, listed):
     found = promising(promises_of(gains, unexplained=0.0).of_candidates, set(), least)
     assert [effect_of(signal) for signal in found] == list(gains)[:listed]
+
+
+@pytest.mark.parametrize("settles", [True, False])
+def test_of_what_promises_little_beside_a_curve_that_is_kept_which_settles_it(settles):
+    """Friction and drag, which viscous friction makes up for: no single effect does much, and each more than it
+    seems."""
+    gains = {
+        "torque_constant_saturation": 74.0,
+        "stribeck_friction": 60.0,
+        "brush_voltage_drop": 5.0,
+    }
+    found = promises_of(gains, unexplained=np.inf)
+    found.left, found.is_formula = 0.0, lambda model: False
+    selection, tried = StepwiseSelection.__new__(StepwiseSelection), Mock(spec=Model)
+    selection.refits = Mock(with_signal=Mock(return_value=tried))
+    selection._better = lambda current, found, models: models[-1]
+    selection._leaves_little = lambda current, better: settles
+    better = selection._by_likeliest_effect(Mock(spec=Model, effects=()), found)
+    assert better is (tried if settles else None)
+    asked = [effect_of(call.args[1]) for call in selection.refits.with_signal.call_args_list]
+    assert asked == list(gains)[:2]
 
 
 @pytest.mark.parametrize(("count", "left", "asked"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])
