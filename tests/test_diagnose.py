@@ -563,7 +563,7 @@ def test_response_is_the_change_of_the_simulation(x64, name):
     without, with_it = (free_run(m, tape, own) for m in (bare, motor))
     path = path_of(without, tape, BEGUN, False)
     if EFFECTS[name].equation == "sensor":
-        found = sensed(motor, tape, path)
+        found = sensed(motor, bare, tape, path)
     else:
         found = respond(bare, tape, path, kicks(motor, bare, tape, path)[..., None])[..., 0]
     expected = (with_it - without).transpose(2, 1, 0)
