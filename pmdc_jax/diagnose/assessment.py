@@ -9,7 +9,7 @@ import numpy as np
 
 from ..effects import EFFECTS
 from ..effects.base import AbstractEffect
-from .effect_relations import CONTAINS, FULLER
+from .effect_relations import CONTAINS, FULLER, unbalances
 from .library import Curve
 from .model import Model
 from .screen import Screen, Signal
@@ -146,4 +146,4 @@ def _is_own(one: Curve | type[AbstractEffect], model: Model) -> bool:
 
 
 def _axes(one: Curve | type[AbstractEffect]) -> tuple[str, str | None]:
-    return ("electrical" if one.equation == "input" else one.equation, one.variable)
+    return unbalances(one.equation), one.variable

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..identify.generalised_least_squares import residuals_of, series_of
-from ..identify.noise import resolution_noise, white_noise
+from ..identify.noise import noise_of_sensor, white_noise
 from ..identify.noise_model import Series
 from ..motor import Drive, Motor
 from ..recording import OVER_LAST
@@ -117,5 +117,4 @@ def _flows(
 def _noise(measured: Float[np.ndarray, " samples"], left: Float[np.ndarray, " samples"]) -> float:
     """Standard deviation of a sensor's white noise: by what was measured, or by what a model leaves of it, which shows
     it better the rougher the motion is, unless the sensor's own steps are coarser."""
-    by_fit = max(white_noise([left]) or 0.0, resolution_noise([measured]))
-    return min(white_noise([measured]) or np.inf, by_fit)
+    return min(white_noise([measured]) or np.inf, noise_of_sensor(measured, left))

@@ -14,7 +14,7 @@ Verdict = Literal["none_detected", "named", "ambiguous", "not_in_library"]
 
 
 # Sensors' own ways, and formulas that are not quite nature's, leave up to 1.4 times the noise in the electrical
-# equation; what is not in the library, such as a filter of the current, three times and more
+# equation; what is not in the library, such as a mean of many samples of the current, three times and more
 MAX_ELECTRICAL = 3.0
 # ... or more than a trace, and more than this share of what the motor without effects leaves: those that were added
 # are then not what is missing there

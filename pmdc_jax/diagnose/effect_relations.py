@@ -10,6 +10,12 @@ CONTAINS = {effect: trial.contains for effect, trial in TRIALS.items() if trial.
 FULLER = {effect: trial.fuller for effect, trial in TRIALS.items() if trial.fuller}
 
 
+def unbalances(equation: str) -> str:
+    """The equation that is out of balance for want of an effect in another one: a voltage lost on the way to the
+    terminals is missing in the electrical one."""
+    return "electrical" if equation == "input" else equation
+
+
 def are_rivals(a: set[str], b: set[str]) -> bool:
     """Not the same, none a part of the other, and none with an effect in place of one that it contains."""
     return bool(a) and not (a <= b or b <= a or _same_class(a, b) or _contains(a, b))

@@ -68,15 +68,19 @@ class Model:
     def effects_at_end(self) -> set[str]:
         """The effects of which a parameter is held at its bound, or has gone where no run sees it."""
         names = self.given.problem.parameters.names
-        ended = [names[k] for k in self.fit.at_bound] + [n for n in names if self.is_lost(n)]
+        ended = {names[k] for k in self.fit.at_bound} | self.lost
         return {name.partition(".")[0] for name in ended} & set(self.effects)
 
-    def is_lost(self, name: str) -> bool:
-        """Whether a parameter has gone where no run sees it, so that nothing leads it back."""
+    @property
+    def lost(self) -> set[str]:
+        """The parameters that have gone where no run sees them, so that nothing leads them back."""
         problem = self.given.problem
-        jacobian = np.asarray(self.fit.evaluation.jacobian)[problem.fitted_blocks]
-        seen = jacobian[..., problem.parameters.names.index(name)]
-        return float(np.square(seen).sum()) < 1 / FLAT**2
+        names = problem.parameters.names
+        # columns of each run's own unknowns follow those of the parameters
+        jacobian = np.asarray(self.fit.evaluation.jacobian)
+        columns = jacobian[problem.fitted_blocks][..., : len(names)]
+        seen = np.square(columns).reshape(-1, len(names)).sum(axis=0)
+        return {name for name, square in zip(names, seen, strict=True) if square < 1 / FLAT**2}
 
     @property
     def dry(self) -> float:

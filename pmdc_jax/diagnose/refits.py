@@ -280,10 +280,10 @@ class Refits:
         before = dict(zip(names, np.asarray(unknowns.coordinates) + near, strict=True))
         for effect, new in values.items():
             self.begun.setdefault(effect, new)
-        coordinates = []
+        coordinates, lost = [], current.lost
         for name, log in zip(parameters.names, parameters.logarithmic, strict=True):
             effect, _, field = name.partition(".")
-            if name in before and not (field and current.is_lost(name)):
+            if name in before and not (field and name in lost):
                 coordinates.append(before[name])
             else:
                 value = values.get(effect, self.begun.get(effect, {}))[field]

@@ -13,6 +13,7 @@ from ..effects import EFFECTS
 from ..identify.noise_model import Series, Whitener, plain, whitener
 from ..simulate import LOCAL
 from .candidates import Candidate
+from .effect_relations import unbalances
 from .evidence import Block, Evidence, blocks_of, products
 from .library import Curve, Library, curves_over
 from .model import Model
@@ -180,7 +181,7 @@ def _waver(found: Screen) -> Block | None:
 def _is_voltage(of: Candidate | Curve) -> bool:
     """Whether something is a voltage: what is left of the noise of the recorded one may look like it."""
     equation = EFFECTS[of.effect].equation if isinstance(of, Candidate) else of.equation
-    return equation in ("electrical", "input")
+    return unbalances(equation) == "electrical"
 
 
 def _is_slow_torque(of: Candidate | Curve) -> bool:

@@ -31,6 +31,15 @@ def white_noise(signals: Sequence[np.ndarray]) -> float | None:
     return float(max(spread, resolution_noise(known), FLOOR * size, 1e-12))
 
 
+def noise_of_sensor(measured: np.ndarray, left: np.ndarray) -> float:
+    """Standard deviation of the white noise of a sensor by what a model leaves of it, zero where too little is known.
+
+    No less than its steps make: most of what is left of a motor at rest does not change, however coarse an encoder is.
+    """
+    white = white_noise([left])
+    return max(white, resolution_noise([measured])) if white else 0.0
+
+
 def is_coarse(signal: np.ndarray) -> bool:
     """Whether a signal moves in steps that its noise does not blur: errors then last as long as it stands still."""
     known = signal[~np.isnan(signal)]

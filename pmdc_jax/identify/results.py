@@ -14,7 +14,7 @@ from ..simulate import RunUnknowns, Tape
 from ..threads import side_by_side
 from .identifiability import SHARE, explain
 from .identification import Estimate, Identification, Role, RunFit, Status
-from .noise import resolution_noise, white_noise
+from .noise import noise_of_sensor, white_noise
 from .parameters import Parameters, unit_of
 from .polish import Fit, fit_run_unknowns, polish
 from .prepare import Prepared
@@ -272,10 +272,9 @@ def _missed(fit: Mapping[str, RunFit]) -> dict[str, float]:
     times = {}
     for name in ("current", "speed"):
         scaled = [
-            # most of what is left of a motor at rest does not change, however coarse its encoder
-            left / max(white, resolution_noise([measured]))
+            left / noise
             for measured, left in _measured_and_left(fit, name)
-            if (white := white_noise([left]))
+            if (noise := noise_of_sensor(measured, left))
         ]
         times[name] = _rms(np.concatenate(scaled)) if scaled else 0.0
     return {name: much for name, much in times.items() if much > MISSED}

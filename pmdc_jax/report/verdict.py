@@ -15,7 +15,7 @@ from ..diagnose.diagnosis import (
     unlike_held_out,
     worse_held_out,
 )
-from ..diagnose.effect_relations import CONTAINS
+from ..diagnose.effect_relations import CONTAINS, unbalances
 from ..identify.identification import Estimate, Role, RunFit
 from .notation import (
     effect_words,
@@ -214,7 +214,7 @@ def _equation_and_variable(region: Region) -> tuple[str, str]:
 
 def _disagreement_sentence(diagnosis: Diagnosis) -> str:
     # parameters that make up for what is missing bring the other equation out of balance, too
-    of = {"electrical" if e.equation == "input" else e.equation for e in diagnosis.effects}
+    of = {unbalances(effect.equation) for effect in diagnosis.effects}
     regions = [region for region in diagnosis.where if region.equation in of] or diagnosis.where
     return f"Simulation and measurement disagree {disagreement(regions, diagnosis.base.fit)}."
 
