@@ -27,6 +27,7 @@ from pmdc_jax.identify.binary_ga import BinaryGA
 from pmdc_jax.identify.bounds import effect_bounds
 from pmdc_jax.identify.generalised_least_squares import last_fit, residuals_of
 from pmdc_jax.identify.identification import Identification
+from pmdc_jax.identify.nearby import best_nearby
 from pmdc_jax.identify.noise import is_coarse, quantum, resolution, white_noise
 from pmdc_jax.identify.noise_model import whitener
 from pmdc_jax.identify.parameters import Parameters
@@ -965,6 +966,25 @@ def test_a_run_may_begin_anywhere_in_the_play(twist):
             for own in (fit_run_unknowns(problem, begun, 8)[0], truth)
         )
     assert fitted < 1.01 * right
+
+
+def test_populations_find_a_gear_where_a_slope_ends_elsewhere():
+    factors = {"gap_rad": 10.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2}
+    off = {"gap_rad": 0.3, "stiffness_Nm_rad": 0.2, "damping_Nms_rad": 3.0, "load_share": 1.5}
+    with jax.enable_x64(True):
+        problem, truth = behind_a_gear(gap=0.3, load=0.0)
+        names = [f"gear_backlash.{field}" for field in off]
+        columns = jnp.array([problem.parameters.names.index(name) for name in names])
+        moved = truth.coordinates.at[columns].add(jnp.log(jnp.array([*off.values()])))
+        begun = Optimum(truth._replace(coordinates=moved), np.inf, (), False)
+        start = polish(problem, begun, steps=0)
+        sought = dict(zip(names, factors.values(), strict=True))
+        slope = polish(problem, begun)
+        found = polish(problem, best_nearby(problem, start, sought, seed=0))
+        gap, *_, share = np.exp(np.asarray(found.coordinates - truth.coordinates)[columns])
+    assert found.fitness < 0.5 * slope.fitness
+    assert gap == pytest.approx(1, abs=0.03)
+    assert share == pytest.approx(1, abs=0.03)
 
 
 @pytest.mark.parametrize("turned_by", [0.0, 0.2, 0.45, -0.3])

@@ -233,18 +233,12 @@ def _shaft_starts(scales: Scales) -> list[Values]:
 
 def _backlash_starts(scales: Scales) -> list[Values]:
     """Of teeth that are stiff beside everything else."""
-    return [
-        {"gap_rad": gap, **_shaft(100.0, scales, share, 0.3)}
-        for gap in (0.1, 0.03, 0.01)
-        for share in (0.6, 0.3)
-    ]
+    return [{"gap_rad": 0.03, **_shaft(100.0, scales, 0.45, 0.3)}]
 
 
-def _other_teeth(gear: Values) -> list[Values]:
-    """Stiffer and softer ones; how fast they come to rest, their damping says and not their stiffness."""
-    stiffness = "stiffness_Nm_rad"
-    return [{stiffness: times * gear[stiffness]} for times in (10.0, 3.0, 1.7, 0.6)]
-
+# Within which factor of that each is sought: how fast teeth come to rest, their damping says and not their stiffness,
+# of which as good as nothing is known
+TEETH = {"gap_rad": 10.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2.0}
 
 # A peak of dry friction that is clearly one: as high again, within this share of the speeds that occur
 PEAK, SLOW = 2.0, 0.05
@@ -301,8 +295,8 @@ class Trial(NamedTuple):
     columns: Rows
     # where else to begin refitting it, one start after another, if it is easily fitted wrongly
     starts: Callable[[Scales], list[Values]] | None = None
-    # what else to try from where its refit ended, if it has many optima
-    around: Callable[[Values], list[Values]] | None = None
+    # within which factors of a start populations seek it first, by field, if it has many optima
+    factors: Mapping[str, float] = MappingProxyType({})
     # effects that it contains, and replaces
     contains: frozenset[str] = frozenset()
     # effects that look much like it, each with how it would begin in its place
@@ -329,7 +323,7 @@ TRIALS: Mapping[str, Trial] = {
     "shaft_compliance": Trial(
         _compliance, starts=_shaft_starts, fuller=Fuller("gear_backlash", _with_play, ("gap_rad",))
     ),
-    "gear_backlash": Trial(_no_columns, starts=_backlash_starts, around=_other_teeth),
+    "gear_backlash": Trial(_no_columns, starts=_backlash_starts, factors=TEETH),
     "brush_voltage_drop": Trial(_amplitude("voltage_V", lambda s: s.voltage)),
     "resistance_heating": Trial(
         _amplitude("rise_per_W", lambda s: 1 / (s.voltage * s.current), time_constant_s=_thermal)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from ..effects import EFFECTS
 from ..identify.generalised_least_squares import residuals_of, whitened
 from ..identify.identifiability import moved_by
+from ..identify.nearby import best_nearby
 from ..identify.noise_model import Whitener, whitener
 from ..identify.polish import best_backlash_start, polish
 from ..identify.prepare import Prepared
@@ -20,7 +21,7 @@ from ..identify.refine import Optimum
 from ..identify.solve import POOR, Solved, searched
 from ..identify.uncertainty import information_of
 from ..progress import ReportProgress
-from ..threads import side_by_side, side_by_side_until
+from ..threads import side_by_side_until
 from .candidates import TRIALS, Values
 from .compare import Comparison
 from .effect_relations import CONTAINS, FULLER, spelt_out
@@ -199,7 +200,11 @@ class Refits:
 
     def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener) -> Model:
         """The best refit of several, begun one after another until one is as good as the noise or found twice."""
-        given = starts[0][0]
+        given, seed = starts[0][0], self.solved.seed
+        runs = starts[0][1].unknowns.runs
+        factors = {f"{effects[-1]}.{f}": times for f, times in TRIALS[effects[-1]].factors.items()}
+        if factors:
+            starts = [(given, _nearby(given, start, factors, seed)) for _, start in starts]
 
         def enough(ends: list[Optimum]) -> bool:
             least, *others = sorted(end.fitness for end in ends)
@@ -208,10 +213,9 @@ class Refits:
 
         ends = side_by_side_until(_roughly, starts, enough)
         best = min(ends, key=lambda end: end.fitness)
-        unknowns = best_backlash_start(given.problem, best.unknowns, starts[0][1].unknowns.runs)
-        begun = best._replace(unknowns=unknowns)
-        if around := TRIALS[effects[-1]].around:
-            return _best_around(effects, given, begun, around)
+        begun = best._replace(unknowns=best_backlash_start(given.problem, best.unknowns, runs))
+        if factors:
+            return _best_around(effects, given, begun, factors, seed)
         return refit_from(effects, given, begun, white)
 
     def _refitted(
@@ -318,24 +322,26 @@ def _best_around(
     effects: tuple[str, ...],
     given: Prepared,
     begun: Optimum,
-    around: Callable[[Values], list[Values]],
+    factors: Mapping[str, float],
+    seed: int,
 ) -> Model:
-    """The best refit from a start and from around where that ends, where the last effect has many optima, by the filter
-    of what the start leaves."""
+    """The best refit from a start and from where populations around its end lead, by the filter of what it leaves."""
     white = whitener(residuals_of(given, polish(given.problem, begun, steps=0)))
-    model, sharp = refit_from(effects, given, begun, white), whitened(given, white)
-    here = polish(sharp.problem, model.fit.optimum, steps=0).optimum
-    effect, names = effects[-1], sharp.problem.parameters.names
-    columns = {field: names.index(f"{effect}.{field}") for field in EFFECTS[effect].ranges}
-    coordinates = np.asarray(here.unknowns.coordinates)
-    starts = []
-    for values in around({f: float(np.exp(coordinates[k])) for f, k in columns.items()}):
-        elsewhere = coordinates.copy()
-        elsewhere[[columns[field] for field in values]] = np.log(list(values.values()))
-        unknowns = here.unknowns._replace(coordinates=jnp.asarray(elsewhere))
-        starts.append((sharp, Optimum(unknowns, np.inf, (), False)))
-    best = min(side_by_side(_roughly, starts), key=lambda end: end.fitness)
-    return refit_from(effects, given, best, white) if best.fitness < here.fitness else model
+    sharp = whitened(given, white).problem
+
+    def left(model: Model) -> float:
+        return polish(sharp, model.fit.optimum, steps=0).fitness
+
+    model = refit_from(effects, given, begun, white)
+    nearer = {name: np.sqrt(times) for name, times in factors.items()}
+    elsewhere = _nearby(given, model.fit.optimum, nearer, seed)
+    return min((model, refit_from(effects, given, elsewhere, white)), key=left)
+
+
+def _nearby(given: Prepared, start: Optimum, factors: Mapping[str, float], seed: int) -> Optimum:
+    """The best of populations around a start."""
+    fit = polish(given.problem, start, steps=0)
+    return best_nearby(given.problem, fit, factors, seed)
 
 
 def _turns(model: Model, effect: str) -> list[np.ndarray | None]:

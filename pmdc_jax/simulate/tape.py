@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -137,6 +138,13 @@ class Tape(eqx.Module):
     def runs(self) -> int:
         """Number of runs, with those of which nothing was measured."""
         return self.initial.shape[0]
+
+    def first_blocks(self, count: int) -> Tape:
+        """The tape cut off after so many blocks, and as many more as make a usual shape."""
+        count = min(_round_up(count), len(self.run))
+        names = ("value", "load", "measured", "weight", "run", "begins", "grid", "turn", "rise")
+        signals = {name: getattr(self, name) for name in names}
+        return replace(self, **{n: s if s is None else s[:count] for n, s in signals.items()})
 
     def blocks_of(self, run: int) -> Bool[np.ndarray, " blocks"]:
         """Which blocks are of one run."""

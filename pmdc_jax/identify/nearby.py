@@ -1,0 +1,66 @@
+"""A population around a fit: where a slope leads no further than the next of many optima."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..motor import PARAMETERS
+from ..simulate import Tape
+from .parameters import Parameters
+from .polish import Fit
+from .problem import Problem, Unknowns
+from .refine import Optimum
+from .search import search
+
+# Evaluated as fast as a smaller one: what takes long is to go through the samples one after another
+POPULATION, GENERATIONS = 64, 20
+
+
+def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: int) -> Optimum:
+    """The best point of a search (`search`) among some parameters around those of a fit, while all others stay.
+
+    **Arguments**: `factors`, by parameter: it is sought within so many times and one over so many times what it is.
+    """
+    parameters, coordinates = problem.parameters, np.array(fit.coordinates)
+    values = {name: parameters.value(name, coordinates) for name in parameters.names}
+    bounds = {name: (value, value) for name, value in values.items() if name in PARAMETERS}
+    for name, factor in factors.items():
+        effect, _, field = name.partition(".")
+        its = next(e for e in parameters.effects if e.name == effect).ranges[field]
+        bounds[name] = (
+            max(values[name] / factor, its.lower),
+            min(values[name] * factor, its.upper),
+        )
+    known = {name: float(value) for name, value in parameters.known.items()}
+    known |= {name: value for name, value in values.items() if name not in factors}
+    sought = Parameters.of(bounds, parameters.effects, known, parameters.ties)
+    # a fit that cannot be simulated leaves none
+    noise = np.where(np.isfinite(fit.noise), fit.noise, problem.noise)
+    found = search(
+        sought,
+        _as_fitted(problem, fit.unknowns),
+        noise,
+        seed=seed,
+        population=POPULATION,
+        generations=GENERATIONS,
+    )
+    coordinates[[parameters.names.index(name) for name in sought.names]] = found.candidates[0]
+    unknowns = fit.unknowns._replace(coordinates=jnp.asarray(coordinates))
+    return Optimum(unknowns, np.inf, (), False)
+
+
+def _as_fitted(problem: Problem, unknowns: Unknowns) -> Tape:
+    """The runs that count, each begun and loaded as its own unknowns say."""
+    tape, fitted = problem.tape, problem.fitted_blocks
+    offset = jnp.where(tape.load_unknown, unknowns.runs.load_offset, 0.0)[tape.run]
+    counting = replace(
+        tape,
+        weight=tape.weight * fitted[:, None, None],
+        load=tape.load + offset[:, None],
+        initial=jnp.stack([unknowns.runs.current, unknowns.runs.speed], 1),
+    )
+    return counting.first_blocks(int(np.flatnonzero(fitted)[-1]) + 1)
