@@ -15,7 +15,7 @@ each of which does nothing unless the effect overrides it:
 - `repeats_after`: after how much of a state everything is as before
 - `linear`: the linear effect that it is, or nearly is, whose states then join the exact step
 - `fastest_rate`: how much faster it makes the motor
-- `sensors` and `speed_delay`: how current and speed are seen
+- `sensors`, `speed_delay` and `speed_before_sensor`: how current and speed are seen, and how the rotor turned
 
 New effects are one class here and one row in the table `EFFECTS` of this package.
 """
@@ -181,3 +181,10 @@ class AbstractEffect(eqx.Module):
     def speed_delay(self) -> Scalars | None:
         """By how many seconds the reported speed is late; None for not at all."""
         return None
+
+    def speed_before_sensor(
+        self, reported: Float[np.ndarray, " samples"], time: Float[np.ndarray, " samples"]
+    ) -> Float[np.ndarray, " samples"]:
+        """The speed of the rotor, rad/s, from what the sensor reported of it, free of noise, at each time in s."""
+        del time
+        return reported

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+import numpy as np
+from jaxtyping import Float
+
 from .base import AbstractEffect, ParameterRange, Scalars, State
 
 if TYPE_CHECKING:
@@ -44,6 +47,11 @@ class SpeedSensorLag(AbstractEffect):
         del speed
         return current, state.extra["reported_speed"]
 
+    def speed_before_sensor(
+        self, reported: Float[np.ndarray, " samples"], time: Float[np.ndarray, " samples"]
+    ) -> Float[np.ndarray, " samples"]:
+        return reported + float(self.time_constant_s) * np.gradient(reported, time)
+
 
 class SpeedSensorDelay(AbstractEffect):
     """Delay: the reported speed is y(t) = w(t - delay_s); before a run began, w as it began.
@@ -64,6 +72,11 @@ class SpeedSensorDelay(AbstractEffect):
 
     def speed_delay(self) -> Scalars:
         return self.delay_s
+
+    def speed_before_sensor(
+        self, reported: Float[np.ndarray, " samples"], time: Float[np.ndarray, " samples"]
+    ) -> Float[np.ndarray, " samples"]:
+        return np.interp(time + float(self.delay_s), time, reported)
 
 
 class CurrentSensorOffset(AbstractEffect):

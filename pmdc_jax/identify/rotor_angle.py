@@ -36,8 +36,9 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
 
     The angle is the integral of the speed. That of the measured one strays by the sensor's noise, that of the
     simulated one by whatever torque disturbs the motor: the speed is the simulated one, of the rotor itself, and that
-    part of the misfit that is motion.
+    part of the misfit that is motion, before a sensor made it late.
     """
+    motor = problem.parameters(fit.coordinates)
     tape, seen = problem.tape, np.asarray(fit.evaluation.seen)
     rotor = np.asarray(of_rotor(problem, fit))
     turn, run = np.array(tape.turn), np.asarray(tape.run)
@@ -54,7 +55,11 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
         end = known[-1] + 1
         error = np.where(weight[:end] > 0, measured[:end] - simulated[:end], 0.0)
         speed = rotor[mine, 1].reshape(-1).copy()
-        speed[:end] += motion(error)
+        time = np.cumsum(np.repeat(length[mine], turn.shape[1]))[:end]
+        missed = motion(error)
+        for effect in motor.effects:
+            missed = effect.speed_before_sensor(missed, time)
+        speed[:end] += missed
         ahead = np.append(speed[1:], speed[-1])
         turn[mine] = ((speed + ahead) / 2).reshape(turn[mine].shape) * length[mine, None]
     return eqx.tree_at(lambda p: p.tape.turn, problem, jnp.asarray(turn))
