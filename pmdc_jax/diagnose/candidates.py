@@ -233,12 +233,12 @@ def _shaft_starts(scales: Scales) -> list[Values]:
 
 def _backlash_starts(scales: Scales) -> list[Values]:
     """Of teeth that are stiff beside everything else."""
-    return [{"gap_rad": 0.03, **_shaft(100.0, scales, 0.45, 0.3)}]
+    return [{"gap_rad": 0.05, **_shaft(100.0, scales, 0.45, 0.3)}]
 
 
 # Within which factor of that each is sought: how fast teeth come to rest, their damping says and not their stiffness,
 # of which as good as nothing is known
-TEETH = {"gap_rad": 10.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2.0}
+TEETH = {"gap_rad": 40.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2.0}
 
 # A peak of dry friction that is clearly one: as high again, within this share of the speeds that occur
 PEAK, SLOW = 2.0, 0.05

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeGuard
 
 import numpy as np
@@ -88,9 +88,10 @@ class StepwiseSelection:
         while better := self._step(current, found):
             current, found = better, self.assess(better)
             self.superseded.add(current)
-        return self._naming(
-            self._better(current, found, self._equivalent_swaps(current, found)) or current
-        )
+        others = self._equivalent_swaps(current, found)
+        if found.left < ALARM:  # however little: beside a large effect play in a gear is a trace
+            others += self._in_harder_form(current, found, set(current.effects))
+        return self._naming(self._better(current, found, others) or current)
 
     def _step(self, current: Model, found: Assessment) -> Model | None:
         """A better model than the current one, with one effect more or another one, that settles something, if there is
@@ -104,13 +105,21 @@ class StepwiseSelection:
 
     def _accepted(self, current: Model, found: Assessment, better: Model | None) -> Model | None:
         """A better model if it is more than a way to mend a formula, or else in another form that is."""
-        if better is None or self._explains_more_than_a_formula(current, found, better):
+        return self._in_a_form_that(
+            lambda model: self._explains_more_than_a_formula(current, found, model), current, better
+        )
+
+    def _in_a_form_that(
+        self, settles: Callable[[Model], bool], current: Model, better: Model | None
+    ) -> Model | None:
+        """A better model if it settles what is left, or else what was added to it in another form, if that does."""
+        if better is None or settles(better):
             return better
         # a simple form may be but a step to the one that is there
         added = set(better.effects) - set(current.effects)
         again = self.assess(better)
         best = self._better(better, again, self._in_other_form(better, again, added))
-        return best if best and self._explains_more_than_a_formula(current, found, best) else None
+        return best if best and settles(best) else None
 
     def _by_evidence(self, current: Model, found: Assessment) -> Model | None:
         """The best of the models that the evidence asks to be tried."""
@@ -172,7 +181,9 @@ class StepwiseSelection:
         else:
             most = shortlist(current, found)
         better = self._better(current, found, self._with(current, found, most))
-        return better if better and self._leaves_little(current, better) else None
+        return self._in_a_form_that(
+            lambda model: self._leaves_little(current, model), current, better
+        )
 
     def _by_unfiltered_misfit(self, current: Model, found: Assessment) -> Model | None:
         """The current model with one of the effects that take away most of what is left, no filter between, if that
