@@ -124,7 +124,7 @@ class Motor(eqx.Module):
         """
         shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (current, speed, load, angle, self.R)))
         current, speed, load, angle = (jnp.zeros(shape) + x for x in (current, speed, load, angle))
-        extra = {}
+        load, extra = self._whole_load(load), {}
         for effect in self.effects:
             extra |= effect.initial_states(speed, load, angle)
         return State(current, speed, extra)
@@ -150,6 +150,7 @@ class Motor(eqx.Module):
         v, c, t, free = drive or Drive()
         state = state._replace(current=v * state.current + c * value)
         direction_i, direction_w = moving or (jnp.sign(state.current), jnp.sign(state.speed))
+        load = self._whole_load(load)
         motor, voltage, torque = self.at(state), value, load
         drop = _opposing(self.grip("current", state), direction_i)
         extra = {}
@@ -167,6 +168,9 @@ class Motor(eqx.Module):
         driving = motor.Kt * state.current + t * value
         speed_rate = free * (driving - motor.f * state.speed - torque) * (1 / motor.J)
         return State(current_rate, speed_rate, extra)
+
+    def _whole_load(self, load: Scalars) -> Scalars:
+        return reduce(lambda load, effect: effect.load_torque(load), self.effects, load)
 
     def grip(self, holds: str, state: State) -> Grip | None:
         """What all dry elements on "current" (V) or "speed" (N m) can hold together; None without any."""

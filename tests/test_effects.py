@@ -579,6 +579,25 @@ def test_a_run_may_begin_twisted(x64, name):
             assert np.max(np.abs(found - right[channel])) < case.tolerance * np.max(right[channel])
 
 
+@pytest.mark.parametrize("name", ["shaft_compliance", "gear_backlash"])
+def test_a_constant_load_acts_where_recorded_ones_do(x64, name):
+    """Behind the shaft or gear, which it twists before a run begins, too."""
+    weight, motor = 0.1, with_effect(name)
+    loaded = motor.with_effects([*motor.effects, EFFECTS["constant_load"](jnp.asarray(weight))])
+    tape, heavier = (
+        Tape.from_recordings([evolve(run, load=run.load + more) for run in RUNS])
+        for more in (0.0, weight)
+    )
+    found = free_run(loaded, tape, RunUnknowns.as_recorded(tape))
+    expected = free_run(motor, heavier, RunUnknowns.as_recorded(heavier))
+    for k, run in enumerate(RUNS):
+        for channel in range(2):
+            both, one = (
+                tape.samples_of(k, seen[:, channel], len(run)) for seen in (found, expected)
+            )
+            np.testing.assert_allclose(both, one, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_teeth_in_many_short_blocks_are_joined(x64):
     """A slow small wave at 0.2 ms: some sixty blocks, each half as long as the motor remembers how it began."""

@@ -7,7 +7,7 @@ each of which does nothing unless the effect overrides it:
 - `terminal_voltage`: the voltage that reaches the winding, V
 - `parameters`: the motor's own parameters at a state, R(temperature), Kt(current), ...
 - `voltage_drop` and `torque`: smooth terms of the electrical and the mechanical equation
-- `load_at_rotor`: what of the load torque acts on the rotor itself
+- `load_torque` and `load_at_rotor`: the whole load, and what of it acts on the rotor itself
 - `grip`: a dry, set-valued term that can hold a state at exactly zero (stiction, brush contact)
 - `teeth` and `without_contact`: flanks that touch and part (a gear)
 - `averaged_over_step`: how it acts on average over a step, or until something switches
@@ -124,6 +124,10 @@ class AbstractEffect(eqx.Module):
         """Torque opposing positive motion, N m."""
         del state
         return 0.0
+
+    def load_torque(self, load: Scalars) -> Scalars:
+        """The whole load torque, N m, where `load` was recorded."""
+        return load
 
     def load_at_rotor(self, load: Scalars) -> Scalars:
         """The load torque as it acts on the rotor, N m."""

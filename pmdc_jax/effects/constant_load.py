@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from .base import AbstractEffect, ParameterRange, Scalars, State
+from .base import AbstractEffect, ParameterRange, Scalars
 
 
 class ConstantLoad(AbstractEffect):
     """Constant load: a torque T_0 that opposes positive motion, whichever way the motor turns: a weight, a
-    spring, the zero error of a torque sensor.
+    spring, the zero error of a torque sensor. It acts where a recorded load does: behind a shaft or gear.
 
     A run whose load is unknown already has such a torque of its own, beside which this one cannot be seen.
 
@@ -27,6 +27,5 @@ class ConstantLoad(AbstractEffect):
 
     torque_Nm: Scalars
 
-    def torque(self, state: State) -> Scalars:
-        del state
-        return self.torque_Nm
+    def load_torque(self, load: Scalars) -> Scalars:
+        return load + self.torque_Nm
