@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from benchmarks.naming.plant import Plant, simulate
 from benchmarks.virtual_bench import prbs, staircase
 from pmdc_jax import diagnose, identify
-from pmdc_jax.identify.corrections.speed_averaging import counted_over, differenced_over
+from pmdc_jax.identify.corrections.speed_averaging import _in_counts, counted_over, differenced_over
 from pmdc_jax.identify.noise import quantum
 from pmdc_jax.recording import OVER_BOTH, OVER_LAST, Recording
 
@@ -160,6 +160,18 @@ def test_steps_of_printed_counts_are_known_to_more_digits_than_one_has():
     counts = np.cumsum(rng.integers(-3, 4, 3000)) * 2 * np.pi / 2762 / 8.1e-4
     speed = np.array([float(f"{x:.7g}") for x in counts])
     assert 2 * np.pi / quantum(np.diff(speed)) / 8.1e-4 == pytest.approx(2762, abs=2e-3)
+
+
+def test_counts_printed_in_few_digits_are_counts():
+    """Counts of 3.125 rpm in hundredths of it: by one run's largest speeds alone its 1920 lines are 1919.95 or so."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        counts = np.round(rng.uniform(40, 90) * np.sin(np.linspace(0, 9, 3000)))
+        rpm = np.round(60 / 1920 / 0.01 * counts, 2)
+        (found,) = _in_counts([(rpm * 2 * np.pi / 60, 0.01)])
+        np.testing.assert_allclose(found, counts, atol=0.01)
+        # ... and a converter's steps are none
+        assert not _in_counts([(1.0003 * rpm * 2 * np.pi / 60, 0.01)])
 
 
 @pytest.mark.parametrize("known_by", ["angle", "difference"])

@@ -206,7 +206,13 @@ def _in_counts(speeds: Sequence[tuple[np.ndarray, float]]) -> list[np.ndarray]:
         # from sample to sample a speed may leap by many counts, its values lie closer
         step = quantum(np.diff(speed)) or quantum(np.diff(np.unique(speed)))
         lines = 2 * np.pi / step / sample_time if step else np.inf
-        if lines > LINES or abs(lines - round(lines)) > WHOLE:
+        if lines > LINES:
             return []
-        counts.append(speed / step)
+        in_counts = speed / step
+        # by as much of it as a count may be wrong, where speeds were written with few digits
+        rounded = np.quantile(np.abs(in_counts - np.round(in_counts)), 0.95)
+        whole = WHOLE + lines * rounded / np.max(np.abs(in_counts))
+        if abs(lines - round(lines)) > whole:
+            return []
+        counts.append(in_counts)
     return counts
