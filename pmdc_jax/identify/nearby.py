@@ -12,12 +12,14 @@ from ..motor import PARAMETERS
 from ..simulate import Tape
 from .parameters import Parameters
 from .polish import Fit
-from .problem import Problem, Unknowns
+from .problem import Problem
 from .refine import Optimum
 from .search import search
 
 # Evaluated as fast as a smaller one: what takes long is to go through the samples one after another
 POPULATION, GENERATIONS = 64, 20
+# So many samples, if not those of one run, tell a few parameters from others
+ENOUGH = 2**13
 
 
 def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: int) -> Optimum:
@@ -42,7 +44,7 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     noise = np.where(np.isfinite(fit.noise), fit.noise, problem.noise)
     found = search(
         sought,
-        _as_fitted(problem, fit.unknowns),
+        _telling_runs(problem, fit),
         noise,
         seed=seed,
         population=POPULATION,
@@ -53,14 +55,20 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     return Optimum(unknowns, np.inf, (), False)
 
 
-def _as_fitted(problem: Problem, unknowns: Unknowns) -> Tape:
-    """The runs that count, each begun and loaded as its own unknowns say."""
-    tape, fitted = problem.tape, problem.fitted_blocks
+def _telling_runs(problem: Problem, fit: Fit) -> Tape:
+    """The few runs of which a fit leaves most, each begun and loaded as its own unknowns say."""
+    tape, unknowns = problem.tape, fit.unknowns
+    run = np.asarray(tape.run)[problem.fitted_blocks]
+    residuals = np.nan_to_num(np.asarray(fit.evaluation.residuals)[problem.fitted_blocks])
+    runs, of_run, blocks = np.unique(run, return_inverse=True, return_counts=True)
+    left = np.bincount(of_run, np.square(residuals).sum((1, 2))) / blocks
+    order = np.argsort(-left, kind="stable")
+    samples = np.cumsum(blocks[order]) * tape.value.shape[1]
+    telling = runs[order[: max(1, np.searchsorted(samples, ENOUGH, side="right"))]]
     offset = jnp.where(tape.load_unknown, unknowns.runs.load_offset, 0.0)[tape.run]
-    counting = replace(
+    begun = replace(
         tape,
-        weight=tape.weight * fitted[:, None, None],
         load=tape.load + offset[:, None],
         initial=jnp.stack([unknowns.runs.current, unknowns.runs.speed], 1),
     )
-    return counting.first_blocks(int(np.flatnonzero(fitted)[-1]) + 1)
+    return begun.of_runs(telling.tolist())

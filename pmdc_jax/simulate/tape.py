@@ -139,12 +139,14 @@ class Tape(eqx.Module):
         """Number of runs, with those of which nothing was measured."""
         return self.initial.shape[0]
 
-    def first_blocks(self, count: int) -> Tape:
-        """The tape cut off after so many blocks, and as many more as make a usual shape."""
-        count = min(_round_up(count), len(self.run))
+    def of_runs(self, runs: Sequence[int]) -> Tape:
+        """The tape of some runs, filled up to a usual shape with blocks of others, of which nothing counts."""
+        mine = np.isin(np.asarray(self.run), runs)
+        blocks = np.argsort(~mine, kind="stable")[: _round_up(int(mine.sum()))]
+        counting = replace(self, weight=self.weight * mine[:, None, None])
         names = ("value", "load", "measured", "weight", "run", "begins", "grid", "turn", "rise")
-        signals = {name: getattr(self, name) for name in names}
-        return replace(self, **{n: s if s is None else s[:count] for n, s in signals.items()})
+        signals = {name: getattr(counting, name) for name in names}
+        return replace(counting, **{n: s if s is None else s[blocks] for n, s in signals.items()})
 
     def blocks_of(self, run: int) -> Bool[np.ndarray, " blocks"]:
         """Which blocks are of one run."""
