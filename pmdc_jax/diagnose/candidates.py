@@ -1,7 +1,7 @@
-"""What may be missing: for every effect of the library the columns that its evidence is a regression on.
+"""What may be missing: for every effect of the library the regression columns that test for it.
 
-An effect is linear in its amplitudes; what else shapes it (a Stribeck speed, a number of periods) is tried on a
-grid that the recordings set. Effects that are no small change (a lag, a shaft) are tried at finite sizes.
+An effect is linear in its amplitudes. Its other parameters (a Stribeck speed, a number of periods) are tried on a
+grid that the recordings set. Effects that are no small perturbation (a lag, a shaft) are tried at finite sizes.
 """
 
 from __future__ import annotations
@@ -29,31 +29,32 @@ class Scales(NamedTuple):
 
     current: float  # A
     speed: float  # rad/s
-    slow: float  # rad/s, that of the slowest twentieth of the motion
+    slow: float  # rad/s, below which the motion is for a twentieth of its time
     voltage: float  # V
     torque: float  # N m
     inertia: float  # kg m^2
     sample_time: float  # s
     duration: float  # s
-    travel: float  # rad, through which the rotor turns in one run
+    travel: float  # rad, the largest range of rotor angles in one run
 
 
 class Candidate(NamedTuple):
     """One shape of one effect.
 
-    `columns` are settings of the effect, each with one amplitude small; the response to each over `units` is
-    one column of the regression. `build` makes the effect's parameters of the coefficients found and of the
-    Coulomb friction that is in the model already, or None where they have a sign that physics forbids. With
-    `own_phase`, every run has coefficients of its own.
+    `columns` are settings of the effect, each with one small amplitude; the response to each, divided by its unit in
+    `units`, is one column of the regression. `build` turns the coefficients found, and the Coulomb friction (N m) that
+    the model has already, into the effect's parameters; None where their signs are unphysical. With `own_phase`, every
+    run has coefficients of its own.
     """
 
     effect: str
     columns: tuple[Values, ...]
     units: tuple[float, ...]
     build: Callable[[np.ndarray, float], Values | None]
-    amplitude: str | None = None  # the field that the last column's coefficient is, where it is one
+    amplitude: str | None = None  # the field that the last coefficient is, if it is one field
     own_phase: bool = False
-    whole: bool = False  # the response is that of a simulation with the whole setting
+    # the response is from a simulation with the whole setting, not to first order
+    whole: bool = False
 
     @property
     def order(self) -> int:
@@ -62,23 +63,23 @@ class Candidate(NamedTuple):
 
     @property
     def unit(self) -> float:
-        """The amplitude for a last coefficient of one: the response is to that, or to the whole of a finite one."""
+        """The amplitude at a last coefficient of one: one unit, or the whole size of an effect tried at finite size."""
         if self.amplitude is None or self.units[-1] != 1.0:
             return 1.0
         return self.columns[-1][self.amplitude]
 
     @property
     def largest(self) -> float:
-        """An amplitude as large as what the motor does: a larger one no motor has."""
+        """Upper limit of the amplitude: the scale itself, which no real motor exceeds; infinite at finite sizes."""
         return np.inf if self.units[-1] == 1.0 else self.units[-1] / SMALL
 
 
-# The shapes of an effect, by its name and the scales of the recordings
+# Makes the candidates of an effect from its name and the scales of the recordings
 Rows = Callable[[str, Scales], list[Candidate]]
 
-# An amplitude that is small, as a share of the scale: the response to it is as good as a derivative.
+# A small amplitude, as a share of its scale: the response to it is practically a derivative.
 SMALL = 1e-4
-# ... and one that is nothing at all, where an amplitude must be positive.
+# ... and one in SI units that stands for zero, where an amplitude must be positive.
 NOTHING = 1e-12
 
 
@@ -93,7 +94,7 @@ def _amplitude(
     signed: bool = False,
     **shapes: Callable[[Scales], Iterable[float]],
 ) -> Rows:
-    """An effect of one amplitude; `shapes` are functions of the scales that give the grid of another field."""
+    """An effect with one amplitude, tried at `SMALL` of its `size`; `shapes` give the grids of its other fields."""
 
     def rows(name: str, scales: Scales) -> list[Candidate]:
         small = SMALL * size(scales)
@@ -113,7 +114,7 @@ def _amplitude(
 
 
 def _finite(field: str, grid: Callable[[Scales], Sequence[float]]) -> Rows:
-    """An effect tried at finite sizes, scaled up or down by the coefficient."""
+    """An effect tried at finite sizes; the coefficient scales each size, within a factor of 5 either way."""
 
     def rows(name: str, scales: Scales) -> list[Candidate]:
         def candidate(size: float) -> Candidate:
@@ -132,7 +133,7 @@ def _either(*rows: Rows) -> Rows:
     return lambda name, scales: [c for of_one in rows for c in of_one(name, scales)]
 
 
-# The speeds by which a peak of friction falls off, over the largest
+# The Stribeck speeds that are tried, as shares of `Scales.speed`
 PEAKS = (0.01, 0.016, 0.025, 0.04, 0.06, 0.1, 0.15, 0.25)
 
 
@@ -143,7 +144,7 @@ def _stribeck(name: str, scales: Scales) -> list[Candidate]:
         def build(c: np.ndarray, dry: float) -> Values | None:
             if c[1] <= 0 or c[0] + c[1] + dry <= 0:
                 return None
-            # not so small that no run would see it, and nothing would lead it back
+            # were it much smaller, no run would be sensitive to it and a refit could not bring it back
             coulomb = max(float(c[0]) + dry, 0.1 * float(c[1]))
             return {"coulomb_Nm": coulomb, "static_Nm": coulomb + float(c[1]), "speed_rad_s": speed}
 
@@ -170,7 +171,7 @@ def _asymmetric(name: str, scales: Scales) -> list[Candidate]:
 
 
 def _periodic(field: str, size: Callable[[Scales], float], *others: Values) -> Rows:
-    """Sine and cosine of the angle, in every run of its own phase; `others` are settings of the other fields."""
+    """Cosine and sine of the rotor angle, with a phase of its own in every run; `others` set the other fields."""
 
     def rows(name: str, scales: Scales) -> list[Candidate]:
         small = SMALL * size(scales)
@@ -185,7 +186,7 @@ def _periodic(field: str, size: Callable[[Scales], float], *others: Values) -> R
             columns = tuple({field: small, "phase_rad": p, **shape} for p in (0.0, np.pi / 2))
             return Candidate(name, columns, (small, small), build, field, own_phase=True)
 
-        # what comes round within a sample even where the motor is slow, or not once, no record shows
+        # a period that passes within one sample even in slow motion, or is never completed, is not in the record
         most = 2 * np.pi / (scales.slow * scales.sample_time)
         shown = [p for p in PERIODS if p < most and p * scales.travel >= 2 * np.pi]
         return [candidate(periods, other) for other in others or ({},) for periods in shown]
@@ -195,13 +196,14 @@ def _periodic(field: str, size: Callable[[Scales], float], *others: Values) -> R
 
 PERIODS = (*range(1, 17), 18, 20, 21, 22, 24, 26, 28, 30, 32, 36, 40, 42, 48)
 
-# How often a compliant shaft rings, in Hz: what rings at another frequency takes little of it away
+# Resonances of a compliant shaft that are tried, Hz; so dense because one far from the true one explains little
 RINGING = (6.0, 9.0, 12.0, 18.0, 25.0, 35.0, 50.0, 70.0, 100.0, 140.0, 200.0, 280.0, 400.0)
+# Share of the inertia that they have behind the shaft
 SHARE = 0.5
 
 
 def _shaft(hertz: float, scales: Scales, share: float = SHARE, damping: float = 0.05) -> Values:
-    """A shaft on which two inertias ring at `hertz`, with a share of the critical damping."""
+    """A shaft on which two inertias ring at `hertz`; `share`, the load's of the inertia; `damping`, damping ratio."""
     rate = 2 * np.pi * hertz
     stiffness = rate**2 * scales.inertia * share * (1 - share)
     return {
@@ -222,7 +224,7 @@ def _compliance(name: str, scales: Scales) -> list[Candidate]:
 
 
 def _no_columns(name: str, scales: Scales) -> list[Candidate]:
-    """No column at all: what play does is nothing like proportional to it. It is begun from `Trial.starts`."""
+    """No columns: the response to backlash is not even roughly proportional to it. See `Trial.starts` instead."""
     del name, scales
     return []
 
@@ -232,17 +234,17 @@ def _shaft_starts(scales: Scales) -> list[Values]:
 
 
 def _backlash_starts(scales: Scales) -> list[Values]:
-    """Of teeth that are stiff beside everything else."""
+    """A gear whose teeth are stiff compared with everything else."""
     return [{"gap_rad": 0.05, **_shaft(100.0, scales, 0.45, 0.3)}]
 
 
-# Within which factor of that each is sought: how fast teeth come to rest, their damping says and not their stiffness,
-# of which as good as nothing is known
+# The factors, up and down from that start, within which each is sought. Of the stiffness almost nothing is known: how
+# fast teeth come to rest depends on their damping.
 TEETH = {"gap_rad": 40.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2.0}
 
-# A peak of dry friction that is clearly one: as high again, within this share of the speeds that occur
+# A clear Stribeck peak: static over Coulomb friction, and the Stribeck speed as a share of `Scales.speed`
 PEAK, SLOW = 2.0, 0.05
-# ... and play: this share of what the largest torque twists a shaft by
+# ... and clear backlash: the gap as a share of the twist of the shaft under `Scales.torque`
 PLAY = 0.3
 
 
@@ -257,7 +259,7 @@ def _with_play(shaft: ShaftCompliance, scales: Scales) -> Values:
 
 
 def _times(scales: Scales) -> list[float]:
-    """Time constants of a sensor, from a fraction of a sample on."""
+    """Time constants or delays of a sensor that are tried, in s: from 0.2 to 200 samples."""
     return [x for x in (5e-4, 1.5e-3, 4e-3, 1e-2, 3e-2) if 0.2 < x / scales.sample_time < 200]
 
 
@@ -266,7 +268,7 @@ def _thermal(scales: Scales) -> list[float]:
 
 
 def _without_peak(friction: StribeckFriction) -> Values:
-    """Of a size in between: a peak as wide as the speeds that occur leaves nothing beside it."""
+    """Coulomb friction midway between both levels: under a peak as wide as the speeds the Coulomb level is hidden."""
     return {"torque_Nm": float(friction.coulomb_Nm + friction.static_Nm) / 2}
 
 
@@ -279,27 +281,28 @@ def _as_slow(delay: SpeedSensorDelay) -> Values:
 
 
 class Fuller(NamedTuple):
-    """A fuller form of an effect."""
+    """A fuller form of an effect: the simple form is a special case of it."""
 
     effect: str
-    begun: Callable[[Any, Scales], Values]  # by the simple form, what makes it fuller clearly there
-    extra: tuple[str, ...]  # the fields that make it so
-    # how the simple form begins by the fuller one, which may have been found without it
+    # start values from the fit of the simple form, with what makes it fuller clearly there
+    begun: Callable[[Any, Scales], Values]
+    extra: tuple[str, ...]  # the fields that make it fuller
+    # start values of the simple form from the fit of the fuller one, which may have been found without it
     reduced: Callable[[Any], Values] | None = None
 
 
 class Trial(NamedTuple):
     """How an effect is tried."""
 
-    # its shapes, each a regression on columns, by its name and the scales of the recordings
+    # makes its candidates, each with its regression columns
     columns: Rows
-    # where else to begin refitting it, one start after another, if it is easily fitted wrongly
+    # additional start values for refits, if these easily end in a wrong optimum
     starts: Callable[[Scales], list[Values]] | None = None
-    # within which factors of a start populations seek it first, by field, if it has many optima
+    # by field, the factor around a start within which populations search first, if it has many optima
     factors: Mapping[str, float] = MappingProxyType({})
     # effects that it contains, and replaces
     contains: frozenset[str] = frozenset()
-    # effects that look much like it, each with how it would begin in its place
+    # effects that resemble it, each with its start values from the fit of this one
     alike: Mapping[str, Callable[[Any], Values]] = MappingProxyType({})
     # a fuller form of it, which the runs must rule out
     fuller: Fuller | None = None
@@ -332,7 +335,8 @@ TRIALS: Mapping[str, Trial] = {
         _amplitude("per_A2", lambda s: 1 / s.current**2, emf_share=lambda s: (0.0, 1.0))
     ),
     "inductance_saturation": Trial(_amplitude("per_A2", lambda s: 1 / s.current**2)),
-    # a voltage within it that is noise, or a small signal, has a sign which the motor does not feel
+    # also at finite widths: noise or a small signal within the dead zone has a sign that the motor does not feel, which
+    # a small width does not show
     "input_dead_zone": Trial(
         _either(
             _amplitude("width_V", lambda s: s.voltage),

@@ -1,4 +1,4 @@
-"""Models fitted to the same runs, compared by the squares of what each leaves, made white by one filter."""
+"""Models fitted to the same runs, compared by the squares of their residuals, whitened by one common filter."""
 
 from __future__ import annotations
 
@@ -12,34 +12,35 @@ from ..identify.noise_model import Whitener, whitener
 from .effect_relations import is_within
 from .model import Model
 
-# Models whose criterion is nearer than this are not told apart
+# Models whose criteria (BIC, in noise variances) differ by less are not told apart
 MARGIN = 8.0
-# Squares, in noise variances, for which no model is fitted another step
+# Fall of the squares, in noise variances, below which no further fitting step is made
 WORTH = 0.1
-# A model that leaves so many times the squares of another one is no match for it, whatever a filter makes of either
+# A model that leaves so many times the unfiltered squares of another one is worse, whatever a filter makes of both
 FAR = 3.0
 
 
 class Fitted(NamedTuple):
-    """A model among others fitted to the same runs, and how well it does by a common filter of the noise."""
+    """A model among others fitted to the same runs, and how well it does by a common whitening filter."""
 
     model: Model
-    squares: float
-    criterion: float  # squares and the price of every parameter; less is better
+    squares: float  # sum of its squared white residuals
+    # BIC: squares + (number of parameters) ln(number of measured values); less is better
+    criterion: float
 
 
 class Comparison:
-    """Models and filters so far; each model is fitted once by each filter."""
+    """Fits models by common whitening filters, each model once by each filter, and keeps the results."""
 
     def __init__(self) -> None:
         self._filters: dict[Model, Whitener] = {}
         self._fitted: dict[tuple[Model, Whitener], Fitted] = {}
 
     def ranked(self, models: Sequence[Model], white: Whitener) -> list[Fitted]:
-        """By the squares of what each leaves when fitted to residuals that a filter makes white, the best first.
+        """Models by their criteria when fitted to residuals whitened by one filter, the best first.
 
-        One that leaves far more than another of what is measured is out of the question: filters pass none of what
-        changes slowly.
+        One that leaves far more unfiltered squares than another is ruled out (infinite criterion): a whitening filter
+        suppresses whatever changes slowly.
         """
         least = min(m.fit.fitness for m in models)
         fitted = [
@@ -49,7 +50,7 @@ class Comparison:
         return sorted(fitted, key=lambda f: f.criterion)
 
     def left(self, model: Model, white: Whitener) -> Fitted:
-        """A model fitted to what a filter makes white of what it leaves."""
+        """A model fitted to its residuals whitened by a filter."""
         key = model, white
         if key not in self._fitted:
             given, polished = sharpened(model.given, model.fit, white, WORTH)
@@ -60,14 +61,14 @@ class Comparison:
         return self._fitted[key]
 
     def white(self, model: Model) -> Whitener:
-        """The filter that makes white what a model leaves."""
+        """The filter that whitens the residuals of a model."""
         if model not in self._filters:
             self._filters[model] = whitener(residuals_of(model.given, model.fit))
         return self._filters[model]
 
 
 def plainest(ranked: Sequence[Fitted]) -> Model:
-    """The best model, or a simpler one that it contains and that the data do not tell from it."""
+    """The best model, or one with an effect in a simpler form whose criterion is within `MARGIN` of the best."""
     best = ranked[0]
     for other in ranked[1:]:
         within = is_within(set(other.model.effects), set(best.model.effects))

@@ -13,15 +13,16 @@ from ..identify.identification import Estimate, Identification, Role
 Verdict = Literal["none_detected", "named", "ambiguous", "not_in_library"]
 
 
-# Sensors' own ways, and formulas that are not quite nature's, leave up to 1.4 times the noise in the electrical
-# equation; what is not in the library, such as a mean of many samples of the current, three times and more
+# Electrical misfit (`balance.electrical_misfit`) that no torque and no effect of the library explains. Peculiarities of
+# sensors and model-form error leave up to 1.4; what is not in the library, such as a current that is the mean of many
+# samples, leaves 3 and more.
 MAX_ELECTRICAL = 3.0
-# ... or more than a trace, and more than this share of what the motor without effects leaves: those that were added
-# are then not what is missing there
+# ... or a misfit above the first value whose excess over the noise, in squares, is more than the second share of that
+# of the motor without effects: the effects added are then not what is missing there
 TRACE_OF_ELECTRICAL, UNEXPLAINED_ELECTRICAL = 1.5, 0.5
-# Hold-outs that are missed by so many times what the fitted runs are show what those do not
+# Misfit of hold-outs over that of the fitted runs above which the hold-outs show something that the fitted runs do not
 BEYOND = 2.5
-# ... or the effects that were added make them worse by this factor
+# ... and the misfit of hold-outs after effects were added, over that before, above which these made them worse
 WORSE = 1.1
 
 
@@ -29,9 +30,9 @@ WORSE = 1.1
 class EffectFound:
     """An effect that the data ask for: its parameters, and how sure it is that it is there."""
 
-    name: str
-    equation: str
-    parameters: Mapping[str, Estimate]
+    name: str  # a key of `pmdc_jax.effects.EFFECTS`
+    equation: str  # "electrical", "mechanical", "input" or "sensor"
+    parameters: Mapping[str, Estimate]  # by field of the effect
     p_value: float  # of the data if the effect were not there
     also_possible: tuple[str, ...] = ()  # sets such as "coulomb_friction + constant_load"
 
@@ -41,14 +42,14 @@ class Region:
     """A stretch of one variable in which one equation of the motor without effects is off."""
 
     equation: str  # "mechanical" or "electrical"
-    variable: str  # "speed", "current", "voltage", "time"
-    region: tuple[float, float]  # rad/s, A, V, or share of a run
-    z: float  # the misfit there over its standard error, of the largest size in the region
+    variable: str  # "speed", "current", "voltage", "time", "frequency"
+    region: tuple[float, float]  # rad/s, A, V, share of a run, or Hz
+    z: float  # misfit over its standard error where that is largest; for a frequency, amplitude over the level around
 
 
 @frozen
 class LearnedCurve:
-    """A term of one equation as the data draw it, whatever it may be: (knots,) arrays, SI."""
+    """An unknown term of one equation over a variable, as estimated from the data: (knots,) arrays, SI."""
 
     equation: str
     variable: str
@@ -57,16 +58,16 @@ class LearnedCurve:
     value: np.ndarray
     stderr: np.ndarray
     p_value: float
-    reverses: bool  # turns with the direction of motion, as friction does
+    reverses: bool  # changes sign with the direction of motion, as friction does
 
 
 @frozen
 class Gap:
     """Root mean squares of the noise-scaled residual over both outputs; a perfect model has 1."""
 
-    before: float
-    after: float
-    floor: float
+    before: float  # of the motor without effects
+    after: float  # of the motor with the effects found
+    floor: float  # what no model can close: 1, or `after` if that is less
 
 
 @frozen
@@ -75,9 +76,9 @@ class NextExperiment:
 
     why: str
     description: str
-    power: float
-    time: np.ndarray
-    voltage: np.ndarray
+    power: float  # probability of telling them apart, 0 to 1
+    time: np.ndarray  # s, (samples,)
+    voltage: np.ndarray  # V, (samples,)
 
 
 @frozen
@@ -99,27 +100,27 @@ class Diagnosis:
     where: tuple[Region, ...]
     gap: Mapping[Role, Gap]
     gap_of_run: Mapping[str, Gap]
-    closed_fraction: float | None  # of the gap, on hold-outs where there are any
-    next_experiment: NextExperiment | None
-    curves: tuple[LearnedCurve, ...]  # what is left, where something outside the library is
+    # of the gap, in squares, on hold-outs where there are any; None without effects
+    closed_fraction: float | None
+    next_experiment: NextExperiment | None  # for the verdict "ambiguous", where a run was found
+    curves: tuple[LearnedCurve, ...]  # what is left, for the verdict "not_in_library"
     detectable: tuple[Detectable, ...]
     base: Identification  # without effects
     final: Identification  # with the effects that were found
-    p_nothing: float  # of the data if nothing were missing
-    # what the electrical equation leaves over what the sensors' white noise would; see `balance.electrical_misfit`
+    p_nothing: float  # p-value of the data if nothing were missing
+    # residual of the electrical equation over the sensors' white noise; see `balance.electrical_misfit`
     electrical_misfit: float
     electrical_misfit_before: float  # the same without effects
-    seconds: Mapping[str, float]
+    seconds: Mapping[str, float]  # time taken: "identify", "name", "total"
 
     @property
     def breaks_electrical_equation(self) -> bool:
-        """Whether what is left can come neither from any torque nor from the effects that were added."""
+        """Whether the electrical equation is violated by more than any torque or the effects added can explain."""
         return breaks_electrical_equation(self.electrical_misfit_before, self.electrical_misfit)
 
     @property
     def beyond_fitted(self) -> float | None:
-        """By how many times more the hold-outs are missed than the fitted runs, where that is too much to be the same
-        motor; else None."""
+        """The misfit of the hold-outs over that of the fitted runs, where that is too much for one motor; else None."""
         return beyond_fitted(self.gap)
 
 
@@ -133,17 +134,16 @@ def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:
     """See `Diagnosis.beyond_fitted`."""
     if "holdout" not in gap:
         return None
-    # fitted runs of a simulation are missed by next to nothing, and less than the noise says nothing
+    # a misfit of the fitted runs below the noise, as of a noiseless simulation, says nothing
     ratio = gap["holdout"].after / max(gap["train"].after, 1.0)
     return ratio if ratio > BEYOND else None
 
 
 def unlike_held_out(gap: Mapping[Role, Gap]) -> bool:
-    """Whether hold-outs show that something is missing of which the fitted runs do not tell."""
+    """Whether hold-outs show that something is missing that the fitted runs do not show."""
     return beyond_fitted(gap) is not None or worse_held_out(gap)
 
 
 def worse_held_out(gap: Mapping[Role, Gap]) -> bool:
-    """Whether the effects that were added make hold-outs worse: then others are missing that look alike in the fitted
-    runs."""
+    """Whether the effects added make hold-outs worse: then others are missing that look alike in the fitted runs."""
     return "holdout" in gap and gap["holdout"].after > WORSE * gap["holdout"].before

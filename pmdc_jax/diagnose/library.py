@@ -1,4 +1,4 @@
-"""Everything that may be missing, and what it would change in the outputs, to first order."""
+"""Everything that may be missing, candidates and unknown curves, and what each changes along a path, to first order."""
 
 from __future__ import annotations
 
@@ -22,28 +22,30 @@ from .candidates import Candidate, Scales, candidates
 from .model import Model
 from .response import Outputs, Path, kicks, pushes, sensed
 
+# The variables over which each equation may have an unknown curve
 OVER = {
     "mechanical": ("speed", "current", "time"),
     "electrical": ("current", "speed", "voltage", "time"),
 }
 # Knots of a curve over speed, current or voltage, and over the time of each run.
 KNOTS, KNOTS_IN_TIME = 9, 7
-# Periods a turn of a torque that comes round behind a gear; two neighbours differ by half a period in some 500 rad
+# Periods per turn of the rotor of a torque that is periodic behind a gear; so dense that neighbours differ by half a
+# period in some 500 rad
 BEHIND_GEAR = np.arange(0.02, 0.25, 0.006)
 KNOTS_IN_PERIOD = 25
-# A motor moves above this share of its speed, and is slow for this share of the time that it moves
+# A motor counts as moving above this share of `Scales.speed`; `Scales.slow` is this quantile of its speeds then
 MOVING, SLOWEST = 0.02, 0.05
-# Of the largest voltage, what a converter of seven bits and more resolves
+# A step of the voltage counts as a converter's below this share of the largest voltage: seven bits and more
 OF_CONVERTER = 0.01
-# Columns that are simulated side by side, and numbers in all of them: the more, the more memory they take
+# Most columns that are simulated side by side, and most numbers in all of them, to limit the memory
 TOGETHER, AT_ONCE = 32, 2**23
 
 
 class Change(NamedTuple):
     """What a few candidates or curves change along a path, in current and speed: (samples, 2, blocks, columns)."""
 
-    kicks: np.ndarray  # where one sample leads to the next
-    seen: np.ndarray  # ... and what is seen on top of it
+    kicks: np.ndarray  # change of the state at the end of each sample
+    seen: np.ndarray  # ... and what is added directly to the recorded outputs
 
 
 def side_by_side_on(tape: Tape) -> int:
@@ -52,17 +54,17 @@ def side_by_side_on(tape: Tape) -> int:
 
 
 class Curve(NamedTuple):
-    """An unknown term of one equation: a straight line between knots of one variable, or a sine of the angle."""
+    """An unknown term of one equation: piecewise linear in one variable, or a sinusoid of the angle."""
 
     equation: str
     variable: str
     knots: np.ndarray
     own: bool = False  # every run has a curve of its own
-    # (knots, columns): the columns at the knots, where they are no hats
+    # (knots, columns): values of the columns at the knots; None where these are hat functions, one a knot
     shapes: np.ndarray | None = None
-    # turns with the direction of motion, as a friction that changes does
+    # changes sign with the direction of motion, as a friction that changes over time does
     reverses: bool = False
-    # what it shows is noise
+    # known to show noise, and so no evidence
     noise: bool = False
 
     @property
@@ -75,12 +77,12 @@ class Curve(NamedTuple):
         return coefficients if self.shapes is None else self.shapes @ coefficients
 
     def errors(self, errors: np.ndarray) -> np.ndarray:
-        """Standard errors there of coefficients with these standard errors."""
+        """Standard errors of the curve at its knots, from those of its coefficients."""
         return errors if self.shapes is None else np.sqrt(self.shapes**2 @ errors**2)
 
 
 class Library:
-    """Everything that may be missing from a motor without effects, and what it would change."""
+    """All candidates that the recordings can tell of, and what each would change in the motor without effects."""
 
     def __init__(self, base: Model) -> None:
         """`base` is the motor without effects, as fitted."""
@@ -91,17 +93,17 @@ class Library:
         known = measured or bool(np.any(np.asarray(tape.drive.current) > 0))
         told = {name for name, effect in EFFECTS.items() if known or not effect.needs_current}
         self.candidates = [c for c in candidates(self.scales) if c.effect in told]
-        # errors that last look like a voltage that changes in time
+        # a coarse encoder's errors last long enough to look like a voltage that changes over time
         self.coarse = any(is_coarse(speed) for speed in _counted(base.given.training))
-        # ... and of noise that the motor did not feel something is left
+        # so does what is left of noise that was taken out of the recorded voltage
         self.wavers = bool(base.given.input_noise)
-        # by unit: what may be but a trace of what a sensor does
+        # by unit: the amplitude that imperfect sensors alone may produce
         self.traces = _traces(base)
         self._simulated: dict[int, np.ndarray] = {}
         self._base = base
 
     def changes(self, tape: Tape, path: Path) -> Iterator[Change]:
-        """What every candidate changes along a path, in their order, some of one effect at a time."""
+        """What the candidates change along a path, in their order; each `Change` is of some of one effect."""
         return one_ahead(self._calls(tape, path))
 
     def _calls(self, tape: Tape, path: Path) -> Iterator[Callable[[], Change]]:
@@ -119,12 +121,12 @@ class Library:
                     yield partial(_scaled_down, case, units[part])
 
     def _whole(self, shapes: Sequence[Candidate], tape: Tape) -> Change:
-        """What whole settings of an effect change."""
+        """What settings of an effect at finite size change, by full simulations."""
         seen = np.stack([self._response(c, tape) for c in shapes], -1)
         return Change(np.zeros_like(seen), seen)
 
     def _response(self, candidate: Candidate, tape: Tape) -> np.ndarray:
-        """The response to a whole setting, simulated once."""
+        """The response to a setting at finite size, simulated once and kept: (samples, 2, blocks)."""
         key = id(candidate)
         if key not in self._simulated:
             values = {field: jnp.asarray(x) for field, x in candidate.columns[0].items()}
@@ -136,8 +138,11 @@ class Library:
 
 
 def _traces(base: Model) -> dict[str, float]:
-    """What is left of noise that was taken out of the recorded voltage, or what that was rounded to; and half of what a
-    current moves by."""
+    """By unit, the amplitude that imperfect sensors alone may produce.
+
+    "V": standard deviation of the noise taken out of the recorded voltage, or the voltage's resolution if that is
+    larger. "A": half the quantum of the measured current.
+    """
     training = base.given.training
     currents = [run.current for run in training if run.current is not None]
     rounded = max((quantum(np.diff(current)) / 2 for current in currents), default=0.0)
@@ -147,19 +152,19 @@ def _traces(base: Model) -> dict[str, float]:
 
 
 def _rounded_to(volts: np.ndarray) -> float:
-    """What a converter rounds to or cuts off; zero for round numbers of a programme, which are far larger."""
+    """The step, in V, to which a converter rounds or truncates; zero for a programme's far coarser round numbers."""
     step = resolution(volts)
     return step if step < OF_CONVERTER * np.max(np.abs(volts)) else 0.0
 
 
 def _counted(runs: Sequence[Recording]) -> list[np.ndarray]:
-    """Speeds as sensors count them: where angles were measured, how far they go in two samples."""
+    """The measured speeds, to judge their resolution; of measured angles the central differences, rad a sample."""
     speeds = [run.speed for run in runs if run.speed is not None]
     return speeds + [np.gradient(run.angle) for run in runs if run.angle is not None]
 
 
 def _scaled_down(case: tuple, units: np.ndarray) -> Change:
-    """What small settings change, as many of each as of one unit of its amplitude."""
+    """What small settings change, each divided by its unit."""
     return Change(*(np.asarray(x) / units for x in _small(*case)))
 
 
@@ -171,7 +176,7 @@ def _small(
     tape: Tape,
     path: Path,
 ) -> tuple[Array, Array]:
-    """Kicks, and what is seen on top of them, by small settings of one effect; settings last."""
+    """Kicks, and what is added to the outputs, by small settings of one effect; the last axis is the setting."""
 
     def change(values: Mapping[str, Float[Array | np.ndarray, ""]]) -> tuple[Outputs, Outputs]:
         motor = bare.with_effects([effect(**values)])
@@ -185,7 +190,7 @@ def _small(
 
 
 def curves_over(library: Library, tape: Tape, path: Path) -> tuple[list[Curve], Iterator[Change]]:
-    """Curves over every variable in every equation, and torques that a gear brings round; what each changes."""
+    """The curves over all variables of all equations, those periodic behind a gear, and what each changes."""
     volt, torque = (np.asarray(push) for push in pushes(library.bare, tape))
     value = np.asarray(tape.value).T
     known = {"speed": np.asarray(path.speed), "current": np.asarray(path.current), "voltage": value}
@@ -217,7 +222,7 @@ def curves_over(library: Library, tape: Tape, path: Path) -> tuple[list[Curve], 
 
 
 def _direction(speed: np.ndarray, tape: Tape) -> np.ndarray:
-    """That of motion, less its mean over each run: where it never changes, a friction is but a torque."""
+    """The direction of motion less its mean over each run: in one direction, friction cannot be told from a torque."""
     direction, run = np.sign(speed), np.asarray(tape.run)
     mean = np.bincount(run, direction.mean(0), tape.runs) / np.bincount(run, minlength=tape.runs)
     return direction - mean[run]
@@ -228,7 +233,7 @@ def _wave(phase: np.ndarray) -> np.ndarray:
 
 
 def _share_of_run(tape: Tape) -> np.ndarray:
-    """The time as a share of each run's, (samples, blocks)."""
+    """The time since the run began over its duration, (samples, blocks)."""
     run, samples = np.asarray(tape.run), tape.value.shape[1]
     block = np.arange(len(run)) - np.searchsorted(run, run)
     time = block * samples + np.arange(samples)[:, None]
@@ -236,14 +241,14 @@ def _share_of_run(tape: Tape) -> np.ndarray:
 
 
 def _knots(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Knots over the range of a variable, denser where it often is and about zero."""
+    """Knots over the range of a variable, denser where it often is, and near zero."""
     values = x[weight]
     low, high = np.quantile(values, [0.001, 0.999])
     spread = max(high - low, 1e-9)
     inner = np.quantile(values, np.linspace(0, 1, KNOTS)[1:-1])
     about_zero = [s * spread for s in (-0.02, 0.02) if low < s * spread < high]
     knots = np.sort(np.concatenate([[low, high], inner, about_zero]))
-    knots[np.abs(knots) < 1e-3 * spread] = 0.0  # where a motor rests, whatever its noise
+    knots[np.abs(knots) < 1e-3 * spread] = 0.0  # a motor at rest, but for noise
     return knots[np.append(True, np.diff(knots) > 0.01 * spread)]
 
 

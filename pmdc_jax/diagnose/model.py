@@ -1,4 +1,4 @@
-"""A motor with some effects, fitted, and what its fit leaves of every run."""
+"""A motor with some effects, fitted, with its residuals and sensitivities in every run."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from ..identify.uncertainty import FLAT
 from ..motor import Motor
 from .response import Path, path_of
 
-# What is missed by a smaller share of what is measured is nothing
+# A model is exact if its residuals are a smaller share of what was measured, as root mean squares
 CLOSE = 1e-4
 
 
 @attrs.frozen(eq=False)
 class Model:
-    """A motor with some effects, fitted to the recordings; each fit is one of its own."""
+    """A motor with some effects, fitted to the recordings; compared and hashed by identity."""
 
     effects: tuple[str, ...]
     given: Prepared
@@ -45,35 +45,40 @@ class Model:
 
     @property
     def is_possible(self) -> bool:
-        """Whether it can be simulated, nature allows what its effects were fitted to be, and what is to repeat itself
-        does."""
+        """Whether it can be simulated, its effects' parameters are physical, and each periodic torque completes a
+        period."""
         simulated = np.isfinite(self.fit.fitness)
         physical = all(effect.is_possible() for effect in self.motor.effects)
         return bool(simulated) and physical and self._comes_round
 
     @property
     def _comes_round(self) -> bool:
-        """Whether a run goes through a whole period of each torque that repeats itself as the rotor turns: of less, any
-        torque that differs from place to place may look like a part."""
+        """Whether some run turns through a whole period of each torque that is periodic in the rotor angle.
+
+        Over less than a period, any torque that depends on position may look like part of one.
+        """
         waves = [effect.repeats_after().get("angle", 0.0) for effect in self.motor.effects]
         return not any(waves) or bool(max(waves) <= self.travel)
 
     @property
     def travel(self) -> float:
-        """Through which range of angles, rad, the rotor turns in a training run, at most."""
+        """The largest range of rotor angles, in rad, of any training run."""
         angle, tape = np.asarray(self.path.angle), self.given.problem.tape
         return float(max(np.ptp(angle[:, tape.blocks_of(run)]) for run in self.training))
 
     @property
     def effects_at_end(self) -> set[str]:
-        """The effects of which a parameter is held at its bound, or has gone where no run sees it."""
+        """The effects with a parameter that is held at its bound or `lost`."""
         names = self.given.problem.parameters.names
         ended = {names[k] for k in self.fit.at_bound} | self.lost
         return {name.partition(".")[0] for name in ended} & set(self.effects)
 
     @property
     def lost(self) -> set[str]:
-        """The parameters that have gone where no run sees them, so that nothing leads them back."""
+        """The parameters to which no run is sensitive where they are, so that no gradient leads them back.
+
+        Those with a standard error, all others known, of more than `FLAT`.
+        """
         problem = self.given.problem
         names = problem.parameters.names
         # columns of each run's own unknowns follow those of the parameters
@@ -89,7 +94,7 @@ class Model:
 
     @property
     def slanted(self) -> float:
-        """The constant load in it, N m: half of what friction forward has more than backward."""
+        """The constant load within asymmetric friction, N m: half of what it is larger forward than backward."""
         backward, forward = self._dry
         return (forward - backward) / 2
 
@@ -104,7 +109,7 @@ class Model:
 
     @property
     def path(self) -> Path:
-        """The free run along which it was fitted, of the rotor itself."""
+        """The free run of the fitted motor: the states of the rotor itself, before any sensor."""
         held = "speed" in {EFFECTS[name].holds for name in self.effects}
         problem = self.given.problem
         begun = self.fit.unknowns.runs.angle
@@ -112,14 +117,14 @@ class Model:
 
     @property
     def misses(self) -> float:
-        """By which share of an output it misses what was measured, of the output that it misses more."""
+        """Its residuals over what was measured, as root mean squares, for the output where that is larger."""
         sizes = self.given.problem.sizes
         there = sizes > 0
         return float(np.max(self.fit.noise[there] / sizes[there], initial=0.0))
 
     @property
     def is_exact(self) -> bool:
-        """Whether it misses nothing: one simulation meets another no closer."""
+        """Whether its residuals are negligible, as small as between two simulations."""
         return self.misses < CLOSE
 
     @property
@@ -129,36 +134,35 @@ class Model:
 
 
 def refit_from(effects: tuple[str, ...], given: Prepared, start: Optimum, white: Whitener) -> Model:
-    """A model fitted from a start to residuals that a filter makes white."""
+    """A model fitted from a start to whitened residuals; its `fit` is evaluated without the filter."""
     given, ended = polish_with_angle(whitened(given, white), start)
     given = given._replace(problem=replace(given.problem, whitening=None))
-    # no step: what it leaves as it is
+    # no step: the unfiltered residuals at the same point
     plain = polish(given.problem, ended.optimum, steps=0)
     optimum = ended.optimum._replace(fitness=plain.fitness)
     return model_of(effects, given, plain._replace(optimum=optimum))
 
 
 def model_of(effects: tuple[str, ...], given: Prepared, polished: Fit) -> Model:
-    """A fitted model, its rotor turned as the fit says."""
-    if not given.problem.angular:  # or else it was fitted so
+    """A fitted model, its rotor turned in each sample as recordings and fit together tell."""
+    if not given.problem.angular:  # with an effect of the angle, the fit has done this
         given = given._replace(problem=with_rotor_angle(given.problem, polished))
     return Model(effects, given, polished)
 
 
 def final_fit(model: Model, white: Whitener) -> tuple[Prepared, Fit]:
-    """The last fit of a model."""
+    """The last fit of a model: to whitened residuals where `last_fit` allows it, else by plain least squares."""
     known = reweighted(model.given.problem, model.fit)
     plainly = polish_with_angle(model.given, model.fit.optimum, known)
     return last_fit(*plainly, model.fit, white)
 
 
 class RunSeries(NamedTuple):
-    """Of one training run, in A and rad/s: what is simulated, what is measured less that, and the derivatives of the
-    former by the motor's parameters and by what belongs to the run alone."""
+    """One training run, in A and rad/s."""
 
-    shared: Series
-    own: Series
-    residual: Series
+    shared: Series  # derivatives of the simulated outputs by the model's search coordinates
+    own: Series  # ... and by the run's own unknowns (initial state, load, ...)
+    residual: Series  # measured less simulated
     simulated: Series
 
 

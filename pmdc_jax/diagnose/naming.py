@@ -1,4 +1,10 @@
-"""Which effects are missing: forward from the motor without effects, each step refitted in full simulation."""
+"""Which effects are missing: forward selection from the motor without effects, each step refitted in full simulation.
+
+Forms of an effect, as named throughout this package: a *richer* one contains simpler effects and replaces them
+(Stribeck friction contains Coulomb friction); a *harder* one has no column in the regression and is found only by
+refitting (backlash, for a compliant shaft). The *fuller* form of an effect (`FULLER`), of either kind, is the one that
+the runs must rule out before the simple form is named alone.
+"""
 
 from __future__ import annotations
 
@@ -33,20 +39,21 @@ from .shortlist import (
     shortlist,
 )
 
-# At most so many effects are named
+# Largest number of effects in a set
 MOST = 3
-# What the clearest signal would take away after one more effect, over what that effect takes away, at most; the larger
-# one after a richer form of what was there, or where that cannot have left it
+# Limits of `_leaves_little`, as shares of the squares that the better model takes away. LITTLE applies where an effect
+# was replaced by another form, or where the effects before cannot have left the misfit.
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
-# A filter that swallows an effect shows no larger share of it, over what the model explains
+# If the clearest signal gains less than this share of what the model explains, the whitening filter may have absorbed
+# a missing effect: the unfiltered misfit is then examined first
 SWALLOWED = 1e-2
-# What is to take away most of a misfit foretells this share of it, at least
+# Least share of the unfiltered squares that a candidate must promise to be tried on the unfiltered misfit
 FORETOLD = 0.05
-# A simpler form leaves at most so many times the squares, as they are
+# A simpler form may leave at most so many times the unfiltered squares of the richer one
 HARDLY_MORE = 1.5
-# So many noise variances left are no small misfit beside which a refit to first order finds its way
+# Scale of the misfit (noise variances per output) from which a first-order start may lead a refit astray
 LOST = 10.0
-# The simplest effect by which a rotor sticks, what looks like it and a load together, and that load
+# The simplest effect that makes a rotor stick, the effect that imitates friction and load together, and that load
 DRY, ONE_SIDED, LOAD = "coulomb_friction", "asymmetric_friction", "constant_load"
 
 
@@ -57,18 +64,18 @@ class Naming(NamedTuple):
     rivals: list[Model]
     first: Screen  # evidence against the motor without effects
     last: Screen  # and against the chosen one
-    nothing: float  # chance of the evidence if nothing were missing
-    left: float  # chance of what is left if nothing more were missing
-    explained: bool  # whether that is no more than other formulas of the chosen effects might leave
-    # share of what the chosen one leaves that no curve takes away, as root mean square
+    nothing: float  # p-value of the evidence if nothing were missing
+    left: float  # p-value of what is left if nothing more were missing
+    explained: bool  # whether what is left may be model-form error of the chosen effects
+    # root mean square of the chosen one's residuals beyond all curves, over that of all; 1 if nothing more is missing
     noise: float
-    without: dict[str, float]  # by effect of the chosen: chance of the data without it
+    without: dict[str, float]  # by effect of the chosen: p-value of the data without it
     ended: tuple[Prepared, Fit]  # the last fit of the chosen one
     line: Line | None  # a steady oscillation that the chosen one does not have
 
 
 class StepwiseSelection:
-    """Gathers evidence, has sets of effects refitted, and compares them."""
+    """Forward selection with backward elimination: gathers evidence, refits sets of effects, compares them."""
 
     def __init__(self, base: Model, solved: Solved, report: ReportProgress) -> None:
         """`base` is the motor without effects, and `solved` how it was found."""
@@ -76,26 +83,28 @@ class StepwiseSelection:
         self.comparison = Comparison()
         self.refits = Refits(base, solved, self.library, self.comparison, report)
         self.assessments: dict[Model, Assessment] = {}
-        # by effect: those that did as well when it was added
+        # by effect: alternatives that did as well when it was added
         self.instead: dict[str, set[str]] = {}
-        # that a better one has replaced, or is to: judged by another filter each may look like the better one
+        # models that a better one has replaced or is to replace: with different filters two models may each look better
+        # than the other, and the selection would go round in circles
         self.superseded: set[Model] = set()
 
     def name(self) -> Naming:
-        """Add effects while the evidence asks for them; then see which could be spared or replaced."""
+        """Add effects while the evidence asks for them; then try other effects in the place of those found."""
         current, found = self.base, self.assess(self.base)
         self.superseded.add(current)
         while better := self._step(current, found):
             current, found = better, self.assess(better)
             self.superseded.add(current)
         others = self._equivalent_swaps(current, found)
-        if found.left < ALARM:  # however little: beside a large effect play in a gear is a trace
+        if (
+            found.left < ALARM
+        ):  # however little: what backlash leaves is small beside what a large effect explains
             others += self._in_harder_form(current, found, set(current.effects))
         return self._naming(self._better(current, found, others) or current)
 
     def _step(self, current: Model, found: Assessment) -> Model | None:
-        """A better model than the current one, with one effect more or another one, that settles something, if there is
-        one."""
+        """The next model: the first accepted result of the ways to add or replace an effect; None if there is none."""
         ways = [self._by_evidence, self._by_likeliest_effect, self._by_unfiltered_misfit]
         if found.unexplained < SWALLOWED:
             ways = [self._by_unfiltered_misfit, self._by_evidence, self._by_likeliest_effect]
@@ -104,7 +113,7 @@ class StepwiseSelection:
         return next(filter(None, models), None)
 
     def _accepted(self, current: Model, found: Assessment, better: Model | None) -> Model | None:
-        """A better model if it is more than a way to mend a formula, or else in another form that is."""
+        """A better model if it does more than compensate for model-form error; or else another form of it that does."""
         return self._in_a_form_that(
             lambda model: self._explains_more_than_a_formula(current, found, model), current, better
         )
@@ -112,10 +121,10 @@ class StepwiseSelection:
     def _in_a_form_that(
         self, settles: Callable[[Model], bool], current: Model, better: Model | None
     ) -> Model | None:
-        """A better model if it settles what is left, or else what was added to it in another form, if that does."""
+        """A better model if it passes the test `settles`; or else one with another form of the added effect that does."""
         if better is None or settles(better):
             return better
-        # a simple form may be but a step to the one that is there
+        # the simple form may be only a step towards the fuller one that the motor has
         added = set(better.effects) - set(current.effects)
         again = self.assess(better)
         best = self._better(better, again, self._in_other_form(better, again, added))
@@ -128,34 +137,35 @@ class StepwiseSelection:
     def _better(
         self, current: Model, found: Assessment, tried: Sequence[Model | None]
     ) -> Model | None:
-        """The best of some models in place of the current one, if it is better, without what it can do without."""
+        """The best of some models after backward elimination; None if the current one is as good."""
         possible = [model for model in tried if self._is_new(model)]
         if not possible:
             return None
         best = self._best(possible, found.screen.white)
-        # judged by the noise that the clearest signal leaves: a filter of what a poorer model leaves takes
-        # for noise what is missing
+        # this filter was fitted after removing the clearest signal: one fitted to the current model's residuals
+        # would absorb what is missing
         if plainest(self.comparison.ranked([current, best], found.screen.white)) is current:
             return None
         return self._eliminated(best)
 
     def _is_new(self, model: Model | None) -> TypeGuard[Model]:
-        """Whether a model is possible, and none that was left for a better one."""
+        """Whether a model exists, is physically possible, and was not superseded by a better one."""
         return model is not None and model.is_possible and model not in self.superseded
 
     def _explains_more_than_a_formula(
         self, current: Model, found: Assessment, better: Model
     ) -> bool:
-        """Whether a better model is more than a way to mend the formula of what the current one has.
+        """Whether a better model does more than compensate for model-form error of the current one's effects.
 
-        What was left is clearly something else; or little is, beside what the better one takes away.
+        It does if what the current one leaves is clearly something else, or if the better one leaves little compared
+        with what it takes away. A harder form is always accepted.
         """
         if (set(better.effects) - set(current.effects)) & set(HARDER.values()):
             return True
         return found.is_clear(current) or self._leaves_little(current, better)
 
     def _leaves_little(self, current: Model, better: Model) -> bool:
-        """Whether a better model leaves little beside what it takes away."""
+        """Whether a better model leaves nothing significant, or little compared with what it takes away."""
         again = self.assess(better)
         if again.left >= ALARM:
             return True
@@ -170,9 +180,12 @@ class StepwiseSelection:
         return bool(again.clearest.gain < share * gained)
 
     def _by_likeliest_effect(self, current: Model, found: Assessment) -> Model | None:
-        """The current model with the effect that promises most, however little, if it settles what no formula explains:
-        beside one that was fitted wrongly for want of it, it does more than it promises, and so does one of a few on
-        its own where parameters have gone far to make up for two."""
+        """The current model with the effect that promises most, however little that is, if it then leaves little.
+
+        Beside an effect whose parameters are biased for lack of it, an effect gains more than its first-order evidence
+        promises. So does a first effect where the motor's parameters have moved far to compensate for two.
+        Not tried where model-form error may explain what is left.
+        """
         if len(current.effects) == MOST or found.left >= ALARM or found.is_formula(current):
             return None
         if current.effects:
@@ -186,8 +199,11 @@ class StepwiseSelection:
         )
 
     def _by_unfiltered_misfit(self, current: Model, found: Assessment) -> Model | None:
-        """The current model with one of the effects that take away most of what is left, no filter between, if that
-        leaves far less: a filter takes for noise what lasts as long as a short run."""
+        """The current model with one of the effects that promise most on the unfiltered misfit, if a refit cuts it by
+        more than a factor of `FAR`.
+
+        A whitening filter takes for noise whatever lasts as long as a short run.
+        """
         far = current.fit.fitness / FAR
         full = len(current.effects) == MOST
         if full or found.left >= ALARM or far < current.given.problem.outputs:
@@ -200,8 +216,8 @@ class StepwiseSelection:
         return self._better(current, found, better)
 
     def _in_exchange(self, current: Model, found: Assessment) -> Model | None:
-        """A model that has no room for one more effect, with the one that promises most in the place of each of those
-        in the same equation."""
+        """A model with `MOST` effects, one of them exchanged: the most promising new effect is tried in place of each
+        effect in the same equation."""
         if len(current.effects) < MOST or found.left >= ALARM or found.is_trace(current):
             return None
         others = [s for s in clear(found) if effect_of(s) not in current.effects]
@@ -218,7 +234,7 @@ class StepwiseSelection:
         return self._better(current, found, tried)
 
     def without(self, named: Naming, effect: str) -> Naming:
-        """The set without one of its effects."""
+        """The naming for the chosen set without one of its effects."""
         white = self.comparison.white(named.chosen)
         return self._naming(self.refits.without(named.chosen, effect, white))
 
@@ -239,7 +255,7 @@ class StepwiseSelection:
         )
 
     def _trials(self, current: Model, found: Assessment) -> list[Model | None]:
-        """The current model with one effect more, or with a richer or a harder one in place of another."""
+        """The current model with one effect more, or with a richer or harder form of one that it has."""
         here = set(current.effects)
         if len(here) == MOST:
             return []
@@ -254,15 +270,19 @@ class StepwiseSelection:
         if found.asks_for_more():
             tried += self._with(current, found, shortlist(current, found))
             if any(model and model.effects_at_end for model in tried):
-                # no fuller form: a load larger than friction is no asymmetric friction
+                # a richer form ended at a bound, so do not try it alone: asymmetric friction cannot represent a load
+                # larger than the friction
                 tried += self._with(current, found, shortlist(current, found, fuller=False))
         if found.left < ALARM and not here:
             tried += self._searched_with_friction(current, found, tried)
         return tried + harder
 
     def _is_enough(self, model: Model | None) -> bool:
-        """Whether a model leaves nothing that is worth a trial: what teeth that meet by chance leave of a simple form
-        may look like many an effect beside it."""
+        """Whether a model leaves nothing that is worth another trial.
+
+        If a harder form is enough, no other effect is tried: what a simple form leaves of gear teeth that meet at
+        unpredictable times may look like many other effects.
+        """
         if model is None or not model.is_possible:
             return False
         found = self.assess(model)
@@ -271,10 +291,14 @@ class StepwiseSelection:
     def _searched_with_friction(
         self, current: Model, found: Assessment, tried: Sequence[Model | None]
     ) -> list[Model | None]:
-        """The motor with dry friction, searched for anew, if that may explain a misfit of which no first-order response
-        is clear, or was the best that was `tried` and left it far from the noise, and now leaves far less: a motor
-        whose rotor sticks for long is far from one that is thought to creep. With a load, too, where friction was to
-        be none in one direction: a load that is larger than friction drives the rotor that way."""
+        """The motor with dry friction from a new global search, if stiction may explain a large misfit.
+
+        A motor whose rotor sticks for long is too far from one that creeps for first-order evidence. The search is
+        made where no possible model was `tried`, or the best one is still far from the noise, and where a leading
+        effect makes the rotor stick. Its result counts if it cuts the misfit by more than a factor of `FAR`.
+        A load is searched for, too, where asymmetric friction ended at a bound: friction of zero in one direction may
+        be a load larger than friction, which drives the rotor that way.
+        """
         possible = [model for model in tried if model is not None and model.is_possible]
         if possible:
             nearest = min(possible, key=lambda m: m.fit.fitness)
@@ -285,7 +309,7 @@ class StepwiseSelection:
             nearest, noise = current, current.given.problem.outputs
         sticks = any(EFFECTS[effect].holds == "speed" for effect in suspects)
         far = nearest.fit.fitness / FAR
-        if not sticks or far < noise:  # not even a perfect fit would
+        if not sticks or far < noise:  # not even a perfect fit would cut the misfit so far
             return []
         searched = [self.refits.sought(current, DRY)]
         if ONE_SIDED in nearest.effects_at_end:
@@ -295,13 +319,13 @@ class StepwiseSelection:
     def _in_other_form(
         self, model: Model, found: Assessment, added: set[str]
     ) -> list[Model | None]:
-        """The model with what was added to it in a richer or a harder form."""
+        """The model with the effects added last replaced by a richer or a harder form."""
         fuller = [s for s in richer(model, found, MUCH_OF_IT) if CONTAINS[effect_of(s)] & added]
         return self._with(model, found, fuller) + self._in_harder_form(model, found, added)
 
     def _equivalent_swaps(self, current: Model, found: Assessment) -> list[Model | None]:
-        """The model with others in the place of its effects that did as well as these when they were added, or are much
-        like them."""
+        """The model with one effect replaced by another that did as well when it was added, or that resembles it
+        (`Trial.alike`)."""
         if len(current.effects) < 2:
             return []
         return [
@@ -345,7 +369,7 @@ class StepwiseSelection:
         return Assessment(found, of_candidates, of_curves, left, explained, removed)
 
     def _best(self, tried: Sequence[Model], white: Whitener) -> Model:
-        """The best of some refits, by the filter of what the one that leaves least leaves."""
+        """The best of some refits, compared by the whitening filter of the one with the least squares."""
         if len(tried) == 1:
             return tried[0]
         least = self.comparison.ranked(tried, white)[0].model
@@ -355,7 +379,7 @@ class StepwiseSelection:
         return best
 
     def _note_ties(self, best: Model, ranked: Sequence[Fitted]) -> None:
-        """Keep in mind which effects do as well as one of the best model's."""
+        """Record the effects that do as well as one of the best model's (within `MARGIN`)."""
         mine = set(best.effects)
         least = next(f.criterion for f in ranked if f.model is best)
         for other in (f for f in ranked if f.criterion < least + MARGIN):
@@ -364,8 +388,8 @@ class StepwiseSelection:
                 self.instead.setdefault(*(mine - its), set()).update(its - mine)
 
     def _eliminated(self, model: Model) -> Model:
-        """The model without effects that it can do without, or with simpler forms of them, alone or beside another one,
-        that leave nothing more."""
+        """The model after backward elimination: without effects that it does not need, and with simpler forms of
+        effects, alone or with another effect added, where these do as well."""
         white = self.comparison.white(model)
         for effect in model.effects[:-1]:
             smaller = self.refits.without(model, effect, white)
@@ -385,14 +409,17 @@ class StepwiseSelection:
         return model
 
     def _simpler_forms(self, effect: str) -> list[str]:
-        """What an effect contains and may be instead: what was tried, and what it is but a fuller form of."""
+        """The simpler effects that may replace one: those it contains that have been begun, and those of which it is a
+        fuller form."""
         reduced = {s for s, form in FULLER.items() if form.effect == effect and form.reduced}
         return sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys() | reduced)
 
     def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:
-        """A model with a simpler form of a rich effect, and one more beside it that promises as much as the rich form.
+        """A model with a simpler form of a rich effect, and one more effect that promises about as much as the rich
+        form (`COMPARABLE`).
 
-        Stribeck friction bends as drag does, if viscous friction makes up for the rest.
+        For instance, the curvature of Stribeck friction can imitate that of drag, if viscous friction compensates for
+        the rest.
         """
         if len(simpler.effects) == MOST:
             return None
@@ -412,15 +439,19 @@ class StepwiseSelection:
         return two if two and two.is_possible else None
 
     def _is_far_better(self, two: Model, model: Model, white: Whitener) -> bool:
-        """Whether two effects leave far less than a rich one by the filter, and no more as it is."""
+        """Whether two effects beat a rich one by `MARGIN` in the criterion, and leave no more unfiltered squares."""
         if two.fit.fitness > model.fit.fitness:
             return False
         criterion = {f.model: f.criterion for f in self.comparison.ranked([two, model], white)}
         return bool(criterion[two] + MARGIN < criterion[model])
 
     def _does_as_well(self, simpler: Model, model: Model) -> bool:
-        """Whether a simpler form of an effect, chosen while another one was still missing, does as well by now: but for
-        less than what neither explains; or leaves nothing to its own filter, and hardly more with no filter between."""
+        """Whether a simpler form of an effect does as well as the richer one, which may have been chosen only because
+        another effect was still missing.
+
+        Either its criterion is worse by less than `MARGIN` and what neither explains, or it leaves nothing significant
+        by its own filter and hardly more unfiltered squares.
+        """
         rich, plain = (
             self.comparison.left(m, self.comparison.white(model)).criterion
             for m in (model, simpler)

@@ -39,11 +39,11 @@ from .model import model_of
 from .naming import Naming, StepwiseSelection
 from .screen import Screen, log_chance
 
-# A hat of a curve whose misfit is so many standard errors is part of a region
+# A knot of a curve with a misfit of so many standard errors is part of a region
 CLEAR = 4.0
-# By this chance of the runs without it an effect is there, however little else they tell of it
+# An effect with a smaller p-value without it is kept even if the runs give no interval of any of its parameters
 CERTAIN = 1e-30
-# ... and none if its amplitude may as well be so small a share of what was found
+# ... and one whose interval of the amplitude reaches down to this share of the estimate may be none
 NOTHING = 1e-2
 
 
@@ -61,10 +61,10 @@ def diagnose(
 ) -> Diagnosis:
     """Find where a motor's recordings and its simulation disagree, name the missing effects and add them.
 
-    The arguments are those of `pmdc_jax.identify`.
+    **Arguments**: those of `pmdc_jax.identify`, where they are described, without `effects`: these are the answer.
 
     **Returns**: the verdict, the effects with their parameters, where the misfit shows, how much of the gap
-    they close, and the motor before and after.
+    they close, and the motor before and after (see `Diagnosis`).
 
     **Raises**: `InputError` on data or arguments that cannot give an answer.
     """
@@ -123,8 +123,11 @@ def _judged(naming: Naming, solved: Solved) -> Identification:
 
 
 def _idle(naming: Naming, final: Identification, library: Library) -> str | None:
-    """One of several effects that the others do without: by its chance, as its interval reaches to nothing, or as the
-    runs determine nothing of it and do not call for it."""
+    """The effect, of several, that the runs need least, if they do not need it; else None.
+
+    They do not if its p-value is above `ALARM`, if its amplitude may be none, or if they determine none of its
+    parameters and its p-value is above `CERTAIN`.
+    """
     if len(naming.without) < 2:
         return None
     amplitude = {c.effect: c.amplitude for c in library.candidates if c.amplitude}
@@ -142,7 +145,8 @@ def _idle(naming: Naming, final: Identification, library: Library) -> str | None
 
 
 def may_be_none(final: Identification, effect: str, amplitude: str) -> bool:
-    """Whether the interval of an effect's amplitude reaches to nothing, or next to it where none is negative."""
+    """Whether the 95 % interval of an effect's amplitude includes zero, or, if it is strictly positive, the larger of
+    its lower bound and the share `NOTHING` of the estimate."""
     found, about = final.parameters[f"{effect}.{amplitude}"], EFFECTS[effect].ranges[amplitude]
     if found.value is None or found.ci95 is None:
         return False
@@ -178,7 +182,7 @@ def _effects(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:
 
 
 def _regions(naming: Naming) -> tuple[Region, ...]:
-    """Where the curves over every variable are far from zero, the clearest first."""
+    """Where the curves of the motor without effects are far from zero, the clearest first; also a line in frequency."""
     found, line = naming.first, naming.line
     base = found.evidence.regress().squares
     regions = []
@@ -198,7 +202,7 @@ def _regions(naming: Naming) -> tuple[Region, ...]:
 
 
 def _alone(found: Screen, column: int) -> float:
-    """A knot's own misfit over its standard error: side by side, knots would share what they explain."""
+    """The misfit at one knot over its standard error; regressed alone, as neighbours would share what they explain."""
     fit = found.evidence.regress([Block((column,))])
     error = float(fit.errors[0][0])
     return float(fit.coefficients[0][0]) / error if error > 0 else 0.0
@@ -221,14 +225,14 @@ def _stretches(equation: str, variable: str, knots: np.ndarray, z: np.ndarray) -
 
 
 def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
-    """The curves that are left, drawn by the data, the most significant first; a line in time has none."""
+    """The curves that the data still show, at most three, the most significant first; none for a line in frequency."""
     found = naming.last
     if naming.left >= ALARM:
         return ()
     base = found.evidence.regress().squares
     learned = []
     for curve, block in zip(found.curves, found.of_curve, strict=True):
-        # what the motor's own parameters would do as well is no part of the curve
+        # directions that the motor's own parameters can imitate are no part of the curve
         fit = found.evidence.regress([block], visible=1e-3)
         chance = log_chance(base - fit.squares, found.evidence.freedom(block))
         value, error = fit.coefficients[0], fit.errors[0]
@@ -252,7 +256,8 @@ def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
 
 
 def _detectable(found: Screen) -> tuple[Detectable, ...]:
-    """For every effect that may be seen the smallest amplitude that would have been, nine times of ten."""
+    """The smallest amplitude of each effect that would have been detected nine times of ten, at a false-alarm
+    probability of `ALARM` for all blocks together; without effects that no physical amplitude would show."""
     count = len(found.candidates) + len(found.curves)
     needed = stats.norm.isf(ALARM / count / 2) + stats.norm.isf(0.1)
     smallest: dict[str, Detectable] = {}
@@ -271,10 +276,10 @@ def _detectable(found: Screen) -> tuple[Detectable, ...]:
 
 
 def _gaps(base: Identification, final: Identification, share: float) -> dict[str, Gap]:
-    """Of every run the misfit before and after, over the noise.
+    """By run, the misfit before and after, over the noise.
 
-    The noise is the `share` of what the final model leaves of the training runs that no curve takes away, and no less
-    than a simulation is scaled by.
+    The noise of a channel is `share` times what the final model leaves of it in the training runs, as root mean square,
+    and at least `FLOOR` times the channel's size. `share` is below 1 where part of what is left is no noise.
     """
     noise = {c: max(share * _left(final, c), FLOOR * _size(final, c)) for c in ("current", "speed")}
 
@@ -294,7 +299,7 @@ def _gaps(base: Identification, final: Identification, share: float) -> dict[str
 
 
 def _left(found: Identification, channel: str) -> float:
-    """Root mean square of what is left of a channel in the training runs."""
+    """Root mean square of a channel's residuals in the training runs."""
     return _rms_of_all((getattr(f, f"{channel}_rmse"), len(f.time)) for f in _fitted(found))
 
 
@@ -309,7 +314,7 @@ def _fitted(found: Identification) -> list[RunFit]:
 
 
 def _rms_of_all(runs: Iterable[tuple[float | None, int]]) -> float:
-    """Of several runs, each with its root mean square and its samples; zero where none has any."""
+    """Root mean square over several runs, each given by its own and its number of samples; zero if none has any."""
     known = [(rms, samples) for rms, samples in runs if rms is not None]
     samples = sum(n for _, n in known)
     return float(np.sqrt(sum(x * x * n for x, n in known) / samples)) if samples else 0.0

@@ -30,22 +30,22 @@ from .model import Model, model_of, refit_from
 from .screen import Screen, Signal
 from .shortlist import effect_of
 
-# Share of the gain foretold by the evidence that a refit keeps, or else is tried in another way
+# Share of the gain promised by the evidence that a refit must realise; otherwise it is fitted in another way
 KEPT = 0.5
-# Another refit of a set takes the place of one that leaves more by this share
+# A new refit of a set replaces the stored one if its misfit is smaller by this share
 BETTER = 1e-3
-# Steps of a refit that is one of several
+# Gauss-Newton steps of a preliminary refit, one of several from different starts
 ROUGHLY = 8
-# ... and of which two have ended alike if their misfits differ by no more
+# ... two of which found the same optimum if their misfits differ by less than this factor
 AGREED = 1.05
-# How finely a phase is looked for that all runs have in common
+# Grid points in [-pi, pi) for the phase that all runs have in common
 PHASES = 120
 
 Start = tuple[Prepared, Optimum]
 
 
 class Refits:
-    """The models that were fitted so far; `solved` is how the motor without effects was found."""
+    """Fits models and keeps one for each set of effects; `solved` is how the motor without effects was found."""
 
     def __init__(
         self,
@@ -58,12 +58,16 @@ class Refits:
         self.library, self.solved, self.report = library, solved, report
         self.comparison = comparison
         self.models: dict[frozenset[str], Model] = {frozenset(): base}
-        # sets, each with a model from which it was fitted, or need not be
+        # pairs of a set and a model from which it has been fitted, or need not be
         self.begun_from: set[tuple[frozenset[str], Model]] = set()
-        self.begun: dict[str, Values] = {}  # where each effect was first begun to be fitted
+        self.begun: dict[str, Values] = {}  # by effect: the values from which it was first fitted
 
     def with_signal(self, current: Model, signal: Signal, found: Screen) -> Model | None:
-        """The current model with one more effect, None where its evidence is none that physics allows."""
+        """The current model with the effect of a signal added; None if physics forbids the coefficients found.
+
+        If the set was fitted before, from another model, and that fit does not realise the promised gain, it is fitted
+        again from the current model.
+        """
         effects = _with_another(current.effects, effect_of(signal))
 
         def refit() -> Model | None:
@@ -82,22 +86,25 @@ class Refits:
         return self._better_from(key, current, refit)
 
     def _keeps(self, model: Model, current: Model, signal: Signal, white: Whitener) -> bool:
-        """Whether a refit keeps enough of what the evidence against the current model promised."""
+        """Whether a refit realises at least the share `KEPT` of the gain that the evidence promised."""
         before, after = (self.comparison.left(m, white).squares for m in (current, model))
         return bool(before - after > KEPT * signal.gain)
 
     def _better_from(
         self, key: frozenset[str], current: Model, refit: Callable[[], Model | None]
     ) -> Model:
-        """The better one of a model as it was fitted from another one and as it is fitted from the current one."""
+        """The better of the stored fit of a set and a new one from the current model."""
         again = self._fitted(key, current, refit)
         if again and _fitness(again) < (1 - BETTER) * _fitness(self.models[key]):
             self.models[key] = again
         return self.models[key]
 
     def in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
-        """The current model with an effect in place of another: a fuller or a simpler form of it, one that is
-        alike, or one that has starts of its own, or was begun before."""
+        """The current model with the effect `new` in place of `old`.
+
+        `new` is a fuller or simpler form of `old`, an effect that resembles it, one with starts of its own, or one
+        that was begun before: anything else has no values to start from.
+        """
         effects = (*(e for e in current.effects if e != old), new)
 
         def refit() -> Model:
@@ -110,7 +117,10 @@ class Refits:
         return self._once(effects, current, refit)
 
     def _by_what_it_replaces(self, current: Model, old: str, new: str) -> dict[str, Values]:
-        """How to begin with an effect that is alike, or a simple form that was never tried, in place of another."""
+        """Start values of an effect, from the fit of the one that it replaces.
+
+        Given for an effect that resembles the old one, and for a simple form that was never begun; else empty.
+        """
         begins = TRIALS[old].alike.get(new)
         if new not in self.begun and new in FULLER and FULLER[new].effect == old:
             begins = FULLER[new].reduced
@@ -119,8 +129,7 @@ class Refits:
         return {new: begins(next(e for e in current.motor.effects if e.name == old))}
 
     def sought(self, current: Model, effect: str) -> Model:
-        """The current model with one more effect, searched for without regard to how it was fitted; or as it was fitted
-        before, if that is better."""
+        """The current model with one more effect, by a new global search; or the stored fit of the set, if better."""
         effects = (*current.effects, effect)
 
         def search() -> Model:
@@ -136,28 +145,31 @@ class Refits:
         return model
 
     def clearly_in_full(self, current: Model, white: Whitener, effect: str) -> Model:
-        """The current model with a fuller form of an effect, where what makes it fuller stays clearly there."""
+        """The current model with a fuller form of an effect, whose extra parameters are held where they clearly act."""
         fuller = FULLER[effect]
         effects = (*(e for e in current.effects if e != effect), fuller.effect)
         given, begun = self._in_full(current, effect, effects)
         held = {f"{fuller.effect}.{field}" for field in fuller.extra}
         if "Kt" in _unseen(current):
-            # all torques would grow together, until what is held is nothing beside them
+            # all torques could scale up with Kt, until the part that is held is negligible
             held.add("Kt")
         free = jnp.asarray([name not in held for name in given.problem.parameters.names])
         given = given._replace(problem=replace(given.problem, free=free))
         return refit_from(effects, given, begun, white)
 
     def _in_full(self, current: Model, effect: str, effects: tuple[str, ...]) -> Start:
-        """Where to begin refitting with the fuller form of an effect, by the fit of the simple one."""
+        """The start of a refit with the fuller form of an effect, from the fit of the simple one."""
         fuller = FULLER[effect]
         simple = next(e for e in current.motor.effects if e.name == effect)
         values = fuller.begun(simple, self.library.scales)
         return self._start(current, effects, {fuller.effect: values})
 
     def without(self, model: Model, effect: str, white: Whitener) -> Model:
-        """The model without one of its effects; fitted once more if it does better with the parameters of the larger
-        one than where it ended."""
+        """The model without one of its effects.
+
+        A stored fit is refitted if it is worse than the larger model's parameters, as they are, with the effect left
+        out.
+        """
         rest = tuple(e for e in model.effects if e != effect)
         given, begun = self._start(model, rest, {})
 
@@ -193,13 +205,18 @@ class Refits:
         return refit()
 
     def _starts(self, current: Model, effects: tuple[str, ...]) -> list[Start]:
-        """Where else to begin refitting the last of some effects."""
+        """Additional starts for the last of some effects: those of its `Trial.starts`."""
         starts = TRIALS[effects[-1]].starts
         others = starts(self.library.scales) if starts else []
         return [self._start(current, effects, {effects[-1]: values}) for values in others]
 
     def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener) -> Model:
-        """The best refit of several, begun one after another until one is as good as the noise or found twice."""
+        """The best refit from several starts of the last effect.
+
+        Preliminary refits of a few steps stop once the best one reaches the noise (`POOR`) or two agree on it
+        (`AGREED`); the best is then refitted in full. With `Trial.factors`, populations search around each start
+        first, and around where the full refit ended.
+        """
         given, seed = starts[0][0], self.solved.seed
         runs = starts[0][1].unknowns.runs
         factors = {f"{effects[-1]}.{f}": times for f, times in TRIALS[effects[-1]].factors.items()}
@@ -226,9 +243,12 @@ class Refits:
         signal: Signal,
         white: Whitener,
     ) -> Model:
-        """Refitted from where the evidence points; if that leads nowhere near what it promises, also by way of plain
-        least squares; and as those leave it, if that is far less of what is measured: then what the filter took for
-        noise was what is missing."""
+        """A refit from where the evidence points, and, if that does not realise the promised gain, by plain least
+        squares, too.
+
+        If plain least squares leaves far less unfiltered misfit, its fit is returned: the filter had taken the missing
+        effect for noise. Otherwise a filtered refit starts from there, and the better of the two is returned.
+        """
         given, begun = start
         model = refit_from(effects, given, begun, white)
         if self._keeps(model, current, signal, white):
@@ -247,7 +267,7 @@ class Refits:
         signal: Signal,
         found: Screen,
     ) -> Start | None:
-        """Where to begin by the evidence for a signal, None where that is none that physics allows."""
+        """The start of a refit by a signal's regression coefficients; None if physics forbids them."""
         candidate, fit = signal.candidate, found.evidence.regress([signal.block])
         assert candidate is not None
         coefficients, angles = fit.coefficients[0], np.zeros(current.given.problem.tape.runs)
@@ -274,12 +294,15 @@ class Refits:
         moved: np.ndarray | float = 0.0,
         angles: np.ndarray | float = 0.0,
     ) -> Start:
-        """Where to begin refitting the current model with other effects: their `values`, and how far by the
-        evidence the motor's parameters have `moved` and each run begins turned."""
+        """The start of a refit of the current model with other effects.
+
+        **Arguments**: `values`, by new effect its parameters; `moved`, first-order change of the motor's search
+        coordinates; `angles`, in rad, added to the rotor angle at which each run begins.
+        """
         given = current.given.with_effects([EFFECTS[e] for e in effects])
         parameters, unknowns = given.problem.parameters, current.fit.unknowns
         names = current.given.problem.parameters.names
-        # a parameter that no run sees may seem to move by any factor
+        # the regression may move a parameter that no run determines by any amount
         near = np.clip(moved, -1.0, 1.0)
         before = dict(zip(names, np.asarray(unknowns.coordinates) + near, strict=True))
         for effect, new in values.items():
@@ -299,8 +322,10 @@ class Refits:
 
 
 def _with_another(here: tuple[str, ...], effect: str) -> tuple[str, ...]:
-    """A set of effects with one more, in place of those that it contains: as they were added, what is spelt out after
-    them, and it last."""
+    """A set of effects with one more, which replaces those that it contains.
+
+    Order: the effects that stay as they were added, those that `spelt_out` puts in, and the new effect last.
+    """
     contains, kept = CONTAINS.get(effect, set()), set(here)
     if contains & spelt_out(kept):
         kept = spelt_out(kept) - contains
@@ -312,7 +337,7 @@ def _fitness(model: Model) -> float:
 
 
 def _roughly(start: Start) -> Optimum:
-    """A few steps of a refit; infinitely bad where it cannot be simulated."""
+    """A preliminary refit of a few steps; its misfit is infinite where it cannot be simulated."""
     given, begun = start
     end = polish(given.problem, begun, ROUGHLY).optimum
     return end if np.isfinite(end.fitness) else end._replace(fitness=np.inf)
@@ -325,7 +350,10 @@ def _best_around(
     factors: Mapping[str, float],
     seed: int,
 ) -> Model:
-    """The best refit from a start and from where populations around its end lead, by the filter of what it leaves."""
+    """The better of two refits: from a start, and from the best of a population around where the first refit ended.
+
+    Both are fitted and compared by the whitening filter of the residuals at the start.
+    """
     white = whitener(residuals_of(given, polish(given.problem, begun, steps=0)))
     sharp = whitened(given, white).problem
 
@@ -339,15 +367,16 @@ def _best_around(
 
 
 def _nearby(given: Prepared, start: Optimum, factors: Mapping[str, float], seed: int) -> Optimum:
-    """The best of populations around a start."""
+    """The best point of a population search around a start; `factors` as in `best_nearby`."""
     fit = polish(given.problem, start, steps=0)
     return best_nearby(given.problem, fit, factors, seed)
 
 
 def _turns(model: Model, effect: str) -> list[np.ndarray | None]:
-    """By which angles, in rad, each training run may begin turned to suit an effect; None, by any.
+    """The angles, in rad, by which the start of each training run may be turned to suit an effect; None: by any.
 
-    By none, where its angle is known or counts as zero; by whole periods of another effect that the model has.
+    Only zero if the run's angle is known or defines zero. If the model has another effect of the angle, only whole
+    periods of that one.
     """
     others = [e for e in model.motor.effects if "angle" in e.states and e.name != effect]
     count = round(2 * np.pi / float(others[0].repeats_after()["angle"])) if others else 0
@@ -359,8 +388,13 @@ def _turns(model: Model, effect: str) -> list[np.ndarray | None]:
 def common_phase(
     coefficients: Float[np.ndarray, "runs 2"], turns: Sequence[np.ndarray | None], periods: float
 ) -> tuple[float, np.ndarray]:
-    """The phase that some runs have in common, by the cosine and sine of each, if each begins turned as it may:
-    by one of its `turns` in rad, or by any angle; and by which it does."""
+    """The phase of a periodic torque that all runs have in common.
+
+    **Arguments**: `coefficients`, cosine and sine amplitude of each run; `turns`, the angles in rad by which the start
+    of each run may be turned, None for any; `periods` of the torque in one turn.
+
+    **Returns**: the phase in rad, and the angle by which each run is turned.
+    """
     sizes = np.hypot(*coefficients.T)
     phases = np.arctan2(coefficients[:, 1], coefficients[:, 0])
     common = np.linspace(-np.pi, np.pi, PHASES, endpoint=False)
@@ -377,7 +411,7 @@ def common_phase(
 
 
 def _unseen(model: Model) -> set[str]:
-    """The parameters that have a part in what the runs do not determine."""
+    """The parameters with a part in any direction that the runs do not determine."""
     problem = model.given.problem
     unseen = information_of(problem, model.fit).unseen
     return {name for d in unseen for name in moved_by(d, problem.parameters)}

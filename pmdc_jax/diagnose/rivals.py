@@ -1,4 +1,4 @@
-"""What stands against the chosen set of effects: other sets that do as well, and the set without each of its own."""
+"""How sure the chosen set of effects is: other sets that do as well, and the likelihood ratio without each effect."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from .effect_relations import FULLER, are_rivals
 from .model import Model
 from .refits import Refits
 
-# A fuller form of an effect is ruled out if it leaves so many squares more: two standard errors
+# A fuller form of an effect is ruled out if it leaves so many more squares, in noise variances: two standard errors
 RULED_OUT = 4.0
-# Rivals whose criterion is nearer than the margin, and this share of what neither explains, are not told apart
+# Share of what the chosen set does not explain that widens the margin within which rivals are not told apart
 OF_UNEXPLAINED = 0.1
 
 
 def rivals_of(
     chosen: Model, found: Assessment, refits: Refits, comparison: Comparison
 ) -> list[Model]:
-    """Other sets that explain the runs as well, the best first, and those with a fuller form that is not ruled out."""
+    """Other sets that explain the runs as well, the best first, then the chosen one with each fuller form that is not
+    ruled out."""
     white = found.screen.white
     models = [chosen, *(m for m in refits.models.values() if m.is_possible)]
     ranked = comparison.ranked(models, white)
@@ -29,7 +30,7 @@ def rivals_of(
     margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.left < ALARM else 0.0)
     near = [f.model for f in ranked if f.criterion < least + margin]
     rivals = [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]
-    # clearly in the fuller form, where the runs show too little of an effect to tell
+    # the fuller form clearly there: a free fit would fall back on the simple form where the runs show too little
     simple = [effect for effect in chosen.effects if effect in FULLER]
     fuller = [refits.clearly_in_full(chosen, white, effect) for effect in simple]
     enough = comparison.left(chosen, white).squares + RULED_OUT
@@ -39,8 +40,8 @@ def rivals_of(
 def chances_without(
     chosen: Model, white: Whitener, refits: Refits, comparison: Comparison
 ) -> dict[str, float]:
-    """By effect of the chosen set, the chance of the runs without it: a ratio of likelihoods, one degree of freedom for
-    each of its parameters."""
+    """By effect of the chosen set, the p-value of the runs without it: a likelihood-ratio test, chi-squared with one
+    degree of freedom for each of the effect's parameters."""
     chances = {}
     for effect in chosen.effects:
         smaller = refits.without(chosen, effect, white)

@@ -1,4 +1,4 @@
-"""The evidence against a fitted motor: its residuals, regressed on everything that may be missing."""
+"""The evidence against a fitted motor: a score test of its white residuals for everything that may be missing."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ from .model import Model
 from .quantisation import READINGS
 from .rows import Rows, gathered
 
-# How much stronger slow noise may be at the slowest waves than at most of them
+# Slow noise at the slowest waves, over that at most of them, at most
 SLOWEST_WAVES = 1.5
-# How much stronger the noise of a torque may be over the few knots of a curve over time than a filter makes of it,
-# where it keeps for 0.2 s and runs take some seconds
+# Torque noise over the few knots of a curve over time, at most, over what is left of it after the whitening filter:
+# for a correlation time of 0.2 s in runs of some seconds
 SLOWER = 4.0
-# So many standard errors are clearly more than nothing
+# Standard errors by which a value clearly differs from zero
 CLEARLY = 3.0
-# What a torque that drifts gains in white noise, over its degrees of freedom, at most: of some forty
+# Largest gain per degree of freedom of a drifting torque in white noise, at some forty degrees of freedom
 BY_CHANCE = 1.25
 
 
 class Screen(NamedTuple):
-    """Evidence, and which of its columns belong to what."""
+    """The evidence against a model, and which of its columns belong to what."""
 
-    evidence: Evidence  # white
+    evidence: Evidence  # whitened
     white: Whitener
-    unfiltered: Evidence  # the same without a filter of the noise
+    unfiltered: Evidence  # the same, only scaled by the noise of each run
     candidates: list[Candidate]
     of_candidate: list[Block]
     curves: list[Curve]
     of_curve: list[Block]
     dry: float  # Coulomb friction in the model, N m
-    traces: Mapping[str, float]  # by unit: what may be but a trace of what a sensor does
+    traces: Mapping[str, float]  # by unit: the amplitude that imperfect sensors alone may produce
 
     def possible(self, candidate: Candidate, coefficients: np.ndarray) -> bool:
-        """Whether physics allows these coefficients, and they are no trace of a sensor."""
+        """Whether physics allows these coefficients, and the amplitude is not one that sensors may produce."""
         if candidate.own_phase:
             return True
         amplitude = abs(coefficients[-1]) * candidate.unit
@@ -53,7 +53,7 @@ class Screen(NamedTuple):
         return physical and bool(amplitude >= self.hidden(candidate))
 
     def hidden(self, candidate: Candidate) -> float:
-        """An amplitude that may be but a trace of what a sensor does."""
+        """The amplitude, in SI units, below which imperfect sensors alone may produce a candidate."""
         field = candidate.amplitude
         unit = EFFECTS[candidate.effect].ranges[field].unit if field else ""
         return self.traces.get(unit, 0.0)
@@ -62,8 +62,8 @@ class Screen(NamedTuple):
 def screen(model: Model, library: Library) -> Screen:
     """Gather the evidence against a model.
 
-    The noise is what the clearest candidate or curve leaves: a filter of the residuals as they are would take
-    for noise what is missing, a constant offset above all, and leave nothing of it to be seen.
+    The whitening filter is fitted to what the clearest candidate or curve leaves of the residuals. One fitted to the
+    residuals themselves would take what is missing for noise, a constant offset above all, and hide it.
     """
     tape, path = model.given.problem.tape, model.path
     curves, of_curves = curves_over(library, tape, path)
@@ -91,16 +91,16 @@ def screen(model: Model, library: Library) -> Screen:
 
 
 def beyond_curves(found: Screen) -> float:
-    """Share of the squares of a model's residuals, as they are, that no curve over a variable takes away."""
+    """Share of a model's unfiltered squared residuals that remains after all curves shared by the runs."""
     shared = [block for block in found.of_curve if not block.own]
     return found.unfiltered.regress(shared).squares / found.unfiltered.regress().squares
 
 
 class Signal(NamedTuple):
-    """A block of the evidence on its own: how much better the fit is with it."""
+    """One block of the evidence, regressed alone: how much it improves the fit."""
 
-    gain: float
-    log_p: float  # natural logarithm of the chance of such a gain by noise
+    gain: float  # decrease of the squared white residuals
+    log_p: float  # natural logarithm of the p-value of such a gain by noise
     of: Candidate | Curve
     block: Block
 
@@ -111,9 +111,9 @@ class Signal(NamedTuple):
 
 
 def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
-    """Of every candidate that physics allows, and of every curve; the most significant first."""
+    """The signals of all possible candidates, and those of all curves; each list the most significant first."""
     base = found.evidence.regress().squares
-    # rows that no filter has made white all drift
+    # unfiltered residuals drift everywhere: no correction for slow noise
     white = found.evidence is not found.unfiltered
     drift, waver = (_drift(found), _waver(found)) if white else (None, None)
 
@@ -138,7 +138,8 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     gains[waves] /= _dispersion(found, gains[waves], found.of_curve[-1])
     for k, curve in enumerate(found.curves):
         if drift is not None and curve.reverses:
-            # a torque that fluctuates slowly is noise; a friction that changes is not, as it turns with the motion
+            # a slowly fluctuating torque is noise, a changing friction is not: it reverses with the motion. So only
+            # what it gains beyond a drifting torque counts.
             gains[k] = _left(found, drift) - _left(found, drift, found.of_curve[k])
         elif found.of_curve[k] is drift:
             gains[k] /= SLOWER
@@ -149,7 +150,7 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
 
 
 def _is_trace(found: Screen, curve: Curve, block: Block) -> bool:
-    """Whether a curve of a voltage is nowhere clearly larger than what a sensor makes of it."""
+    """Whether a curve in volts is nowhere clearly larger than what imperfect sensors may produce."""
     trace = found.traces["V"]
     if not trace or not _is_voltage(curve):
         return False
@@ -160,12 +161,12 @@ def _is_trace(found: Screen, curve: Curve, block: Block) -> bool:
 
 
 def _left(found: Screen, *blocks: Block) -> float:
-    """The squares that some blocks together leave."""
+    """The squares left by a regression on some blocks together."""
     return found.evidence.regress(blocks).squares
 
 
 def _drift(found: Screen) -> Block | None:
-    """A torque that drifts in every run in its own way; None where encoders are too coarse to tell."""
+    """The block of a torque that drifts over time, in every run in its own way; None if there is no such curve."""
     for curve, block in zip(found.curves, found.of_curve, strict=True):
         if (curve.equation, curve.variable, curve.reverses) == ("mechanical", "time", False):
             return block
@@ -173,19 +174,22 @@ def _drift(found: Screen) -> Block | None:
 
 
 def _waver(found: Screen) -> Block | None:
-    """A voltage that wavers in every run in its own way, where it is known to be noise."""
+    """The block of a voltage that fluctuates over time, in every run in its own way; None unless known to be noise."""
     pairs = zip(found.curves, found.of_curve, strict=True)
     return next((block for curve, block in pairs if curve.noise), None)
 
 
 def _is_voltage(of: Candidate | Curve) -> bool:
-    """Whether something is a voltage: what is left of the noise of the recorded one may look like it."""
+    """Whether something acts as a voltage: what is left of the noise of the recorded voltage may look like it."""
     equation = EFFECTS[of.effect].equation if isinstance(of, Candidate) else of.equation
     return unbalances(equation) == "electrical"
 
 
 def _is_slow_torque(of: Candidate | Curve) -> bool:
-    """Whether something is a torque that changes no faster than the motion: slow noise may look like it."""
+    """Whether something is a torque that changes no faster than the motion: slow torque noise may look like it.
+
+    That is a mechanical effect without states, or a mechanical curve over speed or current.
+    """
     if isinstance(of, Candidate):
         effect = EFFECTS[of.effect]
         return effect.equation == "mechanical" and not effect.states
@@ -193,19 +197,20 @@ def _is_slow_torque(of: Candidate | Curve) -> bool:
 
 
 def _beside(found: Screen, block: Block, drift: Block) -> float:
-    """How much more than by chance a torque, or a voltage, gains that drifts beside a block.
+    """Overdispersion beside a block: the gain per degree of freedom of a drifting torque or voltage added to the
+    block, over that by chance; at least 1.
 
-    A filter leaves a weak fluctuation of some tenths of a second, hidden beneath the noise of the sensors, and the
-    block takes its share of it.
+    The whitening filter leaves weak fluctuations of some tenths of a second, hidden below the noise of the sensors, and
+    the block takes its share of them.
     """
     rest = _left(found, block) - _left(found, block, drift)
     return max(rest / found.evidence.freedom(drift) / BY_CHANCE, 1.0)
 
 
 def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> float:
-    """How much more than by chance waves gain: they are slow, and of slow noise a filter leaves some.
+    """Overdispersion of the waves' gains: they are slow, and the whitening filter leaves some slow noise.
 
-    By their lower quartile, for in short runs a wave that is there shows in many of its neighbours.
+    From the lower quartile of the gains, because in short runs a real wave shows in many of its neighbours.
     """
     level = float(np.quantile(gains, 0.25) / stats.chi2.ppf(0.25, found.evidence.freedom(wave)))
     return SLOWEST_WAVES * max(level, 1.0)
@@ -214,7 +219,10 @@ def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> float:
 def common_to_waves(
     evidence: Evidence, gained: Sequence[tuple[Candidate, Block, float]]
 ) -> dict[str, float]:
-    """By effect that is a wave: what most periods gain alike, beyond chance, which is no evidence for one of them."""
+    """By periodic effect, the median over its candidates of the gain beyond chance.
+
+    What candidates with different periods gain alike is no evidence for one of them.
+    """
     by_period: dict[str, list[float]] = {}
     for candidate, block, gain in gained:
         if candidate.own_phase:
@@ -228,7 +236,7 @@ def _log_p(signal: Signal) -> float:
 
 
 def log_chance(gain: float, freedom: int) -> float:
-    """Logarithm of the chance that noise alone gains as much; far out by the leading term of the tail."""
+    """Natural logarithm of the chi-squared p-value of a gain; from 500 on, by the leading term of the tail."""
     if gain < 500:
         return float(stats.chi2.logsf(gain, freedom))
     half = freedom / 2
@@ -236,13 +244,13 @@ def log_chance(gain: float, freedom: int) -> float:
 
 
 def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
-    """Inner products of all rows, made white by one filter."""
+    """The evidence from all rows, whitened by one filter."""
     white = (run.white(k, whiten) for k, run in enumerate(rows))
     return products(white, rows[0].fit.shared.values.shape[-1], LOCAL, READINGS)
 
 
 def _without_clearest(found: Screen, rows: Sequence[Rows]) -> list[Series]:
-    """What the clearest candidate or shared curve leaves of the residuals."""
+    """The residuals of each run less the most significant candidate or shared curve, and all that is fitted with it."""
     of_candidates, of_curves = signals(found)
     clearest = min(
         (s for s in (*of_candidates, *of_curves) if s.candidate or not s.block.own),

@@ -1,4 +1,4 @@
-"""Which effects the evidence against a model puts first."""
+"""Which effects to try next, by the evidence against a model."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from .effect_relations import CONTAINS, spelt_out
 from .model import Model
 from .screen import Signal
 
-# So many candidates for one effect are refitted in full simulation
+# Number of effects that are refitted in full simulation for one step
 SHORTLIST = 3
-# ... those whose gain to first order is at least this share of the best one's
+# ... each with at least this share of the best one's gain to first order
 COMPARABLE = 0.6
-# ... and those that gain as much as the last of them but for this share: rounding must not choose
+# ... and with those whose gain is within this share of the last one's: rounding must not decide
 TIED = 1e-3
 
 
 def shortlist(current: Model, found: Assessment, fuller: bool = True) -> list[Signal]:
-    """The most significant shape of each of the few effects that explain most.
+    """The most significant shape of each of the few effects that gain most.
 
-    If that is an effect which is there already and little is left, its own formula is what is left to be desired,
-    or else an effect that does more than its columns show; but a sensor's formula is exact, and one that explains far
-    more is missing, however much like slow noise it looks. One that contains an effect which is there, and explains
-    most of what is left, needs no other beside it, if `fuller` forms are to be tried alone.
+    If the most significant effect is in the model already and little is left, the rest counts as its model-form error;
+    only effects with `Trial.starts`, which do more than their columns show, are tried then. This does not hold for an
+    effect of a sensor, whose formula is exact, nor if another effect gains far more, however much like slow noise it
+    looks. With `fuller`, a richer form of an effect in the model that explains most of what is left is tried alone.
     """
     obvious = clear(found)
     ranked = [s for s in obvious if effect_of(s) not in current.effects]
@@ -39,9 +39,9 @@ def shortlist(current: Model, found: Assessment, fuller: bool = True) -> list[Si
         ranked = [s for s in ranked if TRIALS[effect_of(s)].starts]
     elif fuller and (alone := richer(current, found)):
         return alone
-    # what may be slow noise is trusted less, but is tried for what it explains
+    # by gain: what may be slow noise has less significance, but is tried for what it explains
     ranked.sort(key=lambda s: -s.gain)
-    # where little is left one has to settle nearly all of it, so those that promise less do no harm
+    # where little is left, an effect is accepted only if it explains nearly all of it, so weak ones do no harm
     share = 0.0 if found.unexplained < FORMULA else COMPARABLE
     ranked = [s for s in ranked if s.gain > share * ranked[0].gain]
     least = ranked[:SHORTLIST][-1].gain if ranked else 0.0
@@ -49,8 +49,11 @@ def shortlist(current: Model, found: Assessment, fuller: bool = True) -> list[Si
 
 
 def promising(signals: Sequence[Signal], here: set[str], least: float) -> list[Signal]:
-    """Of each of the few effects that gain most, but for those that are `here`, the shape that does, if it gains at
-    `least` so much: by far less than the best, too, for a fit far from the truth foretells badly what each would do."""
+    """The shape with the largest gain of each of the few effects that gain most, without those that are `here`.
+
+    Each gains at `least` so much, and at least `MUCH_OF_IT` of the best: a low limit, as the first-order gains of a fit
+    far from the truth predict poorly what each effect would do.
+    """
     best: dict[str, Signal] = {}
     for s in sorted(signals, key=lambda s: -s.gain):
         if effect_of(s) not in here:
@@ -60,10 +63,10 @@ def promising(signals: Sequence[Signal], here: set[str], least: float) -> list[S
 
 
 def clear(found: Assessment) -> list[Signal]:
-    """The most significant shape of every effect that chance would not bring about.
+    """The most significant shape of every significant effect.
 
-    A torque may look like slow noise because another one is missing beside it: what takes away much of the clearest
-    curve counts, if that one is clear.
+    A torque may look like slow noise because another one is missing, too. So an effect also counts if it gains much of
+    what the most significant curve gains, and that curve is significant.
     """
     best: dict[str, Signal] = {}
     for s in found.of_candidates:
@@ -74,7 +77,7 @@ def clear(found: Assessment) -> list[Signal]:
 
 
 def richer(current: Model, found: Assessment, share: float = MOST_OF_IT) -> list[Signal]:
-    """An effect that contains one which is there, and explains such a share of what is left; if there is one."""
+    """The first clear effect that contains one of the model's and explains more than a `share` of what is left."""
     here = spelt_out(set(current.effects))
     enough = share * found.clearest.gain
     return [
