@@ -1,8 +1,8 @@
-"""Whether a model meets the electrical equation to the noise of the sensors, whatever torque the motor is under.
+"""Whether a model satisfies the electrical equation to within the noise of the sensors, whatever torque acts.
 
-A torque that fluctuates makes the residuals of a free run large and slow, and a filter of the noise then takes for
-noise what a model lacks, too. But no torque enters the electrical equation: from sample to sample the residual of the
-current follows that of the speed, but for the white noise of the sensors.
+A fluctuating torque makes the residuals of a free run large and slow, and a whitening filter then takes for noise what
+a model lacks, too. But no torque enters the electrical equation: from sample to sample the residual of the current
+follows from that of the speed, up to the white noise of the sensors.
 """
 
 from __future__ import annotations
@@ -19,31 +19,33 @@ from ..motor import Drive, Motor
 from ..recording import OVER_LAST
 from .model import Model
 
-# Fewer samples of a run tell nothing
+# A run with fewer usable samples is left out
 ENOUGH = 50
-# A current is none by chance from so many times the noise of its sensor on
+# A current flows if it exceeds so many standard deviations of its sensor's noise
 CLEAR = 4.0
-# Errors of sensors are in two steps that follow each other, and what pulses of a bridge put into a step that does not
-# end with one of them is in no other: what is in steps so far apart, by more standard errors than chance brings, is
-# what the equation lacks
+# Lags, in steps of one sample, at which residuals of the equation are correlated, and standard errors that chance may
+# bring. A sensor's error enters two successive steps, and the ripple of a bridge's pulses, where a step does not end
+# with one of them, only one. What steps farther apart have in common is what the equation lacks.
 APART, CHANCE = range(2, 9), 3.0
 
 
 class _Balance(NamedTuple):
-    """Of one run what the electrical equation leaves of the current from sample to sample, and what other values of R,
-    Kb, a voltage that opposes the current, and L would add to it, both over the white noise of the sensors."""
+    """One run's residuals of the electrical equation from sample to sample, over the white noise of the sensors."""
 
-    rest: Float[np.ndarray, " samples"]
+    rest: Float[np.ndarray, " samples"]  # of the current at the end of each step
+    # derivatives by R, Kb, a voltage drop that opposes the current, and L, each up to a factor
     by_parameters: Float[np.ndarray, "samples 4"]
 
 
 def electrical_misfit(model: Model) -> float:
-    """What the electrical equation leaves, over what the white noise of the sensors would, as root mean square: of the
-    run where that is most; 1 where no run has voltage, current and speed, or nothing is missed.
+    """Residual of the electrical equation over the white noise of the sensors, as root mean square, of the worst run.
 
-    With residuals i and w of current and speed, R i + L di/dt + Kb w = 0 between two samples, w on a straight line. R,
-    L, Kb and the drop of brushes are those that leave least: torques that fluctuate lead the fit of a free run astray.
-    Added to the noise is what steps some samples `APART` have in common: a voltage that is rough lacks no effect.
+    With residuals i and w of current and speed, R i + L di/dt + Kb w = 0 between two samples, with w on a straight
+    line. R, L, Kb and the brush voltage drop are fitted to these residuals by least squares over all runs, because
+    fluctuating torques bias the fit of a free run. Only what steps some samples `APART` have in common is added to the
+    noise: a rough voltage, whose errors differ from step to step, is no missing effect.
+
+    **Returns**: at least 1; 1 if no run has voltage, current and speed, or if the model is exact.
     """
     if model.is_exact:
         return 1.0
@@ -61,14 +63,14 @@ def electrical_misfit(model: Model) -> float:
 
 
 def _lasting(rest: Float[np.ndarray, " samples"]) -> float:
-    """The largest product of two values some samples apart, on average, less what chance makes it."""
+    """The largest mean product, in magnitude, of two values some samples `APART`, less what chance makes it."""
     products = [rest[apart:] * rest[:-apart] for apart in APART]
     clear = [abs(p.mean()) - CHANCE * p.std() / np.sqrt(len(p)) for p in products]
     return float(max(0.0, *clear))
 
 
 def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
-    """What the electrical equation leaves of a run; None of one that tells nothing."""
+    """The residuals of the electrical equation in a run; None if they are too few or a signal was not recorded."""
     given, tape = model.given, model.given.problem.tape
     drive, known, left = tape.drive_of(run), residual.known, residual.values
     if residual.kind[1] != (0, 1) or not drive.voltage or known.sum() < ENOUGH:
@@ -83,7 +85,7 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     if pairs.sum() < ENOUGH:
         return None
     kept, before, after, volt = _step(model.motor, drive, tape.sample_time_of(run))
-    if given.runs[run].averaging == OVER_LAST:  # the mean over that very step
+    if given.runs[run].averaging == OVER_LAST:  # the reported speed is the mean over just this step
         before, after = 0.0, before + after
     i, w = left.T
     rest = i[1:] - kept * i[:-1] - before * w[:-1] - after * w[1:]
@@ -97,8 +99,8 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
 
 
 def _step(motor: Motor, drive: Drive, seconds: float) -> tuple[float, float, float, float]:
-    """What of the current is left after a step, and what the speed before and after it, and a volt throughout, add to
-    it: A per A, A per rad/s twice, A per V."""
+    """Derivatives of the current after a step by the current before it (A/A), the speed before and after it (A per
+    rad/s), and a voltage held during it (A/V)."""
     A, B = map(np.asarray, motor.state_space(drive))
     decay = A[0, 0] * seconds
     mean = np.expm1(decay) / decay
@@ -110,11 +112,14 @@ def _step(motor: Motor, drive: Drive, seconds: float) -> tuple[float, float, flo
 def _flows(
     measured: Float[np.ndarray, " samples"], simulated: Float[np.ndarray, " samples"], clear: float
 ) -> Bool[np.ndarray, " samples"]:
-    """Where a current flows by both, in one direction: brushes that hold it at zero take up any voltage."""
+    """Where measured and simulated current both clearly flow, in one direction.
+
+    Elsewhere brushes may hold the current at zero and take up any voltage.
+    """
     return (np.abs(simulated) > clear) & (measured * np.sign(simulated) > clear)
 
 
 def _noise(measured: Float[np.ndarray, " samples"], left: Float[np.ndarray, " samples"]) -> float:
-    """Standard deviation of a sensor's white noise: by what was measured, or by what a model leaves of it, which shows
-    it better the rougher the motion is, unless the sensor's own steps are coarser."""
+    """Standard deviation of a sensor's white noise: the smaller of two estimates, from the measured signal and from its
+    residuals, which show it better the rougher the motion is; the latter at least what the sensor's steps make."""
     return min(white_noise([measured]) or np.inf, noise_of_sensor(measured, left))

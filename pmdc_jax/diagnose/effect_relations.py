@@ -1,23 +1,26 @@
-"""Which sets of effects are one while the motor turns, or contain one another."""
+"""Which effects contain others, and which sets of effects are the same torque while the motor turns."""
 
 from __future__ import annotations
 
 from .candidates import TRIALS
 
-# An effect that contains others replaces them
+# By rich effect, the effects that it contains and replaces
 CONTAINS = {effect: trial.contains for effect, trial in TRIALS.items() if trial.contains}
-# The simple forms of which there are fuller ones
+# By simple effect, its fuller form
 FULLER = {effect: trial.fuller for effect, trial in TRIALS.items() if trial.fuller}
 
 
 def unbalances(equation: str) -> str:
-    """The equation that is out of balance for want of an effect in another one: a voltage lost on the way to the
-    terminals is missing in the electrical one."""
+    """The equation of the motor in which an effect of an `equation` shows when it is missing.
+
+    A voltage lost before the terminals ("input") shows in the electrical one; any other shows in its own.
+    """
     return "electrical" if equation == "input" else equation
 
 
 def are_rivals(a: set[str], b: set[str]) -> bool:
-    """Not the same, none a part of the other, and none with an effect in place of one that it contains."""
+    """Whether two sets, `a` not empty, are alternatives: not the same torque, neither a part of the other, and neither
+    the other with an effect in a simpler form."""
     return bool(a) and not (a <= b or b <= a or _same_class(a, b) or _contains(a, b))
 
 
@@ -27,19 +30,23 @@ def is_within(a: set[str], b: set[str]) -> bool:
 
 
 def spelt_out(effects: set[str]) -> set[str]:
-    """The same torque in motion, by effects that one which is richer in another way can be part of."""
+    """The set with asymmetric friction spelt out as Coulomb friction and a constant load.
+
+    While the motor turns that is the same torque, and an effect that is richer in another way, as Stribeck friction,
+    can replace a part of it.
+    """
     if "asymmetric_friction" in effects:
         return (effects - {"asymmetric_friction"}) | CONTAINS["asymmetric_friction"]
     return effects
 
 
 def _same_class(a: set[str], b: set[str]) -> bool:
-    """While the motor turns, asymmetric friction and Coulomb friction with a constant load are one torque."""
+    """Whether two sets are the same torque while the motor turns (see `spelt_out`)."""
     return spelt_out(a) == spelt_out(b)
 
 
 def _contains(a: set[str], b: set[str]) -> bool:
-    """Whether one set is the other but for an effect that another one contains."""
+    """Whether one set, with its effects in their simplest forms, is part of the other, or both are then the same."""
     return _simplified(a) <= b or _simplified(b) <= a or _simplified(a) == _simplified(b)
 
 

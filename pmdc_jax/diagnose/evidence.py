@@ -1,7 +1,7 @@
 """Evidence for what is missing: one regression of whitened residuals on everything that might be.
 
-Whatever is asked of the evidence afterwards (a single effect, a pair, a curve) is algebra on one small matrix of
-inner products for every run.
+Any question asked of the evidence afterwards (a single effect, a pair, a curve) is algebra on one small matrix of inner
+products for each run.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-# A direction with less than this share of the squares is none: responses to first order are good to a thousandth,
-# and what tells one from what the motor's parameters do as well is no more than that error.
+# Directions with a smaller share of the squares are dropped. First-order responses are accurate to a thousandth (1e-6
+# in squares): a smaller difference between a column and what the motor's parameters can do is only that error.
 VISIBLE = 1e-6
 
 
 class Block(NamedTuple):
-    """Columns that stand or fall together; with `own`, every run has its own coefficients."""
+    """Columns that are regressed on together; with `own`, every run has its own coefficients."""
 
     columns: tuple[int, ...]
     own: bool = False
 
 
 def blocks_of(orders: Iterable[tuple[int, bool]], first: int) -> list[Block]:
-    """Blocks of so many columns each, of every run's own or not, one after another from the `first` column on."""
+    """Blocks from pairs of a number of columns and `own`, one after another from the `first` column on."""
     blocks = []
     for order, own in orders:
         blocks.append(Block(tuple(range(first, first + order)), own))
@@ -34,30 +34,31 @@ def blocks_of(orders: Iterable[tuple[int, bool]], first: int) -> list[Block]:
 
 
 class Regression(NamedTuple):
-    """A fit by some blocks on top of the motor's own parameters."""
+    """A least-squares fit by the motor's own parameters and some blocks."""
 
     squares: float  # sum of the squared white residuals that are left
-    moved: Float[np.ndarray, " parameters"]  # by how much the motor's parameters move
+    moved: Float[np.ndarray, " parameters"]  # change of the motor's search coordinates
     coefficients: list[Float[np.ndarray, "*runs columns"]]  # of every block
     errors: list[Float[np.ndarray, "*runs columns"]]  # their standard errors
 
 
 class Evidence(NamedTuple):
-    """Inner products of the white rows of every run: motor parameters first, then columns, what rounding may leave, and
-    the residual last.
+    """Inner products of the white rows of every run: the motor's parameters first, then the columns of what may be
+    missing, those of rounding errors, and the residual last.
 
-    What belongs to a run alone (its initial state, its load) is projected out, with what can hardly be told from it.
+    The run's own unknowns (its initial state, its load) are nuisance parameters: they are projected out, and columns
+    that can hardly be told from them are set to zero.
     """
 
     products: Float[np.ndarray, "runs columns columns"]
-    parameters: int  # how many columns are the motor's
-    rows: int
-    readings: tuple[int, ...] = ()  # columns of what coarse converters leave
+    parameters: int  # number of columns that are the motor's
+    rows: int  # number of white rows in all runs
+    readings: tuple[int, ...] = ()  # columns of the rounding errors of coarse converters
 
     def regress(self, blocks: Sequence[Block] = (), visible: float = VISIBLE) -> Regression:
         """Least squares of the residual on the motor's parameters and some blocks.
 
-        Directions in which the rows say less than `visible`, as a share of the most, stay where they are.
+        Directions whose eigenvalue, with columns scaled to unit length, is below `visible` are not moved.
         """
         squares, shared, own = self._regressed(blocks, [-1], visible)
         places, found, spread = [self.parameters, 0], [], []
@@ -78,8 +79,11 @@ class Evidence(NamedTuple):
         tuple[Float[np.ndarray, "shared targets"], Float[np.ndarray, " shared"]],
         tuple[Float[np.ndarray, "runs own targets"], Float[np.ndarray, "runs own"]],
     ]:
-        """Least squares of some columns at once: the squares left of each, and the coefficients with their standard
-        errors, those that all runs have in common and those of each run."""
+        """Least squares for several target columns at once.
+
+        **Returns**: the squares left of each target; coefficients and standard errors that all runs share; the same for
+        those of each run.
+        """
         own = np.array([c for b in blocks if b.own for c in b.columns], int)
         shared = [*range(self.parameters), *(c for b in blocks if not b.own for c in b.columns)]
         kept, n = np.array([*shared, *targets]), len(shared)
@@ -94,21 +98,22 @@ class Evidence(NamedTuple):
         return squares, (coefficients, _errors(inverse)), (own_coefficients, _errors(of_own))
 
     def gained_by_rounding(self, block: Block) -> float:
-        """How much more than by chance a block gains, in the mean, of what coarse converters leave; at least one."""
+        """Overdispersion by rounding: the mean gain of a block on the rounding errors of coarse converters, per degree
+        of freedom; at least one."""
         if not self.readings:
             return 1.0
         without, with_it = (self._regressed(b, self.readings, VISIBLE)[0] for b in ([], [block]))
         return float(max(np.mean(without - with_it) / self.freedom(block), 1.0))
 
     def freedom(self, block: Block) -> int:
-        """How many coefficients a block has."""
+        """The degrees of freedom of a block: its coefficients in all runs."""
         return len(block.columns) * (len(self.products) if block.own else 1)
 
 
 def _inverse(
     matrix: Float[np.ndarray, "*runs n n"], visible: float = VISIBLE
 ) -> Float[np.ndarray, "*runs n n"]:
-    """Inverse on what the rows can see of it."""
+    """Pseudo-inverse of a Gram matrix on the directions that are `visible`."""
     if not matrix.size:
         return matrix
     lengths = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 0.0))
@@ -130,10 +135,11 @@ def products(
     own: int,
     readings: int = 0,
 ) -> Evidence:
-    """Gather the evidence from white rows, of every run some at a time.
+    """Gather the evidence from white rows, those of each run in several pieces.
 
-    **Arguments**: the rows, whose first columns are those of the motor's `parameters`, then what may be missing, what
-    coarse converters leave in some `readings`, the residual, and last the run's `own`.
+    **Arguments**: `runs`, the pieces of each run, with columns for the motor's `parameters`, what may be missing, the
+    rounding errors of coarse converters in some `readings`, the residual, and last the run's `own` unknowns; the
+    numbers are how many columns each has.
     """
     gathered, rows = [], 0
     for pieces in runs:

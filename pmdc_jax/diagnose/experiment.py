@@ -1,4 +1,4 @@
-"""The run that would tell rivals apart: of a few waveforms the one in which they differ most."""
+"""The run that would best tell rivals apart: of a few waveforms, the one in which their simulations differ most."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .naming import Naming
 
 # Length of the run in s, and its sample time
 DURATION, STEP = 6.0, 1e-3
-# Simulation and reality share only so much of a difference once every parameter has been fitted anew
+# Share of the difference between two simulations that remains once all parameters are fitted to the new run, too
 SHARED = 0.3
-# Chance of a false answer at which the power is stated
+# Probability of a false answer (one-sided) at which the power is stated
 LEVEL = 0.05
 
 Waveform = Callable[[np.ndarray], np.ndarray]  # time in s to voltage over its limit
 
 
 def _steps(seed: int, least: float, most: float) -> Waveform:
-    """Levels drawn anew after drawn times."""
+    """Random levels, each held for a random time of `least` to `most` seconds."""
 
     def levels(time: np.ndarray) -> np.ndarray:
         rng = np.random.default_rng(seed)
@@ -54,7 +54,10 @@ WAVEFORMS: dict[str, Waveform] = {
 
 
 def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExperiment | None:
-    """The waveform within the recorded voltage in which the chosen motor and its nearest rival differ most."""
+    """The waveform, within the recorded voltage, in which the chosen motor and its nearest rival differ most.
+
+    None without a recorded voltage or a rival, and where no waveform shows a difference.
+    """
     limit = max(
         (float(np.max(np.abs(r.voltage))) for r in recordings if r.voltage is not None), default=0
     )
@@ -91,8 +94,10 @@ def difference_between(
     voltage: Float[np.ndarray, " samples"],
     noise: Float[np.ndarray, "2"],
 ) -> float:
-    """Root of the summed squares of what two motors answer differently, over the noise; 0 where one cannot be
-    simulated, as fitted to other runs it may be unstable in this one."""
+    """Root of the summed squares of the difference between two motors' responses, over the noise of current and speed.
+
+    Zero if one cannot be simulated: fitted to other runs, it may be unstable in this one.
+    """
     start = np.zeros_like(time)
     run = Recording("next", time, voltage, current=start, speed=start, load=start)
     try:

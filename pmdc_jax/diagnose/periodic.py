@@ -1,7 +1,6 @@
-"""A torque from outside that comes and goes in time: one line in the spectra of the residuals of most runs.
+"""An external torque that is periodic in time: one line in the spectra of the residuals of most runs.
 
-No effect of the library knows a frequency of its own, and the filter that makes the noise white would take a steady
-oscillation for noise.
+No effect of the library has a frequency of its own, and the whitening filter would take a steady oscillation for noise.
 """
 
 from __future__ import annotations
@@ -15,21 +14,23 @@ from scipy import ndimage
 
 from .model import Model, rows_of
 
-# Neighbours whose median is the level about a line
+# Frequencies (bins) whose median power is the level around a line
 NEIGHBOURS = 41
-# Among the slowest, where noise rises steeply, neighbours from so far to so far away; still slower ones have none
+# Below the bin SLOWEST, where noise rises steeply, the level is taken from bins NEAR to FAR away; the bins up to NEAR
+# are not searched
 SLOWEST, NEAR, FAR = 12, 3, 6
-# How far a line stands out of the level about it. Measured on six runs each of motors that lack nothing: in single
-# runs with quantised speed up to 180, but at one frequency of three runs no more than 7 in any noise; a periodic
+# Least height of a line, power over the level around it. Measured on six runs each of motors that lack nothing: in
+# single runs with quantised speed up to 180, but at one frequency of three runs no more than 7 in any noise; a periodic
 # torque 200 and more in every run.
 STANDS_OUT = 50.0
-# ... and so many times as far, on the geometric mean, if fewer than three runs could have it
+# ... and so many times that, on the geometric mean, with fewer than three runs
 ALONE = 10.0
-# A line that what drives has as well is no line of its own, unless it stands out so many times as far: a controller
-# answers to a torque from outside
+# A line that the drive has as well (higher than DRIVEN) counts only if it is ANSWERED times as high as the drive's: a
+# controller reacts to an external torque
 DRIVEN, ANSWERED = 10.0, 10.0
-# ... and a drive that repeats itself this well has harmonics, at which any misfit has lines
+# A drive whose autocorrelation reaches this repeats itself: any misfit then has lines at its harmonics
 REPEATED = 0.95
+# Highest lines of each run that are looked for in the other runs
 PEAKS = 5
 
 
@@ -38,11 +39,11 @@ class Line(NamedTuple):
 
     low: float  # Hz
     high: float  # Hz
-    height: float  # median over the runs, over the level about it
+    height: float  # power over the level around it: median of the runs, geometric mean of fewer than three
 
 
 class Spectrum(NamedTuple):
-    """Power over the level about each frequency: of a run's residuals and of what drives it."""
+    """Power at each frequency over the level around it, of a run's residuals and drives: the largest of the signals."""
 
     residual: Float[np.ndarray, " frequencies"]
     driving: Float[np.ndarray, " frequencies"]
@@ -67,7 +68,7 @@ def spectrum(
     driving: Float[np.ndarray, "samples inputs"],
     step: float,
 ) -> Spectrum:
-    """The spectra of one run, sampled every `step` seconds; without any line where what drives repeats itself."""
+    """The spectra of one run, sampled every `step` seconds; that of the residuals is zero if a drive repeats itself."""
     shown = _over_level(residuals)
     if any(_repeats(one) for one in driving.T):
         shown = np.zeros_like(shown)
@@ -75,7 +76,7 @@ def spectrum(
 
 
 def common_line(spectra: Sequence[Spectrum]) -> Line | None:
-    """The line that stands out clearest in most runs at one frequency, if there is one."""
+    """The highest line that stands out at one frequency in more than half of the runs, if there is one."""
     longest = max(spectra, key=lambda s: s.duration)
     enough = STANDS_OUT * (ALONE if len(spectra) < 3 else 1.0)
     best = None
@@ -98,20 +99,20 @@ def common_line(spectra: Sequence[Spectrum]) -> Line | None:
 
 
 def _own_height(frequency: float, one: Spectrum) -> float:
-    """How far a line stands out in a run, zero if it is one of what drives."""
+    """The height of a line in the residuals of a run; zero if the line is the drive's."""
     near = _near(frequency, one)
     height, driving = (float(x[near].max(initial=0.0)) for x in (one.residual, one.driving))
     return height if driving < max(DRIVEN, height / ANSWERED) else 0.0
 
 
 def _near(frequency: float, one: Spectrum, width: float = 0.0) -> slice:
-    """A run's frequencies nearest to this one."""
+    """The bins of a run's spectrum nearest to a frequency in Hz, or within `width` of it."""
     low, high = (frequency - width) * one.duration, (frequency + width) * one.duration
     return slice(max(int(low) - 1, 0), int(high) + 3)
 
 
 def _over_level(signals: Float[np.ndarray, "samples signals"]) -> Float[np.ndarray, " frequencies"]:
-    """Of every frequency the power over the median of its neighbours, the largest of all signals."""
+    """Power at every frequency over the level of its neighbours, the largest of all signals."""
     centred = signals - signals.mean(0)
     power = np.abs(np.fft.rfft(centred, axis=0)) ** 2
     level = ndimage.median_filter(power, (NEIGHBOURS, 1), mode="reflect") / np.log(2)
@@ -127,7 +128,7 @@ def _over_level(signals: Float[np.ndarray, "samples signals"]) -> Float[np.ndarr
 def _over_neighbours(
     centred: Float[np.ndarray, "samples signals"], floor: Float[np.ndarray, " signals"]
 ) -> Float[np.ndarray, " slow"]:
-    """The same for the slowest frequencies, of the tapered signals: a line must not leak into its neighbours."""
+    """The same for the bins from NEAR + 1 to SLOWEST - 1, tapered so that a line does not leak into its neighbours."""
     taper = np.hanning(len(centred))[:, None]
     power = np.abs(np.fft.rfft(centred * taper, axis=0)[: SLOWEST + FAR]) ** 2
     ratios = []
@@ -139,7 +140,7 @@ def _over_neighbours(
 
 
 def _repeats(driving: Float[np.ndarray, " samples"]) -> bool:
-    """Whether a signal is itself again after some time of no more than half its length."""
+    """Whether a signal repeats itself after a lag of 5 to 50 % of its length."""
     x, n = driving - driving.mean(), len(driving)
     if not np.any(x):
         return False
@@ -149,6 +150,6 @@ def _repeats(driving: Float[np.ndarray, " samples"]) -> bool:
     lags = np.arange(n // 20, n // 2)
     both = squares[n - lags] * (squares[n] - squares[lags])
     alike = products[lags] / np.sqrt(np.maximum(both, 1e-300))
-    # what hardly changes within the lag is alike without repeating itself
+    # a slow signal resembles itself at short lags without repeating itself: look beyond where it first differs
     apart = np.flatnonzero(alike < 0.5)
     return bool(len(apart) and np.any(alike[apart[0] :] > REPEATED))

@@ -1,5 +1,7 @@
-"""What a coarse converter leaves of a motor that lacks nothing: errors that last as long as its reading stands still,
-which no filter of the noise takes out."""
+"""Rounding errors of coarse converters, which even a complete model leaves.
+
+They last as long as the reading stands still, so no whitening filter removes them.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +11,20 @@ from jaxtyping import Float
 from ..identify.noise import quantum
 from .model import RunSeries
 
-# Readings that are tried
+# Simulated readings, each with the converter's steps at another offset
 READINGS = 8
-# Errors of so many steps blur them: what rounding adds to such noise is as white. So do errors that come and go by so
-# many times more than those of the readings, as those of an encoder whose counts are taken from sample to sample
+# Noise blurs the steps, and rounding errors are then white, too, if the residuals' root mean square is this many steps,
+# or if the measured signal fluctuates from sample to sample this many times as much as the simulated readings, as one
+# of an encoder whose counts are differenced from sample to sample
 BLURRED, RESTLESS = 0.6, 1.5
 
 
 def readings(fit: RunSeries, run: int) -> Float[np.ndarray, "samples outputs readings"]:
-    """Errors of converters as coarse as a run's that read what is simulated, their steps at any height; none of
-    outputs whose errors blur the steps. The same for the same `run`, its number.
+    """Rounding errors of converters as coarse as the run's, reading the simulated outputs; zero where noise blurs the
+    steps.
 
-    No noise is read with it: that of the sensors may come after the converter, or before it and be little.
+    The offsets of the steps are drawn at random, with the number of the `run` as seed. The simulated outputs are read
+    without noise: that of the sensors may arise after the converter, or before it and be small.
     """
     random = np.random.default_rng(run)
     known, values = fit.residual.known, fit.simulated.values
@@ -39,5 +43,5 @@ def readings(fit: RunSeries, run: int) -> Float[np.ndarray, "samples outputs rea
 
 
 def _restlessness(signals: Float[np.ndarray, "samples *signals"]) -> float:
-    """How much signals come and go from sample to sample."""
+    """How much signals fluctuate from sample to sample: the standard deviation of their second differences."""
     return float(np.std(np.diff(signals, 2, axis=0)))

@@ -1,8 +1,8 @@
 """What an effect would change in the recorded outputs, to first order, along a free run of the motor.
 
-An effect changes where one sample leads to the next: it *kicks* the motor a little at every sample. The linear
-motor carries the kicks on, and the sum is the response: one column of a regression, whose coefficient is the
-amplitude of the effect. No measured signal is ever differentiated.
+An effect changes the state in which each sample ends: it *kicks* the motor a little at every sample. The linear motor
+propagates the kicks, and their sum is the response: one column of a regression, whose coefficient is the amplitude of
+the effect. No measured signal is ever differentiated.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Path(NamedTuple):
 
     current: Signal
     speed: Signal
-    angle: Signal  # rad, from where it began, as the tape says that the rotor turned, else as it is simulated to
+    angle: Signal  # rad, by the turns on the tape, or else by the simulated speed
     held: Bool[Array, "samples blocks"]
 
 
@@ -46,13 +46,16 @@ def path_of(
     begun: Float[Array, " runs"],
     dry: bool | Array,
 ) -> Path:
-    """The path of free runs as seen; each has `begun` at an angle in rad; `dry` says that the motor has friction that
-    holds."""
+    """The path of free runs.
+
+    **Arguments**: `seen`, simulated current in A and speed in rad/s; `begun`, the angle in rad where each run begins;
+    `dry`, whether the motor has friction that can hold the rotor.
+    """
     current, speed = seen[:, 0].T, seen[:, 1].T
     drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid], tape.drive)
     current = drive.voltage * current + drive.current * jnp.asarray(tape.value).T
     step = jnp.asarray(tape.sample_time)[tape.grid][:, None]
-    # the mean speed over a sample turns the rotor
+    # the turn in a sample is its mean speed times its length
     ahead = jnp.append(seen[:, 1].reshape(-1)[1:], 0.0).reshape(tape.turn.shape)
     turn = jnp.where(jnp.isnan(tape.turn), (seen[:, 1] + ahead) / 2 * step, tape.turn)
     before = jnp.append(0.0, jnp.cumsum(turn.reshape(-1))[:-1]).reshape(turn.shape)
@@ -63,7 +66,7 @@ def path_of(
 
 @compiled
 def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
-    """By how much `motor` goes elsewhere than `bare` in the sample after each of the path: current and speed."""
+    """The difference in current and speed between `motor` and `bare` one sample after each point of the path."""
     after = _one_sample(motor, tape, path)
     without = _one_sample(bare, tape, path)
     return jnp.stack([after.current - without.current, after.speed - without.speed], 1)
@@ -71,7 +74,7 @@ def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
 
 @compiled
 def sensed(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
-    """By how much the sensors of `motor` report something else of the path than those of `bare`."""
+    """The difference between what the sensors of `motor` and those of `bare` report of the path."""
     return _seen_on(motor, tape, path) - _seen_on(bare, tape, path)
 
 
@@ -90,13 +93,13 @@ def _seen_on(motor: Motor, tape: Tape, path: Path) -> Outputs:
 def _reported_in_time(
     motor: Motor, tape: Tape, seen: Float[Array, "samples outputs blocks"]
 ) -> Outputs:
-    """What is reported of outputs in the order of time."""
+    """What the motor reports (`reported`) of outputs whose axes are in another order."""
     return reported(motor, tape, seen.transpose(2, 1, 0)).transpose(2, 1, 0)
 
 
 @compiled
 def pushes(motor: Motor, tape: Tape) -> tuple[Outputs, Outputs]:
-    """What a volt, and a newton metre that opposes motion, over one sample do to current and speed."""
+    """The change of current and speed within one sample by 1 V, and by a torque of 1 N m that opposes motion."""
     along, _ = _of_blocks(motor, tape)
     ones = jnp.ones((tape.value.shape[1], 1, 1))
     assert along.inputs is not None, "an effect would need a step of its own"
@@ -111,9 +114,9 @@ def respond(
     path: Path,
     kicks: Float[Array | np.ndarray, "samples 2 blocks columns"],
 ) -> Float[Array, "samples 2 blocks columns"]:
-    """What the kicks of every column grow into, in current and speed, along the linear `motor`.
+    """The response of the linear `motor` to the kicks of every column, in current and speed.
 
-    Blocks run side by side from zero; what reaches the end of each then starts the next.
+    Blocks are simulated side by side from zero; then the state at the end of each is carried on into the next.
     """
     along, _ = _of_blocks(motor, tape)
     whole = along.whole[:, :, 0]
@@ -124,7 +127,7 @@ def respond(
     ) -> tuple[Columns, Columns]:
         kick, held = sample
         after = jnp.einsum("ijb,jbc->ibc", whole, x) + kick
-        # a rotor that sticks forgets
+        # a rotor that sticks keeps no change of speed
         return after.at[1].multiply(1.0 - held[:, None]), x
 
     stuck = path.held.astype(kicks.dtype)
@@ -146,7 +149,7 @@ def respond(
     response = driven + jnp.einsum("sibj,bjc->sibc", free, starts)
     if along.mean is None:
         return response
-    # what kicks comes evenly over the sample
+    # a kick builds up evenly over its sample: half of it is in the mean
     mean = jnp.einsum("jsb,sjbc->sbc", along.mean.whole[1], response) + kicks[:, 1] / 2
     moving = mean * (1.0 - stuck[:, :, None])
     seen = jnp.concatenate([response, moving[:, None]], 1)
@@ -154,7 +157,7 @@ def respond(
 
 
 def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Input]:
-    """The propagator of every block, and what acts there, over (samples, blocks)."""
+    """The propagator of every block, and the inputs that act there, broadcast to (samples, blocks)."""
     along, drive = pick_grid(along_grids(motor, tape), tape, tape.grid)
     samples = tape.value.shape[1]
 
@@ -175,12 +178,12 @@ def _one_sample(motor: Motor, tape: Tape, path: Path) -> State:
     return held_step(motor, along, acting, _states(motor, tape, path), steps_in_sample(motor, tape))
 
 
-# Whether a run begins, how the effects' states then begin, current, speed, value, load, and the block
+# Whether a run begins, the effects' initial states, current, speed, value of the drive, load, and index of the block
 OfSample = tuple[Bool[Array, ""], Extra, Scalars, Scalars, Scalars, Scalars, Int[Array, ""]]
 
 
 def _states(motor: Motor, tape: Tape, path: Path) -> State:
-    """The motor's states on the path; those that its effects add follow from current and speed there."""
+    """The motor's states on the path; those that its effects add are simulated along its current and speed."""
     load = jnp.asarray(tape.load).T
     start = motor.initial_state(path.current, path.speed, load, path.angle)
     if not set(motor.states) - {"angle"}:

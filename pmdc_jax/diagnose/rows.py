@@ -1,7 +1,7 @@
-"""The rows of the regression: in every training run what the motor's parameters, and whatever may be missing, change.
+"""The rows of the regression: in every training run, derivatives by the motor's parameters and all that may be missing.
 
-The columns are kept in single precision, and made white and multiplied some rows at a time in double: a log of a
-million samples has to fit into memory.
+The columns are kept in single precision, and whitened and multiplied in double, some rows at a time: a log of a million
+samples has to fit into memory.
 """
 
 from __future__ import annotations
@@ -23,20 +23,19 @@ from .model import Model, RunSeries, rows_of
 from .quantisation import readings
 from .response import Path, respond
 
-# Samples that are made white at once
+# Samples that are whitened at once, to limit the memory
 STRETCH = 2048
 
 
 class Rows(NamedTuple):
-    """Of one training run its fit, what every candidate and curve changes, and what rounding may leave; A and rad/s."""
+    """One training run's fit, responses to every candidate and curve, and possible rounding errors; A and rad/s."""
 
     fit: RunSeries
     columns: Float[np.ndarray, "samples outputs columns"]
     rounding: Float[np.ndarray, "samples outputs readings"]
 
     def white(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
-        """Rows made white, some at a time: of the motor's parameters, the columns, what rounding may leave,
-        the residual, and the run's own."""
+        """Whitened rows, `STRETCH` samples at a time; columns in the order that `evidence.products` expects."""
         shared, own, residual, _ = self.fit
         back = len(whiten.filters[run])
         for first in range(back, len(residual.values), STRETCH):
@@ -55,7 +54,8 @@ class Rows(NamedTuple):
 def gathered(
     model: Model, bare: Motor, path: Path, changes: Iterable[Change], count: int
 ) -> list[Rows]:
-    """The rows of every training run, of `count` columns; `bare`, the motor without effects, carries changes on."""
+    """The rows of every training run, from `changes` with `count` columns in all, which the motor without effects,
+    `bare`, propagates."""
     tape, fits = model.given.problem.tape, rows_of(model)
     rows = [
         Rows(f, np.empty((*f.residual.values.shape, count), np.float32), readings(f, k))
@@ -74,13 +74,14 @@ def gathered(
 @compiled
 def _response(bare: Motor, tape: Tape, path: Path, change: Change) -> Float32[Array, "..."]:
     response = respond(bare, tape, path, change.kicks) + change.seen
-    # a setting that cannot be simulated says nothing
+    # a setting that cannot be simulated gets a column of zeros
     sound = jnp.all(jnp.isfinite(response), (0, 1, 2))
     return jnp.where(sound, response, 0.0).astype(jnp.float32)
 
 
 def _side_by_side(changes: Iterable[Change], most: int) -> Iterator[tuple[Change, int]]:
-    """The changes in parts of one width, for which the response is compiled once; how many columns each is of."""
+    """The changes regrouped into parts of `most` columns, so that the response is compiled once, each with the number
+    of its columns that count; the last part is filled up with zeros."""
     waiting: list[Change] = []
     count = 0
     for change in changes:

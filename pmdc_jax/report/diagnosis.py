@@ -42,7 +42,7 @@ from .verdict import (
     verdict_sentences,
 )
 
-# traces that a run has in the picture of its residuals, and in that of its simulation
+# traces of one run in the figure of its residuals, and in that of its simulation: they share the points drawn
 TRACES_OF_RESIDUALS = 4
 TRACES_OF_SIMULATION = 7
 
@@ -72,7 +72,7 @@ def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
 
 
 def _tiles(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    """Label, number and small print of the figures worth knowing first."""
+    """Label, value and small print of the key figures at the top of the report."""
     role = judged_role(diagnosis)
     gap = diagnosis.gap[role]
     error = significant(gap.before)
@@ -103,7 +103,7 @@ def _effect(effect: EffectFound) -> dict[str, Any]:
 
 
 def _rivals(diagnosis: Diagnosis) -> list[str]:
-    """The other sets that would do as well, in words."""
+    """The other sets of effects that would explain the runs as well, in words."""
     rivals = dict.fromkeys(r for effect in diagnosis.effects for r in effect.also_possible)
     return [enumerate_words([effect_words(name) for name in one.split(" + ")]) for one in rivals]
 
@@ -153,7 +153,7 @@ def _gaps(diagnosis: Diagnosis) -> list[dict[str, str]]:
 
 
 def _residuals(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """A picture for every run whose residual the effects changed."""
+    """A figure for each run of its residuals before and after; none if no effect was added."""
     if not diagnosis.effects:
         return []
     runs = runs_in_order(diagnosis.final)
@@ -166,7 +166,7 @@ def _residuals(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def _residual_over_variable(diagnosis: Diagnosis) -> dict[str, Any] | None:
-    """The residual over the variable in which the plain motor was most clearly off."""
+    """The residual over the variable in which the motor without effects disagreed most clearly."""
     equation, variable = _clearest_misfit(diagnosis)
     wanted = "current" if equation == "electrical" else "speed"
     for channel in (wanted, "speed", "current"):

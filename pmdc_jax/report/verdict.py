@@ -1,4 +1,4 @@
-"""A diagnosis in plain English: where it disagrees, what is missing, what adding it did."""
+"""A diagnosis in plain English: where simulation and recordings disagree, what is missing, what adding it did."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ VARIABLE_UNITS = {
     "angle": "rad",
     "frequency": "Hz",
 }
-# %, a parameter that moved by less is not worth a sentence
+# a parameter whose change in % is smaller is not mentioned
 MIN_DRIFT = 1.0
-# ends of both directions closer than this ratio are told as one
+# the regions of both directions are described as one if their far ends differ by no more than this factor
 MAX_END_RATIO = 2.0
 
 Interval = tuple[float, float]
@@ -138,7 +138,7 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
 
 
 def disagreement(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> str:
-    """Which equation is off, and where, by the clearest region and those like it."""
+    """Which equation disagrees, and where, in words: by the clearest region and those of the same variable."""
     if not regions:
         return "by more than noise"
     clearest = regions[0]
@@ -152,7 +152,7 @@ def disagreement(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> str:
 def intervals_in_words(
     variable: str, intervals: Sequence[Interval], largest: float | None = None
 ) -> str:
-    """Intervals of one variable in words; `largest` is the largest size the runs have of it, but for a few samples."""
+    """Intervals of one variable in words; `largest` is its largest magnitude in the runs, but for a few samples."""
     joined = _merged(intervals)
     if variable == "time":
         parts = [f"{percent(100 * low)} to {percent(100 * high)}" for low, high in joined]
@@ -174,7 +174,7 @@ def intervals_in_words(
 
 
 def _merged(intervals: Sequence[Interval]) -> list[Interval]:
-    """Intervals in order, those that touch made one."""
+    """The intervals in order, with those that touch merged."""
     joined: list[Interval] = []
     for low, high in sorted(intervals):
         if joined and low <= joined[-1][1]:
@@ -185,7 +185,7 @@ def _merged(intervals: Sequence[Interval]) -> list[Interval]:
 
 
 def _symmetric(intervals: Sequence[Interval]) -> Interval | None:
-    """The sizes that both directions have in common, or None where they do not."""
+    """The range of magnitudes that describes both directions; None if they differ, or there is only one."""
     forward = [(max(low, 0.0), high) for low, high in intervals if high > 0]
     backward = [(max(-high, 0.0), -low) for low, high in intervals if low < 0]
     if not (forward and backward):
@@ -203,7 +203,7 @@ def _ends(intervals: Sequence[Interval]) -> Interval:
 
 def _largest_size(variable: str, fits: Mapping[str, RunFit]) -> float | None:
     values = [getattr(fit, variable, None) for fit in fits.values()]
-    # the knots of the curves reach as far
+    # the knots of the curves end at this quantile
     sizes = [np.nanquantile(np.abs(one), 0.999) for one in values if one is not None and len(one)]
     return float(max(sizes)) if sizes else None
 
@@ -213,7 +213,7 @@ def _equation_and_variable(region: Region) -> tuple[str, str]:
 
 
 def _disagreement_sentence(diagnosis: Diagnosis) -> str:
-    # parameters that make up for what is missing bring the other equation out of balance, too
+    # parameters that compensate for what is missing make the other equation disagree, too: leave that out
     of = {unbalances(effect.equation) for effect in diagnosis.effects}
     regions = [region for region in diagnosis.where if region.equation in of] or diagnosis.where
     return f"Simulation and measurement disagree {disagreement(regions, diagnosis.base.fit)}."
@@ -269,7 +269,7 @@ def detectable_others(diagnosis: Diagnosis) -> list[Detectable]:
     return [one for one in diagnosis.detectable if one.effect not in found]
 
 
-# the three that drives most often have, for a sentence; the table has them all
+# the three effects that drives most often have, for a sentence; the table of the report has all
 COMMON_EFFECTS = ("coulomb_friction", "constant_load", "brush_voltage_drop")
 
 
@@ -283,7 +283,7 @@ def _detectable_sentence(begin: str, diagnosis: Diagnosis) -> str:
 
 
 def judged_role(diagnosis: Diagnosis) -> Role:
-    """Hold-outs are the test where there are any."""
+    """The role of the runs by which the result is judged: hold-outs where there are any."""
     return "holdout" if "holdout" in diagnosis.gap else "train"
 
 
@@ -298,7 +298,7 @@ def _gap_sentence(diagnosis: Diagnosis) -> str:
 
 
 def _slow_rest_sentence(diagnosis: Diagnosis) -> str:
-    """That what counts as noise is not the sensors' alone, where it is not."""
+    """A warning that what counts as noise exceeds the white noise of the sensors; empty where it does not."""
     rest = [
         f"{significant(times)} times the white noise of the {name}"
         for name, times in diagnosis.final.missed.items()
@@ -320,19 +320,19 @@ class Drift(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether the recordings determined it both times: a limit of the search is nothing to move from."""
+        """Whether the recordings determined it in both fits: a change from a limit of the search means nothing."""
         return {self.before.status, self.after.status} <= {"identified", "tied"}
 
     @property
     def percent(self) -> float | None:
-        """By how much it moved, if that is known."""
+        """The change in %, if it is known."""
         if not self.is_known or not self.before.value or self.after.value is None:
             return None
         return 100 * (self.after.value / self.before.value - 1)
 
 
 def drifts(diagnosis: Diagnosis) -> list[Drift]:
-    """How the parameters that both motors have moved."""
+    """Every parameter of the motor without effects, before and after these were added."""
     after = diagnosis.final.parameters
     return [
         Drift(name, estimate, after[name])
