@@ -100,7 +100,7 @@ class Diagnosis:
     where: tuple[Region, ...]
     gap: Mapping[Role, Gap]
     gap_of_run: Mapping[str, Gap]
-    # of the gap, in squares, on hold-outs where there are any; None without effects
+    # of the gap, in squares, on hold-outs where there are any; None without effects or gap
     closed_fraction: float | None
     next_experiment: NextExperiment | None  # for the verdict "ambiguous", where a run was found
     curves: tuple[LearnedCurve, ...]  # what is left, for the verdict "not_in_library"

@@ -11,10 +11,8 @@ FULLER = {effect: trial.fuller for effect, trial in TRIALS.items() if trial.full
 
 
 def unbalances(equation: str) -> str:
-    """The equation of the motor in which an effect of an `equation` shows when it is missing.
-
-    A voltage lost before the terminals ("input") shows in the electrical one; any other shows in its own.
-    """
+    """The equation in which a missing effect shows: the electrical one for a voltage lost before the terminals
+    ("input"), or else its own."""
     return "electrical" if equation == "input" else equation
 
 
@@ -30,11 +28,8 @@ def is_within(a: set[str], b: set[str]) -> bool:
 
 
 def spelt_out(effects: set[str]) -> set[str]:
-    """The set with asymmetric friction spelt out as Coulomb friction and a constant load.
-
-    While the motor turns that is the same torque, and an effect that is richer in another way, as Stribeck friction,
-    can replace a part of it.
-    """
+    """The set with asymmetric friction as Coulomb friction and a constant load, the same torque while the motor turns,
+    so that an effect which is richer in another way, as Stribeck friction, can replace a part."""
     if "asymmetric_friction" in effects:
         return (effects - {"asymmetric_friction"}) | CONTAINS["asymmetric_friction"]
     return effects

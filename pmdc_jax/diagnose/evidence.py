@@ -79,11 +79,7 @@ class Evidence(NamedTuple):
         tuple[Float[np.ndarray, "shared targets"], Float[np.ndarray, " shared"]],
         tuple[Float[np.ndarray, "runs own targets"], Float[np.ndarray, "runs own"]],
     ]:
-        """Least squares for several target columns at once.
-
-        **Returns**: the squares left of each target; coefficients and standard errors that all runs share; the same for
-        those of each run.
-        """
+        """Least squares of several targets: the squares left, and coefficients with standard errors, shared and own."""
         own = np.array([c for b in blocks if b.own for c in b.columns], int)
         shared = [*range(self.parameters), *(c for b in blocks if not b.own for c in b.columns)]
         kept, n = np.array([*shared, *targets]), len(shared)
@@ -98,8 +94,7 @@ class Evidence(NamedTuple):
         return squares, (coefficients, _errors(inverse)), (own_coefficients, _errors(of_own))
 
     def gained_by_rounding(self, block: Block) -> float:
-        """Overdispersion by rounding: the mean gain of a block on the rounding errors of coarse converters, per degree
-        of freedom; at least one."""
+        """The mean gain per degree of freedom of a block on the rounding errors of coarse converters; at least one."""
         if not self.readings:
             return 1.0
         without, with_it = (self._regressed(b, self.readings, VISIBLE)[0] for b in ([], [block]))

@@ -82,7 +82,7 @@ class Curve(NamedTuple):
 
 
 class Library:
-    """All candidates that the recordings can tell of, and what each would change in the motor without effects."""
+    """The candidates that the recordings can tell of, and what each changes in the motor without effects."""
 
     def __init__(self, base: Model) -> None:
         """`base` is the motor without effects, as fitted."""
@@ -95,7 +95,7 @@ class Library:
         self.candidates = [c for c in candidates(self.scales) if c.effect in told]
         # a coarse encoder's errors last long enough to look like a voltage that changes over time
         self.coarse = any(is_coarse(speed) for speed in _counted(base.given.training))
-        # so does what is left of noise that was taken out of the recorded voltage
+        # so may the rest of noise that was taken out of the recorded voltage
         self.wavers = bool(base.given.input_noise)
         # by unit: the amplitude that imperfect sensors alone may produce
         self.traces = _traces(base)
@@ -138,11 +138,8 @@ class Library:
 
 
 def _traces(base: Model) -> dict[str, float]:
-    """By unit, the amplitude that imperfect sensors alone may produce.
-
-    "V": standard deviation of the noise taken out of the recorded voltage, or the voltage's resolution if that is
-    larger. "A": half the quantum of the measured current.
-    """
+    """By unit, the amplitude that imperfect sensors alone may produce: the noise taken out of the recorded voltage (V,
+    standard deviation) or its resolution, if larger; half the quantum of the current (A)."""
     training = base.given.training
     currents = [run.current for run in training if run.current is not None]
     rounded = max((quantum(np.diff(current)) / 2 for current in currents), default=0.0)

@@ -45,8 +45,7 @@ class Model:
 
     @property
     def is_possible(self) -> bool:
-        """Whether it can be simulated, its effects' parameters are physical, and each periodic torque completes a
-        period."""
+        """Whether it can be simulated, its effects are physical, and each periodic torque completes a period."""
         simulated = np.isfinite(self.fit.fitness)
         physical = all(effect.is_possible() for effect in self.motor.effects)
         return bool(simulated) and physical and self._comes_round
@@ -75,10 +74,7 @@ class Model:
 
     @property
     def lost(self) -> set[str]:
-        """The parameters to which no run is sensitive where they are, so that no gradient leads them back.
-
-        Those with a standard error, all others known, of more than `FLAT`.
-        """
+        """The parameters to which no run is sensitive (standard error above `FLAT`), so that no gradient leads back."""
         problem = self.given.problem
         names = problem.parameters.names
         # columns of each run's own unknowns follow those of the parameters

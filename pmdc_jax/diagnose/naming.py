@@ -1,9 +1,8 @@
 """Which effects are missing: forward selection from the motor without effects, each step refitted in full simulation.
 
-Forms of an effect, as named throughout this package: a *richer* one contains simpler effects and replaces them
-(Stribeck friction contains Coulomb friction); a *harder* one has no column in the regression and is found only by
-refitting (backlash, for a compliant shaft). The *fuller* form of an effect (`FULLER`), of either kind, is the one that
-the runs must rule out before the simple form is named alone.
+A *richer* form of an effect contains and replaces it, as Stribeck does Coulomb friction; a *harder* one has no column
+in the regression, as backlash for a compliant shaft. The *fuller* form (`FULLER`), of either kind, is the one that the
+runs must rule out.
 """
 
 from __future__ import annotations
@@ -44,8 +43,8 @@ MOST = 3
 # Limits of `_leaves_little`, as shares of the squares that the better model takes away. LITTLE applies where an effect
 # was replaced by another form, or where the effects before cannot have left the misfit.
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
-# If the clearest signal gains less than this share of what the model explains, the whitening filter may have absorbed
-# a missing effect: the unfiltered misfit is then examined first
+# Where the clearest signal gains a smaller share of what the model explains, the whitening filter may have absorbed an
+# effect: the unfiltered misfit is looked at first
 SWALLOWED = 1e-2
 # Least share of the unfiltered squares that a candidate must promise to be tried on the unfiltered misfit
 FORETOLD = 0.05
@@ -85,8 +84,7 @@ class StepwiseSelection:
         self.assessments: dict[Model, Assessment] = {}
         # by effect: alternatives that did as well when it was added
         self.instead: dict[str, set[str]] = {}
-        # models that a better one has replaced or is to replace: with different filters two models may each look better
-        # than the other, and the selection would go round in circles
+        # models that a better one has replaced or is to: by different filters, each of two may look like the better one
         self.superseded: set[Model] = set()
 
     def name(self) -> Naming:
@@ -142,8 +140,7 @@ class StepwiseSelection:
         if not possible:
             return None
         best = self._best(possible, found.screen.white)
-        # this filter was fitted after removing the clearest signal: one fitted to the current model's residuals
-        # would absorb what is missing
+        # by the filter fitted without the clearest signal: one of the current residuals absorbs what is missing
         if plainest(self.comparison.ranked([current, best], found.screen.white)) is current:
             return None
         return self._eliminated(best)
@@ -157,8 +154,7 @@ class StepwiseSelection:
     ) -> bool:
         """Whether a better model does more than compensate for model-form error of the current one's effects.
 
-        It does if what the current one leaves is clearly something else, or if the better one leaves little compared
-        with what it takes away. A harder form is always accepted.
+        It does if what was left is clearly something else, if the better one leaves little, or if it has a harder form.
         """
         if (set(better.effects) - set(current.effects)) & set(HARDER.values()):
             return True
@@ -182,9 +178,8 @@ class StepwiseSelection:
     def _by_likeliest_effect(self, current: Model, found: Assessment) -> Model | None:
         """The current model with the effect that promises most, however little that is, if it then leaves little.
 
-        Beside an effect whose parameters are biased for lack of it, an effect gains more than its first-order evidence
-        promises. So does a first effect where the motor's parameters have moved far to compensate for two.
-        Not tried where model-form error may explain what is left.
+        An effect gains more than it promises if parameters of others are biased for lack of it, or if the motor's have
+        moved far to compensate for two effects. Not tried where model-form error may explain what is left.
         """
         if len(current.effects) == MOST or found.left >= ALARM or found.is_formula(current):
             return None
@@ -199,11 +194,8 @@ class StepwiseSelection:
         )
 
     def _by_unfiltered_misfit(self, current: Model, found: Assessment) -> Model | None:
-        """The current model with one of the effects that promise most on the unfiltered misfit, if a refit cuts it by
-        more than a factor of `FAR`.
-
-        A whitening filter takes for noise whatever lasts as long as a short run.
-        """
+        """The current model with one of the effects that promise most on the unfiltered misfit, if that falls by a
+        factor of `FAR`: a whitening filter takes for noise what lasts as long as a short run."""
         far = current.fit.fitness / FAR
         full = len(current.effects) == MOST
         if full or found.left >= ALARM or far < current.given.problem.outputs:
@@ -216,8 +208,7 @@ class StepwiseSelection:
         return self._better(current, found, better)
 
     def _in_exchange(self, current: Model, found: Assessment) -> Model | None:
-        """A model with `MOST` effects, one of them exchanged: the most promising new effect is tried in place of each
-        effect in the same equation."""
+        """A model with `MOST` effects, with the most promising new one in place of one in the same equation."""
         if len(current.effects) < MOST or found.left >= ALARM or found.is_trace(current):
             return None
         others = [s for s in clear(found) if effect_of(s) not in current.effects]
@@ -270,8 +261,7 @@ class StepwiseSelection:
         if found.asks_for_more():
             tried += self._with(current, found, shortlist(current, found))
             if any(model and model.effects_at_end for model in tried):
-                # a richer form ended at a bound, so do not try it alone: asymmetric friction cannot represent a load
-                # larger than the friction
+                # not a richer form alone: asymmetric friction, at its bound, is no load larger than friction
                 tried += self._with(current, found, shortlist(current, found, fuller=False))
         if found.left < ALARM and not here:
             tried += self._searched_with_friction(current, found, tried)
@@ -280,8 +270,7 @@ class StepwiseSelection:
     def _is_enough(self, model: Model | None) -> bool:
         """Whether a model leaves nothing that is worth another trial.
 
-        If a harder form is enough, no other effect is tried: what a simple form leaves of gear teeth that meet at
-        unpredictable times may look like many other effects.
+        If a harder form is enough no other effect is tried: what a simple form leaves of gear teeth may look like many.
         """
         if model is None or not model.is_possible:
             return False
@@ -293,11 +282,10 @@ class StepwiseSelection:
     ) -> list[Model | None]:
         """The motor with dry friction from a new global search, if stiction may explain a large misfit.
 
-        A motor whose rotor sticks for long is too far from one that creeps for first-order evidence. The search is
-        made where no possible model was `tried`, or the best one is still far from the noise, and where a leading
-        effect makes the rotor stick. Its result counts if it cuts the misfit by more than a factor of `FAR`.
-        A load is searched for, too, where asymmetric friction ended at a bound: friction of zero in one direction may
-        be a load larger than friction, which drives the rotor that way.
+        A rotor that sticks for long is too far from one that creeps for first-order evidence. So this is tried if no
+        possible model was `tried`, or the best of them is far from the noise, and a leading effect makes a rotor stick.
+        The result must cut the misfit by a factor of `FAR`. With a load, too, where asymmetric friction ended at a
+        bound: a load larger than friction drives the rotor in one direction.
         """
         possible = [model for model in tried if model is not None and model.is_possible]
         if possible:
@@ -409,17 +397,14 @@ class StepwiseSelection:
         return model
 
     def _simpler_forms(self, effect: str) -> list[str]:
-        """The simpler effects that may replace one: those it contains that have been begun, and those of which it is a
-        fuller form."""
+        """The simpler effects that may replace one: contained ones that were begun, and that of which it is fuller."""
         reduced = {s for s, form in FULLER.items() if form.effect == effect and form.reduced}
         return sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys() | reduced)
 
     def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:
-        """A model with a simpler form of a rich effect, and one more effect that promises about as much as the rich
-        form (`COMPARABLE`).
+        """A model with a simpler form of a rich effect, and one more effect that promises as much (`COMPARABLE`).
 
-        For instance, the curvature of Stribeck friction can imitate that of drag, if viscous friction compensates for
-        the rest.
+        Stribeck friction is curved like drag, for instance, if viscous friction compensates for the rest.
         """
         if len(simpler.effects) == MOST:
             return None
@@ -446,11 +431,10 @@ class StepwiseSelection:
         return bool(criterion[two] + MARGIN < criterion[model])
 
     def _does_as_well(self, simpler: Model, model: Model) -> bool:
-        """Whether a simpler form of an effect does as well as the richer one, which may have been chosen only because
-        another effect was still missing.
+        """Whether a simpler form does as well as the richer one, chosen when another effect may have been missing.
 
-        Either its criterion is worse by less than `MARGIN` and what neither explains, or it leaves nothing significant
-        by its own filter and hardly more unfiltered squares.
+        Its criterion is worse by less than `MARGIN` and what neither explains; or, by its own filter, nothing
+        significant is left, and hardly more unfiltered squares.
         """
         rich, plain = (
             self.comparison.left(m, self.comparison.white(model)).criterion

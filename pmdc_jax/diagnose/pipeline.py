@@ -123,11 +123,8 @@ def _judged(naming: Naming, solved: Solved) -> Identification:
 
 
 def _idle(naming: Naming, final: Identification, library: Library) -> str | None:
-    """The effect, of several, that the runs need least, if they do not need it; else None.
-
-    They do not if its p-value is above `ALARM`, if its amplitude may be none, or if they determine none of its
-    parameters and its p-value is above `CERTAIN`.
-    """
+    """The one of several effects that the runs need least, if they need none of it: by its p-value, as its amplitude
+    may be none, or as they determine none of its parameters and its p-value is not below `CERTAIN`."""
     if len(naming.without) < 2:
         return None
     amplitude = {c.effect: c.amplitude for c in library.candidates if c.amplitude}
@@ -256,8 +253,7 @@ def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
 
 
 def _detectable(found: Screen) -> tuple[Detectable, ...]:
-    """The smallest amplitude of each effect that would have been detected nine times of ten, at a false-alarm
-    probability of `ALARM` for all blocks together; without effects that no physical amplitude would show."""
+    """The smallest amplitude of each effect that would have been detected nine times of ten, where one is physical."""
     count = len(found.candidates) + len(found.curves)
     needed = stats.norm.isf(ALARM / count / 2) + stats.norm.isf(0.1)
     smallest: dict[str, Detectable] = {}
@@ -278,8 +274,8 @@ def _detectable(found: Screen) -> tuple[Detectable, ...]:
 def _gaps(base: Identification, final: Identification, share: float) -> dict[str, Gap]:
     """By run, the misfit before and after, over the noise.
 
-    The noise of a channel is `share` times what the final model leaves of it in the training runs, as root mean square,
-    and at least `FLOOR` times the channel's size. `share` is below 1 where part of what is left is no noise.
+    The noise is the final model's residuals in the training runs times `share`, below 1 where part of them is no noise,
+    and at least `FLOOR` times what was measured; all as root mean squares of each channel.
     """
     noise = {c: max(share * _left(final, c), FLOOR * _size(final, c)) for c in ("current", "speed")}
 

@@ -13,9 +13,9 @@ from .model import RunSeries
 
 # Simulated readings, each with the converter's steps at another offset
 READINGS = 8
-# Noise blurs the steps, and rounding errors are then white, too, if the residuals' root mean square is this many steps,
-# or if the measured signal fluctuates from sample to sample this many times as much as the simulated readings, as one
-# of an encoder whose counts are differenced from sample to sample
+# Noise blurs the steps, and rounding errors are white, from residuals of this many steps on (root mean square), or if
+# the measured signal fluctuates from sample to sample this many times as much as the simulated readings, as differences
+# of an encoder's counts do
 BLURRED, RESTLESS = 0.6, 1.5
 
 

@@ -65,8 +65,7 @@ class Refits:
     def with_signal(self, current: Model, signal: Signal, found: Screen) -> Model | None:
         """The current model with the effect of a signal added; None if physics forbids the coefficients found.
 
-        If the set was fitted before, from another model, and that fit does not realise the promised gain, it is fitted
-        again from the current model.
+        A set that was fitted from another model and does not realise the promised gain is fitted again from this one.
         """
         effects = _with_another(current.effects, effect_of(signal))
 
@@ -100,11 +99,8 @@ class Refits:
         return self.models[key]
 
     def in_place(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
-        """The current model with the effect `new` in place of `old`.
-
-        `new` is a fuller or simpler form of `old`, an effect that resembles it, one with starts of its own, or one
-        that was begun before: anything else has no values to start from.
-        """
+        """The current model with `new` in place of `old`: a fuller or a simpler form of it, an effect that resembles
+        it, one with starts of its own, or one begun before. Others have no values to start from."""
         effects = (*(e for e in current.effects if e != old), new)
 
         def refit() -> Model:
@@ -117,10 +113,7 @@ class Refits:
         return self._once(effects, current, refit)
 
     def _by_what_it_replaces(self, current: Model, old: str, new: str) -> dict[str, Values]:
-        """Start values of an effect, from the fit of the one that it replaces.
-
-        Given for an effect that resembles the old one, and for a simple form that was never begun; else empty.
-        """
+        """Start values, from the fit of the old effect, of one that resembles it or of a simple form never begun."""
         begins = TRIALS[old].alike.get(new)
         if new not in self.begun and new in FULLER and FULLER[new].effect == old:
             begins = FULLER[new].reduced
@@ -165,11 +158,7 @@ class Refits:
         return self._start(current, effects, {fuller.effect: values})
 
     def without(self, model: Model, effect: str, white: Whitener) -> Model:
-        """The model without one of its effects.
-
-        A stored fit is refitted if it is worse than the larger model's parameters, as they are, with the effect left
-        out.
-        """
+        """The model without one of its effects; fitted again if the larger one's parameters beat the stored fit."""
         rest = tuple(e for e in model.effects if e != effect)
         given, begun = self._start(model, rest, {})
 
@@ -213,9 +202,8 @@ class Refits:
     def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener) -> Model:
         """The best refit from several starts of the last effect.
 
-        Preliminary refits of a few steps stop once the best one reaches the noise (`POOR`) or two agree on it
-        (`AGREED`); the best is then refitted in full. With `Trial.factors`, populations search around each start
-        first, and around where the full refit ended.
+        Short refits are made until the best reaches the noise (`POOR`) or two agree on it (`AGREED`); it is then
+        refitted in full. With `Trial.factors`, populations search around each start first, and around the end.
         """
         given, seed = starts[0][0], self.solved.seed
         runs = starts[0][1].unknowns.runs
@@ -243,11 +231,10 @@ class Refits:
         signal: Signal,
         white: Whitener,
     ) -> Model:
-        """A refit from where the evidence points, and, if that does not realise the promised gain, by plain least
-        squares, too.
+        """A refit from where the evidence points; if that does not realise the promised gain, plain least squares, too.
 
-        If plain least squares leaves far less unfiltered misfit, its fit is returned: the filter had taken the missing
-        effect for noise. Otherwise a filtered refit starts from there, and the better of the two is returned.
+        The plain fit is returned if it leaves far less unfiltered misfit: the filter had taken the missing effect for
+        noise. Otherwise a second filtered refit starts from it, and the better of the two filtered ones is returned.
         """
         given, begun = start
         model = refit_from(effects, given, begun, white)
@@ -296,8 +283,8 @@ class Refits:
     ) -> Start:
         """The start of a refit of the current model with other effects.
 
-        **Arguments**: `values`, by new effect its parameters; `moved`, first-order change of the motor's search
-        coordinates; `angles`, in rad, added to the rotor angle at which each run begins.
+        **Arguments**: `values` of new effects; `moved`, first-order changes of the current search coordinates;
+        `angles`, in rad, added to the rotor's initial angles.
         """
         given = current.given.with_effects([EFFECTS[e] for e in effects])
         parameters, unknowns = given.problem.parameters, current.fit.unknowns
@@ -322,10 +309,8 @@ class Refits:
 
 
 def _with_another(here: tuple[str, ...], effect: str) -> tuple[str, ...]:
-    """A set of effects with one more, which replaces those that it contains.
-
-    Order: the effects that stay as they were added, those that `spelt_out` puts in, and the new effect last.
-    """
+    """A set of effects with one more in place of those that it contains: the others in order, those that `spelt_out`
+    puts in, and the new one last."""
     contains, kept = CONTAINS.get(effect, set()), set(here)
     if contains & spelt_out(kept):
         kept = spelt_out(kept) - contains
@@ -350,10 +335,8 @@ def _best_around(
     factors: Mapping[str, float],
     seed: int,
 ) -> Model:
-    """The better of two refits: from a start, and from the best of a population around where the first refit ended.
-
-    Both are fitted and compared by the whitening filter of the residuals at the start.
-    """
+    """The better of two refits, by the whitening filter of the residuals at the start: one from there, and one from the
+    best of a population around where that ended."""
     white = whitener(residuals_of(given, polish(given.problem, begun, steps=0)))
     sharp = whitened(given, white).problem
 
@@ -375,8 +358,7 @@ def _nearby(given: Prepared, start: Optimum, factors: Mapping[str, float], seed:
 def _turns(model: Model, effect: str) -> list[np.ndarray | None]:
     """The angles, in rad, by which the start of each training run may be turned to suit an effect; None: by any.
 
-    Only zero if the run's angle is known or defines zero. If the model has another effect of the angle, only whole
-    periods of that one.
+    Zero if its angle is known or defines zero; whole periods of another effect of the angle that the model has.
     """
     others = [e for e in model.motor.effects if "angle" in e.states and e.name != effect]
     count = round(2 * np.pi / float(others[0].repeats_after()["angle"])) if others else 0
@@ -388,12 +370,9 @@ def _turns(model: Model, effect: str) -> list[np.ndarray | None]:
 def common_phase(
     coefficients: Float[np.ndarray, "runs 2"], turns: Sequence[np.ndarray | None], periods: float
 ) -> tuple[float, np.ndarray]:
-    """The phase of a periodic torque that all runs have in common.
+    """The phase, in rad, that all runs have in common, and the angle by which the start of each is turned for it.
 
-    **Arguments**: `coefficients`, cosine and sine amplitude of each run; `turns`, the angles in rad by which the start
-    of each run may be turned, None for any; `periods` of the torque in one turn.
-
-    **Returns**: the phase in rad, and the angle by which each run is turned.
+    **Arguments**: `coefficients`, of cosine and sine in each run; `turns`, as from `_turns`; `periods` in one turn.
     """
     sizes = np.hypot(*coefficients.T)
     phases = np.arctan2(coefficients[:, 1], coefficients[:, 0])

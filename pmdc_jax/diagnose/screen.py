@@ -20,10 +20,10 @@ from .model import Model
 from .quantisation import READINGS
 from .rows import Rows, gathered
 
-# Slow noise at the slowest waves, over that at most of them, at most
+# Factor by which slow noise may be stronger at the slowest waves than at most of them
 SLOWEST_WAVES = 1.5
-# Torque noise over the few knots of a curve over time, at most, over what is left of it after the whitening filter:
-# for a correlation time of 0.2 s in runs of some seconds
+# Factor by which torque noise over the few knots of a curve over time may be stronger than the whitening filter makes
+# it, for a correlation time of 0.2 s in runs of some seconds
 SLOWER = 4.0
 # Standard errors by which a value clearly differs from zero
 CLEARLY = 3.0
@@ -138,8 +138,7 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     gains[waves] /= _dispersion(found, gains[waves], found.of_curve[-1])
     for k, curve in enumerate(found.curves):
         if drift is not None and curve.reverses:
-            # a slowly fluctuating torque is noise, a changing friction is not: it reverses with the motion. So only
-            # what it gains beyond a drifting torque counts.
+            # a slowly fluctuating torque is noise; a changing friction, which reverses with the motion, is not
             gains[k] = _left(found, drift) - _left(found, drift, found.of_curve[k])
         elif found.of_curve[k] is drift:
             gains[k] /= SLOWER
@@ -186,10 +185,7 @@ def _is_voltage(of: Candidate | Curve) -> bool:
 
 
 def _is_slow_torque(of: Candidate | Curve) -> bool:
-    """Whether something is a torque that changes no faster than the motion: slow torque noise may look like it.
-
-    That is a mechanical effect without states, or a mechanical curve over speed or current.
-    """
+    """Whether something is a torque that changes no faster than the motion: slow torque noise may look like it."""
     if isinstance(of, Candidate):
         effect = EFFECTS[of.effect]
         return effect.equation == "mechanical" and not effect.states
@@ -197,8 +193,8 @@ def _is_slow_torque(of: Candidate | Curve) -> bool:
 
 
 def _beside(found: Screen, block: Block, drift: Block) -> float:
-    """Overdispersion beside a block: the gain per degree of freedom of a drifting torque or voltage added to the
-    block, over that by chance; at least 1.
+    """Overdispersion beside a block: what a drifting torque or voltage gains when added to it, per degree of freedom
+    and over what it gains by chance; at least 1.
 
     The whitening filter leaves weak fluctuations of some tenths of a second, hidden below the noise of the sensors, and
     the block takes its share of them.
@@ -219,10 +215,7 @@ def _dispersion(found: Screen, gains: np.ndarray, wave: Block) -> float:
 def common_to_waves(
     evidence: Evidence, gained: Sequence[tuple[Candidate, Block, float]]
 ) -> dict[str, float]:
-    """By periodic effect, the median over its candidates of the gain beyond chance.
-
-    What candidates with different periods gain alike is no evidence for one of them.
-    """
+    """By periodic effect, the gain beyond chance that most periods have alike: it is no evidence for one of them."""
     by_period: dict[str, list[float]] = {}
     for candidate, block, gain in gained:
         if candidate.own_phase:
