@@ -23,9 +23,9 @@ ALARM = 0.01
 # Model-form error: the share of the squares explained by effects that imperfect formulas of them may leave; the larger
 # one if the rest is a curve over an effect's own variable
 FORMULA, OWN_FORMULA = 0.1, 0.5
-# Gain of the best candidate over that of the clearest signal: from the first share on it is worth a trial, from the
-# second on what is left is clearly that effect, or a richer form of one
-MUCH_OF_IT, MOST_OF_IT = 0.3, 0.7
+# Gain of a candidate or curve over that of the clearest signal: from the first share on a candidate is worth a trial,
+# from the second on a curve describes what is left, from the third on what is left is clearly a candidate's effect
+MUCH_OF_IT, HALF_OF_IT, MOST_OF_IT = 0.3, 0.5, 0.7
 # Harder forms (fuller ones without a regression column) by the simple form, in whose place they are tried
 HARDER = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}
 # The clearest gain left, over what the effects explain, below which nothing more is worth a trial; the larger one with
@@ -136,8 +136,8 @@ class Assessment(NamedTuple):
             return False
         best, effect = max(self.of_curves, key=_gain), max(self.of_candidates, key=_gain).candidate
         assert isinstance(best.of, Curve) and effect is not None
-        # a curve that explains little of what is left does not describe it
-        curve_is_own = _is_own(best.of, model) and best.gain > MUCH_OF_IT * self.clearest.gain
+        # of model-form error a curve over the effect's own variable explains nearly all
+        curve_is_own = _is_own(best.of, model) and best.gain > HALF_OF_IT * self.clearest.gain
         return not (curve_is_own or _is_own(EFFECTS[effect.effect], model))
 
 

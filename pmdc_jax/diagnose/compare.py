@@ -55,7 +55,7 @@ class Comparison:
         if key not in self._fitted:
             given, polished = sharpened(model.given, model.fit, white, WORTH)
             squares = squares_of(given, polished)
-            samples = np.count_nonzero(given.problem.tape.weight)
+            samples = given.problem.samples.sum()
             price = len(given.problem.parameters.names) * np.log(samples)
             self._fitted[key] = Fitted(model, squares, squares + price)
         return self._fitted[key]

@@ -114,6 +114,12 @@ class Diagnosis:
     seconds: Mapping[str, float]  # time taken: "identify", "name", "total"
 
     @property
+    def rivals(self) -> list[list[str]]:
+        """Other sets of effects that would explain the runs as well."""
+        sets = dict.fromkeys(one for effect in self.effects for one in effect.also_possible)
+        return [one.split(" + ") for one in sets]
+
+    @property
     def breaks_electrical_equation(self) -> bool:
         """Whether the electrical equation is violated by more than any torque or the effects added can explain."""
         return breaks_electrical_equation(self.electrical_misfit_before, self.electrical_misfit)

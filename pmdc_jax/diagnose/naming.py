@@ -119,7 +119,7 @@ class StepwiseSelection:
     def _in_a_form_that(
         self, settles: Callable[[Model], bool], current: Model, better: Model | None
     ) -> Model | None:
-        """A better model if it passes the test `settles`; or else one with another form of the added effect that does."""
+        """A better model if it passes the test `settles`; or else one with another form of what was added that does."""
         if better is None or settles(better):
             return better
         # the simple form may be only a step towards the fuller one that the motor has

@@ -56,7 +56,7 @@ def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
         summary=verdict_sentences(diagnosis),
         tiles=_tiles(diagnosis),
         effects=[_effect(effect) for effect in diagnosis.effects],
-        rivals=_rivals(diagnosis),
+        rivals=[enumerate_words([effect_words(e) for e in one]) for one in diagnosis.rivals],
         experiment=_experiment(diagnosis.next_experiment),
         where=[_region(region) for region in diagnosis.where],
         where_figure=_where_figure(diagnosis),
@@ -100,12 +100,6 @@ def _effect(effect: EffectFound) -> dict[str, Any]:
         "parameters": parameters,
         "chance": p_value_words(effect.p_value),
     }
-
-
-def _rivals(diagnosis: Diagnosis) -> list[str]:
-    """The other sets of effects that would explain the runs as well, in words."""
-    rivals = dict.fromkeys(r for effect in diagnosis.effects for r in effect.also_possible)
-    return [enumerate_words([effect_words(name) for name in one.split(" + ")]) for one in rivals]
 
 
 def _experiment(experiment: NextExperiment | None) -> dict[str, Any] | None:

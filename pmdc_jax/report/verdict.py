@@ -84,7 +84,7 @@ def _named(diagnosis: Diagnosis) -> list[str]:
 
 def _ambiguous(diagnosis: Diagnosis) -> list[str]:
     names = [effect.name for effect in diagnosis.effects]
-    sets = [names, *(rival.split(" + ") for rival in _rivals(diagnosis))]
+    sets = [names, *diagnosis.rivals]
     either = " or ".join(enumerate_words([effect_words(name) for name in one]) for one in sets)
     return [
         _disagreement_sentence(diagnosis),
@@ -246,10 +246,6 @@ def place_in_words(variable: str, value: float) -> str:
     if variable == "time":
         return f"at {percent(100 * float(value))} of a run"
     return f"at {significant(float(value))} {VARIABLE_UNITS.get(variable, '')}".strip()
-
-
-def _rivals(diagnosis: Diagnosis) -> list[str]:
-    return list(dict.fromkeys(r for effect in diagnosis.effects for r in effect.also_possible))
 
 
 def _experiment_sentence(diagnosis: Diagnosis) -> str:
