@@ -116,6 +116,12 @@ def words(diagnosis: Diagnosis) -> str:
     return " ".join(verdict_sentences(diagnosis)).replace(notation.NARROW, " ")
 
 
+def test_more_than_noise_is_said_to_be_left():
+    """By itself a named effect promises that its formula is nature's."""
+    assert not any("another formula" in s for s in verdict_sentences(named()))
+    assert any("another formula" in s for s in verdict_sentences(named(leaves_noise=False)))
+
+
 def test_a_named_effect_in_words():
     told = words(named())
     where = "disagree in the mechanical equation, below 20.0 rad/s, in both directions."

@@ -112,6 +112,8 @@ class Diagnosis:
     electrical_misfit: float
     electrical_misfit_before: float  # the same without effects
     seconds: Mapping[str, float]  # time taken: "identify", "name", "total"
+    # whether what the final motor leaves is no more than noise may
+    leaves_noise: bool = True
 
     @property
     def rivals(self) -> list[list[str]]:

@@ -114,6 +114,7 @@ def diagnose(
         electrical_misfit=electrical,
         electrical_misfit_before=before,
         seconds=seconds,
+        leaves_noise=naming.left >= ALARM,
     )
 
 

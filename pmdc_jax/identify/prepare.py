@@ -112,6 +112,12 @@ def prepare(
     noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in ("current", "speed")])
     untouched = _untouched(training, tie)
     parameters = Parameters.of(search_bounds(training), effects, untouched | dict(known or {}), tie)
+    if not parameters.names:
+        raise InputError(
+            "--known",
+            "with every parameter known nothing is left to identify",
+            "Leave one out, R say: it then stays near its value, or tells that something is amiss",
+        )
     # hold-outs lie on the tape too, but do not count: only what is their own is fitted to them
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True))
     problem = Problem(

@@ -62,7 +62,7 @@ def verdict_sentences(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.effects:
         sentences += [_gap_sentence(diagnosis), _drift_sentence(diagnosis)]
     if diagnosis.verdict != "not_in_library":
-        sentences.append(_slow_rest_sentence(diagnosis))
+        sentences += [_formula_sentence(diagnosis), _slow_rest_sentence(diagnosis)]
     return [sentence for sentence in sentences if sentence] + cautions(diagnosis.final)
 
 
@@ -291,6 +291,15 @@ def _gap_sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.closed_fraction is None or diagnosis.closed_fraction <= 0:
         return f"{sentence}."
     return f"{sentence}: {percent(100 * diagnosis.closed_fraction)} of the gap is closed."
+
+
+def _formula_sentence(diagnosis: Diagnosis) -> str:
+    if diagnosis.leaves_noise or not diagnosis.effects:
+        return ""
+    return (
+        "What is left is small beside that, but more than noise: as much as another formula of the same effect would"
+        " leave. No interval covers that."
+    )
 
 
 def _slow_rest_sentence(diagnosis: Diagnosis) -> str:
