@@ -137,6 +137,10 @@ IMPOSSIBLE = {
         {"setpoint": 481.0, "voltage_limit": 30.0, "sample_time": 1e-6},
         "1e-06 s makes",
     ),
+    "milliseconds": (
+        {"setpoint": 481.0, "voltage_limit": 30.0, "sample_time": 1.0},
+        "1 s is far longer than the fastest settling, 0.0441 s",
+    ),
     "controller": ({"controller": "fuzzy"}, "there is no controller 'fuzzy'"),
 }
 

@@ -25,6 +25,7 @@ MAX_SENSITIVITY = 2.0  # of the loop by default, over any frequency
 LONGEST_SAMPLE_TIME = 1e-3  # s, of those chosen by default
 SAMPLES_PER_SETTLING = 40  # samples by default in the fastest settling, at least
 FEW_SAMPLES = 10  # samples in the fastest settling; with fewer the loop loses much
+TOO_LONG = 10  # sample time over the fastest settling, beyond which it can only be a mistake
 # How long each part of the task takes: so many times the fastest settling, or beyond it so many times what no loop is
 # faster than.
 PART_SETTLINGS = 2.5
@@ -120,6 +121,13 @@ class LoopRequirements:
             return suitable, [f"no sample time given: {suitable:g} s"]
         if self.sample_time <= fastest / FEW_SAMPLES:
             return self.sample_time, []
+        if self.sample_time > TOO_LONG * fastest:
+            raise InputError(
+                "--sample-time",
+                f"{self.sample_time:g} s is far longer than the fastest settling, {fastest:.3g} s:"
+                " nothing happens while a controller could see it",
+                f"It is in seconds; {suitable:g} would suit this motor",
+            )
         taken = f"{fastest / self.sample_time:.2g} samples of {self.sample_time:g} s"
         remark = (
             f"the fastest settling, {fastest:.3g} s, takes {taken}:"
