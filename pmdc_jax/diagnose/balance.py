@@ -24,8 +24,9 @@ ENOUGH = 50
 # A current flows if it exceeds so many standard deviations of its sensor's noise
 CLEAR = 4.0
 # Lags, in steps of one sample, at which residuals of the equation are correlated, and standard errors that chance may
-# bring. A sensor's error enters two successive steps, and the ripple of a bridge's pulses, where a step does not end
-# with one of them, only one. What steps farther apart have in common is what the equation lacks.
+# bring. A sensor's error enters two successive steps, with opposite signs, and the ripple of a bridge's pulses, where a
+# step does not end with one of them, only one. What steps farther apart have in common is what the equation lacks, and
+# so is what makes successive ones alike, unless samples of an uneven clock were moved.
 APART, CHANCE = range(2, 9), 3.0
 
 
@@ -35,6 +36,7 @@ class _Balance(NamedTuple):
     rest: Float[np.ndarray, " samples"]  # of the current at the end of each step
     # derivatives by R, Kb, a voltage drop that opposes the current, and L, each up to a factor
     by_parameters: Float[np.ndarray, "samples 4"]
+    even: bool  # sampled by an even clock
 
 
 def electrical_misfit(model: Model) -> float:
@@ -57,16 +59,20 @@ def electrical_misfit(model: Model) -> float:
     ]
     if not balances:
         return 1.0
-    rest, columns = map(np.concatenate, zip(*balances, strict=True))
-    better = np.linalg.lstsq(columns, rest, rcond=None)[0]
-    return float(np.sqrt(1 + max(_lasting(b.rest - b.by_parameters @ better) for b in balances)))
+    columns = np.concatenate([b.by_parameters for b in balances])
+    better = np.linalg.lstsq(columns, np.concatenate([b.rest for b in balances]), rcond=None)[0]
+    lasting = [_lasting(b.rest - b.by_parameters @ better, b.even) for b in balances]
+    return float(np.sqrt(1 + max(lasting)))
 
 
-def _lasting(rest: Float[np.ndarray, " samples"]) -> float:
-    """The largest mean product, in magnitude, of two values some samples `APART`, less what chance makes it."""
-    products = [rest[apart:] * rest[:-apart] for apart in APART]
-    clear = [abs(p.mean()) - CHANCE * p.std() / np.sqrt(len(p)) for p in products]
-    return float(max(0.0, *clear))
+def _lasting(rest: Float[np.ndarray, " samples"], even: bool) -> float:
+    """The largest mean product, in magnitude, of two values some samples `APART`, or the positive one of neighbours,
+    less what chance makes it."""
+    lags = [*APART, 1] if even else APART
+    products = [rest[lag:] * rest[:-lag] for lag in lags]
+    means = [p.mean() if lag == 1 else abs(p.mean()) for lag, p in zip(lags, products, strict=True)]
+    chance = [CHANCE * p.std() / np.sqrt(len(p)) for p in products]
+    return float(max(0.0, *np.subtract(means, chance)))
 
 
 def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
@@ -95,7 +101,8 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     noise = np.sqrt(explained + (volt * unfelt) ** 2)
     drop = volt * brushes * np.sign(mean[:, :1])
     by_parameters = np.concatenate([volt * mean, drop, change], axis=1)
-    return _Balance(rest[pairs] / noise, by_parameters[pairs] / noise)
+    even = given.runs[run].uneven is None
+    return _Balance(rest[pairs] / noise, by_parameters[pairs] / noise, even)
 
 
 def _step(motor: Motor, drive: Drive, seconds: float) -> tuple[float, float, float, float]:

@@ -341,7 +341,8 @@ def _best_around(
     sharp = whitened(given, white).problem
 
     def left(model: Model) -> float:
-        return polish(sharp, model.fit.optimum, steps=0).fitness
+        fitness = polish(sharp, model.fit.optimum, steps=0).fitness
+        return fitness if np.isfinite(fitness) else np.inf
 
     model = refit_from(effects, given, begun, white)
     nearer = {name: np.sqrt(times) for name, times in factors.items()}

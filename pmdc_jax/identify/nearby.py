@@ -11,13 +11,15 @@ import numpy as np
 from ..motor import PARAMETERS
 from ..simulate import Tape
 from .parameters import Parameters
-from .polish import Fit
+from .polish import Fit, polish
 from .problem import Problem
 from .refine import Optimum
 from .search import search
 
 # Evaluated as fast as a smaller one: what takes long is to go through the samples one after another
 POPULATION, GENERATIONS = 64, 20
+# Candidates, the best one first, of which one is to have derivatives in all runs
+RANKS = (0, 1, 3, 7, 15, 31)
 # So many samples, if not those of one run, tell a few parameters from others
 ENOUGH = 2**13
 
@@ -26,6 +28,7 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     """The best point of a search (`search`) among some parameters around those of a fit, while all others stay.
 
     **Arguments**: `factors`, by parameter: it is sought within so many times and one over so many times what it is.
+    **Returns**: the best point at which the problem can be evaluated; that of the fit, if there is none.
     """
     parameters, coordinates = problem.parameters, np.array(fit.coordinates)
     values = {name: parameters.value(name, coordinates) for name in parameters.names}
@@ -50,9 +53,14 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
         population=POPULATION,
         generations=GENERATIONS,
     )
-    coordinates[[parameters.names.index(name) for name in sought.names]] = found.candidates[0]
-    unknowns = fit.unknowns._replace(coordinates=jnp.asarray(coordinates))
-    return Optimum(unknowns, np.inf, (), False)
+    places = [parameters.names.index(name) for name in sought.names]
+    for rank in RANKS:
+        coordinates[places] = found.candidates[rank]
+        unknowns = fit.unknowns._replace(coordinates=jnp.asarray(coordinates))
+        best = Optimum(unknowns, np.inf, (), False)
+        if np.isfinite(polish(problem, best, steps=0).fitness):
+            return best
+    return fit.optimum
 
 
 def _telling_runs(problem: Problem, fit: Fit) -> Tape:
