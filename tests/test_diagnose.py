@@ -115,7 +115,7 @@ class Undecided(StepwiseSelection):
         assert self.trials < 5
         return [self.other if current is self.one else self.one]
 
-    assess = staticmethod(lambda model: Mock(spec=Assessment, unexplained=np.inf))
+    assess = staticmethod(lambda model: Mock(spec=Assessment, unexplained=np.inf, left=1.0))
     _by_unfiltered_misfit = staticmethod(lambda *models: None)
     _by_likeliest_effect = staticmethod(lambda *models: None)
     _best = staticmethod(lambda tried, white: tried[0])
@@ -167,9 +167,12 @@ def test_of_what_promises_little_beside_a_curve_that_is_kept_which_settles_it(se
     }
     found = promises_of(gains, unexplained=np.inf)
     found.left, found.is_formula = 0.0, lambda model: False
-    selection, tried = StepwiseSelection.__new__(StepwiseSelection), Mock(spec=Model)
+    selection = StepwiseSelection.__new__(StepwiseSelection)
+    tried = Mock(spec=Model, effects=("stribeck_friction",))
     selection.refits = Mock(with_signal=Mock(return_value=tried))
-    selection._better = lambda current, found, models: models[-1]
+    selection.assess = lambda model: found
+    selection._better = lambda current, found, models: models[-1] if models else None
+    selection._in_other_form = lambda *models: []
     selection._leaves_little = lambda current, better: settles
     better = selection._by_likeliest_effect(Mock(spec=Model, effects=()), found)
     assert better is (tried if settles else None)
