@@ -924,6 +924,10 @@ BAD = {
     "negative known": (lambda r: identify(r, known={"R": -1.0}), "positive"),
     "infinite known": (lambda r: identify(r, known={"R": float("inf")}), "R"),
     "not a number known": (lambda r: identify(r, known={"R": float("nan")}), "positive"),
+    "everything known": (
+        lambda r: identify(r, known={n: getattr(PAPER, n) for n in PARAMETERS}),
+        "nothing is left to identify",
+    ),
     "unknown effect": (lambda r: identify(r, effects=("magic",)), "magic"),
     "unknown search": (lambda r: identify(r, search="magic"), "magic"),
 }

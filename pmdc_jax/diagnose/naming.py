@@ -95,9 +95,8 @@ class StepwiseSelection:
             current, found = better, self.assess(better)
             self.superseded.add(current)
         others = self._equivalent_swaps(current, found)
-        if (
-            found.left < ALARM
-        ):  # however little: what backlash leaves is small beside what a large effect explains
+        # however little: what backlash leaves is small beside what a large effect explains
+        if found.left < ALARM:
             others += self._in_harder_form(current, found, set(current.effects))
         return self._naming(self._better(current, found, others) or current)
 

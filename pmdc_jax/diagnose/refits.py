@@ -324,8 +324,7 @@ def _fitness(model: Model) -> float:
 def _roughly(start: Start) -> Optimum:
     """A preliminary refit of a few steps; its misfit is infinite where it cannot be simulated."""
     given, begun = start
-    end = polish(given.problem, begun, ROUGHLY).optimum
-    return end if np.isfinite(end.fitness) else end._replace(fitness=np.inf)
+    return polish(given.problem, begun, ROUGHLY).optimum
 
 
 def _best_around(
@@ -341,8 +340,7 @@ def _best_around(
     sharp = whitened(given, white).problem
 
     def left(model: Model) -> float:
-        fitness = polish(sharp, model.fit.optimum, steps=0).fitness
-        return fitness if np.isfinite(fitness) else np.inf
+        return polish(sharp, model.fit.optimum, steps=0).fitness
 
     model = refit_from(effects, given, begun, white)
     nearer = {name: np.sqrt(times) for name, times in factors.items()}

@@ -165,10 +165,10 @@ def _weighed(problem: Problem, unknowns: Unknowns, known: Evaluation | None = No
         else:
             over = squares * stretch**2 / np.maximum(problem.samples, 1.0)
             cost = float(np.log(np.maximum(noise, 1e-300)).sum() + over.sum() / 2)
-    cost = cost if np.isfinite(cost) else np.inf
-    return _Weighed(
-        unknowns, scaled, noise, matrix, cost, float(squares.sum()) / problem.most_samples
-    )
+    fitness = float(squares.sum()) / problem.most_samples
+    # what cannot be simulated is infinitely bad
+    cost, fitness = (x if np.isfinite(x) else np.inf for x in (cost, fitness))
+    return _Weighed(unknowns, scaled, noise, matrix, cost, fitness)
 
 
 def best_backlash_start(problem: Problem, unknowns: Unknowns, begun: RunUnknowns) -> Unknowns:
