@@ -28,7 +28,16 @@ MIN_CLARITY = 3.0  # a term is seen when it moves the fit by this many residuals
 RPM = 30 / np.pi  # in a rad/s
 DEGREES = 180 / np.pi  # in a rad
 TOP_SPEED = 6000.0  # rad/s, 57,000 rpm: no brushed motor turns faster
+TOP_VOLTAGE = 3000.0  # V, of the largest traction motors
 KB_RANGE = (5e-5, 200.0)  # V s/rad, a factor of 20 beyond what is built
+LEAST_R = 5e-4  # ohm, below that of any brushes
+# What Kt / Kb, in SI about 1, comes out as if a column is in another unit than it is read in
+MISREAD = {
+    RPM: ("speed", "rpm", "rad/s"),
+    DEGREES: ("speed", "deg/s", "rad/s"),
+    1e3: ("load", "mN*m", "N m"),
+    1e-3: ("current", "mA", "A"),
+}
 
 
 class Term(NamedTuple):
@@ -135,13 +144,13 @@ def angle_against_speed(run: Recording) -> Iterator[Finding]:
 
 
 def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
-    """Speeds in rpm or deg/s that pass as rad/s.
+    """Columns in another unit than they are read in, such as a speed in rpm that passes as rad/s.
 
     In SI the torque constant equals that of the back-EMF. Kt shows where the load is known and
     varies, within a run or from run to run.
     """
-    for run in runs:
-        yield from _implausible_speed(run)
+    wrong = [finding for run in runs for finding in _beyond_any_motor(run)]
+    yield from wrong
     names = ", ".join(run.name for run in runs if run.load is not None)
     constants = max(
         (_constants(runs, longer) for longer in WINDOW_LENGTHS), key=lambda c: c.explained
@@ -156,11 +165,11 @@ def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
     if not Kt.positive:
         return
     ratio = Kt.value / Kb.value
-    for scale, unit in ((RPM, "rpm"), (DEGREES, "deg/s")):
-        if 0.8 < ratio / scale < 1.25:
-            what = f"Kt is {ratio:.3g} times Kb, as if the speed were in {unit}, not rad/s"
-            mend = f"If it is, write [{unit}] into the header, or --column speed=HEADER:{unit}"
-            yield Finding(names, "speed", "warning", what, "all loaded runs", mend)
+    for scale, (column, unit, read) in MISREAD.items():
+        if 0.8 < ratio / scale < 1.25 and not any(finding.column == "voltage" for finding in wrong):
+            what = f"Kt is {ratio:.3g} times Kb, as if the {column} were in {unit}, not {read}"
+            mend = f"If it is, write [{unit}] into the header, or --column {column}=HEADER:{unit}"
+            yield Finding(names, column, "warning", what, "all loaded runs", mend)
 
 
 class _Constants(NamedTuple):
@@ -183,20 +192,28 @@ def _constants(runs: Sequence[Recording], longer: int) -> _Constants:
     return _Constants(*_electrical_balance(w), mechanical["current"], explained)
 
 
-def _implausible_speed(run: Recording) -> Iterator[Finding]:
-    mend = "Check the unit: write [rpm] or [deg/s] into the header, or map it by --column"
+def _beyond_any_motor(run: Recording) -> Iterator[Finding]:
+    """Values, and what they make of R and Kb, that no brushed motor has."""
     w = _windows(run)
-    if "speed" not in w:
-        return
-    top = float(np.max(np.abs(w["speed"])))
-    if top > TOP_SPEED:
-        what = f"{top:.4g} rad/s is faster than brushed motors turn"
-        yield Finding(run.name, "speed", "warning", what, "whole run", mend)
-    elif {"voltage", "current"} <= set(w):
-        _, Kb = _electrical_balance(w)
+
+    def wrong(column: str, what: str, units: str) -> Finding:
+        mend = f"Check the unit: write {units} into the header, or map it by --column"
+        return Finding(run.name, column, "warning", what, "whole run", mend)
+
+    top = {name: float(np.max(np.abs(w[name]))) for name in ("speed", "voltage") if name in w}
+    if top.get("voltage", 0.0) > TOP_VOLTAGE:
+        yield wrong("voltage", f"{top['voltage']:.4g} V is more than brushed motors take", "[mV]")
+    elif top.get("speed", 0.0) > TOP_SPEED:
+        what = f"{top['speed']:.4g} rad/s is faster than brushed motors turn"
+        yield wrong("speed", what, "[rpm] or [deg/s]")
+    elif {"voltage", "current", "speed"} <= set(w):
+        R, Kb = _electrical_balance(w)
         if Kb.positive and not KB_RANGE[0] < Kb.value < KB_RANGE[1]:
             what = f"with the voltage it makes Kb = {Kb.value:.3g} V s/rad, unlike any motor"
-            yield Finding(run.name, "speed", "warning", what, "whole run", mend)
+            yield wrong("speed", what, "[rpm] or [deg/s]")
+        if R.positive and R.value < LEAST_R:
+            what = f"with the voltage it makes R = {R.value:.3g} ohm, less than any motor has"
+            yield wrong("current", what, "[mA]")
 
 
 def regress(

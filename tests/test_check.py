@@ -245,6 +245,13 @@ FAULTS = [
     ("speed in rpm by angle", lambda run: with_angle(run, 1 / RPM), "angle", "speed were in rpm"),
     ("angle the other way", lambda run: with_angle(run, -1), "angle", "wrong sign"),
     ("impossible speed", lambda run: evolve(run, speed=1e3 * run.speed), "speed", "faster than"),
+    ("voltage in mV", lambda run: evolve(run, voltage=1e3 * run.voltage), "voltage", "motors take"),
+    (
+        "current in µA",
+        lambda run: evolve(run, current=1e6 * run.current),
+        "current",
+        "less than any",
+    ),
 ]
 
 
@@ -263,6 +270,8 @@ def test_each_fault_is_found(name, inject, column, what):
         (lambda run: evolve(run, speed=RPM * run.speed), "speed", "as if the speed were in rpm"),
         (lambda run: evolve(run, speed=6 * RPM * run.speed), "speed", "in deg/s, not rad/s"),
         (lambda run: evolve(run, load=-run.load), "load", "its sign is reversed"),
+        (lambda run: evolve(run, load=1e3 * run.load), "load", "in mN*m, not N m"),
+        (lambda run: evolve(run, current=1e3 * run.current), "current", "in mA, not A"),
     ],
 )
 def test_a_known_load_shows_wrong_units_and_its_own_sign(fault, column, what):

@@ -314,6 +314,18 @@ def test_summary_says_what_matters():
     assert "did not converge" in sentences
 
 
+def test_summary_repeats_which_columns_the_data_check_doubts():
+    finding = Finding("loaded", "current", "warning", "as if in mA", "whole run", "Mend it")
+    (told,) = (
+        one
+        for one in summary(fake_identification(findings=(finding, replace(finding, column=None))))
+        if "data check" in one
+    )
+    assert "the current and run loaded" in told
+    note = replace(finding, severity="note")
+    assert "data check" not in " ".join(summary(fake_identification(findings=(note,))))
+
+
 def test_summary_presumes_nothing_that_a_message_doubts():
     told = "the fit leaves 22 times its white noise: `pmdc diagnose` tells what is missing"
     doubted = fake_identification(messages=(told,), doubts=(told,))

@@ -41,9 +41,17 @@ def summary(identification: Identification) -> list[str]:
 
 def cautions(identification: Identification) -> list[str]:
     """What the recordings cannot tell, and where the numbers are not to be trusted."""
+    warnings = [one for one in identification.findings if one.severity == "warning"]
+    doubted = dict.fromkeys(one.column or f"run {one.run}" for one in warnings)
+    sentences = []
+    if doubted:
+        sentences.append(
+            f"The data check warns about the {enumerate_words(list(doubted))}:"
+            " the numbers hold only as far as that is harmless or mended."
+        )
     directions = identification.unidentified_directions
     told = (f"{as_sentence(one.why)} {as_sentence(one.mend)}" for one in directions)
-    sentences = list(dict.fromkeys(told))  # several directions may have one reason
+    sentences += dict.fromkeys(told)  # several directions may have one reason
     at_bound = _with_status(identification, "at_bound")
     if at_bound:
         who = f"{enumerate_words(at_bound)} {'stand' if len(at_bound) > 1 else 'stands'}"
