@@ -174,6 +174,16 @@ def test_what_is_left_in_the_electrical_equation_is_a_trace_or_explained(before,
     assert breaks_electrical_equation(before, after) is breaks
 
 
+def test_a_run_that_alone_is_missed_is_told():
+    runs = fake_identification(400).fit
+    first, *_ = (name for name, fit in runs.items() if fit.role == "train")
+    gaps = {name: Gap(4.9, 30.0 if name == first else 1.0, 1.0) for name in runs}
+    told = " ".join(verdict_sentences(named(gap_of_run=gaps, verdict="not_in_library")))
+    assert f"It is the run {first} that is missed, 30.0 times as much as any other" in told
+    for changes in ({"gap_of_run": gaps}, {"verdict": "not_in_library"}):  # noise; all alike
+        assert "It is the run" not in " ".join(verdict_sentences(named(**changes)))
+
+
 def test_what_is_left_beyond_white_noise_is_told():
     shaken = evolve(named().final, missed={"current": 22.4, "speed": 19.6})
     told = words(named(final=shaken))

@@ -24,6 +24,8 @@ TRACE_OF_ELECTRICAL, UNEXPLAINED_ELECTRICAL = 1.5, 0.5
 BEYOND = 2.5
 # ... and the misfit of hold-outs after effects were added, over that before, above which these made them worse
 WORSE = 1.1
+# Misfit of one fitted run over the largest of all others above which something happened in that run alone
+APART = 5.0
 
 
 @frozen
@@ -130,6 +132,18 @@ class Diagnosis:
     def beyond_fitted(self) -> float | None:
         """The misfit of the hold-outs over that of the fitted runs, where that is too much for one motor; else None."""
         return beyond_fitted(self.gap)
+
+    @property
+    def run_apart(self) -> tuple[str, float] | None:
+        """The fitted run that the final motor misses by far more than any other, and how many times; None without one,
+        or if all that is left is white noise, of which one run may have more."""
+        fitted = [name for name, fit in self.final.fit.items() if fit.role == "train"]
+        leaves_more = self.final.missed or not self.leaves_noise or self.verdict == "not_in_library"
+        if len(fitted) < 3 or not leaves_more:
+            return None
+        *_, second, worst = sorted(fitted, key=lambda name: self.gap_of_run[name].after)
+        ratio = self.gap_of_run[worst].after / max(self.gap_of_run[second].after, 1e-300)
+        return (worst, ratio) if ratio > APART else None
 
 
 def breaks_electrical_equation(before: float, after: float) -> bool:

@@ -63,6 +63,7 @@ def verdict_sentences(diagnosis: Diagnosis) -> list[str]:
         sentences += [_gap_sentence(diagnosis), _drift_sentence(diagnosis)]
     if diagnosis.verdict != "not_in_library":
         sentences += [_formula_sentence(diagnosis), _slow_rest_sentence(diagnosis)]
+    sentences.append(_run_apart_sentence(diagnosis))
     return [sentence for sentence in sentences if sentence] + cautions(diagnosis.final)
 
 
@@ -313,6 +314,18 @@ def _slow_rest_sentence(diagnosis: Diagnosis) -> str:
     return (
         f"What is left counts as noise, but is {enumerate_words(rest)}: a torque that fluctuates by itself may do that,"
         " and so may something else that is missing. Look at the residuals over time."
+    )
+
+
+def _run_apart_sentence(diagnosis: Diagnosis) -> str:
+    """Which single run holds what is left; empty if all do, or if nothing is left."""
+    if diagnosis.run_apart is None:
+        return ""
+    name, ratio = diagnosis.run_apart
+    return (
+        f"It is the run {name} that is missed, {significant(ratio)} times as much as any other: something acted there"
+        " that was not recorded, such as a changing load, or that the others do not excite. Record that as well, or"
+        " diagnose the others without it."
     )
 
 
