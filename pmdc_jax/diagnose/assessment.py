@@ -100,6 +100,11 @@ class Assessment(NamedTuple):
         own = isinstance(clearest, Curve) and _is_own(clearest, model)
         return self._is_more_of(model) or bool(own and self.unexplained < OWN_FORMULA)
 
+    def is_misread(self) -> bool:
+        """Whether what is left is clearest as a reading of the speed that swings with the angle."""
+        clearest = self.clearest.of
+        return isinstance(clearest, Curve) and clearest.is_misread
+
     def plainly(self) -> list[Signal]:
         """The candidates' signals with their gains on the unfiltered residuals."""
         plain = self.screen.unfiltered

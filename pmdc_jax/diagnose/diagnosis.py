@@ -55,7 +55,7 @@ class LearnedCurve:
 
     equation: str
     variable: str
-    unit: str  # of `value`: "N m" opposing motion, or "V" at the terminals
+    unit: str  # of `value`: "N m" opposing motion, "V" at the terminals, or "" for a share of the speed that is read
     x: np.ndarray
     value: np.ndarray
     stderr: np.ndarray

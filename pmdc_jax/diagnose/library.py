@@ -56,7 +56,7 @@ def side_by_side_on(tape: Tape) -> int:
 class Curve(NamedTuple):
     """An unknown term of one equation: piecewise linear in one variable, or a sinusoid of the angle."""
 
-    equation: str
+    equation: str  # "mechanical", "electrical", or "sensor" for the reading of the speed, as a share of it
     variable: str
     knots: np.ndarray
     own: bool = False  # every run has a curve of its own
@@ -71,6 +71,21 @@ class Curve(NamedTuple):
     def order(self) -> int:
         """How many coefficients it has (in one run, with `own`)."""
         return len(self.knots) if self.shapes is None else self.shapes.shape[1]
+
+    @property
+    def is_wave(self) -> bool:
+        """Whether it is a sinusoid of the angle."""
+        return self.shapes is not None
+
+    @property
+    def is_misread(self) -> bool:
+        """Whether it is a reading of the speed that swings with the angle."""
+        return self.equation == "sensor"
+
+    @property
+    def periods(self) -> float:
+        """Of a sinusoid, the periods per turn."""
+        return float(2 * np.pi / self.knots[-1])
 
     def values(self, coefficients: np.ndarray) -> np.ndarray:
         """The curve at its knots."""
@@ -187,13 +202,21 @@ def _small(
 
 
 def curves_over(library: Library, tape: Tape, path: Path) -> tuple[list[Curve], Iterator[Change]]:
-    """The curves over all variables of all equations, those periodic behind a gear, and what each changes."""
+    """The curves over all variables of all equations, the waves over the angle, and what each changes."""
+    terms = [*_terms_of_equations(library, tape, path), *_waves(library, tape, path)]
+    return [curve for curve, _ in terms], (change() for _, change in terms)
+
+
+Term = tuple[Curve, Callable[[], Change]]
+
+
+def _terms_of_equations(library: Library, tape: Tape, path: Path) -> Iterator[Term]:
+    """The curves of each equation over its variables (`OVER`)."""
     volt, torque = (np.asarray(push) for push in pushes(library.bare, tape))
     value = np.asarray(tape.value).T
     known = {"speed": np.asarray(path.speed), "current": np.asarray(path.current), "voltage": value}
     known["time"] = _share_of_run(tape)
     weight = np.any(np.asarray(tape.weight), axis=1).T
-    terms: list[tuple[Curve, np.ndarray, Callable[[], np.ndarray]]] = []
     voltage_driven = bool(np.any(np.asarray(tape.drive.voltage) > 0))
     for equation, variables in OVER.items():
         if equation == "electrical" and not voltage_driven:
@@ -206,16 +229,42 @@ def curves_over(library: Library, tape: Tape, path: Path) -> tuple[list[Curve], 
             knots = np.linspace(0, 1, KNOTS_IN_TIME) if own else _knots(x, weight)
             hats = partial(_hats, x, knots)
             noise = own and equation == "electrical" and library.wavers
-            terms.append((Curve(equation, variable, knots, own, noise=noise), push, hats))
+            yield Curve(equation, variable, knots, own, noise=noise), partial(_pushed, push, hats)
             if own and equation == "mechanical":
                 turning = partial(_hats, x, knots, _direction(known["speed"], tape))
-                terms.append((Curve(equation, variable, knots, own, reverses=True), push, turning))
+                reversing = Curve(equation, variable, knots, own, reverses=True)
+                yield reversing, partial(_pushed, push, turning)
+
+
+def _waves(library: Library, tape: Tape, path: Path) -> Iterator[Term]:
+    """Sinusoids of the angle: a torque behind a gear, and a speed reading that swings in proportion to the speed, as of
+    a tachometer's ripple or an encoder off its centre."""
+    angle, speed = np.asarray(path.angle), np.asarray(path.speed)
+    torque = np.asarray(pushes(library.bare, tape)[1])
     for periods in BEHIND_GEAR:
-        turned = np.linspace(0, 2 * np.pi / periods, KNOTS_IN_PERIOD)
-        curve = Curve("mechanical", "angle", turned, True, _wave(periods * turned))
-        terms.append((curve, torque, partial(_wave, periods * np.asarray(path.angle))))
-    kicks = (push[..., None] * shape()[:, None] for _, push, shape in terms)
-    return [curve for curve, *_ in terms], (Change(kick, np.zeros_like(kick)) for kick in kicks)
+        wave = partial(_wave, periods * angle)
+        yield _wave_curve("mechanical", periods), partial(_pushed, torque, wave)
+    of_rotor = [c.columns[0]["periods"] for c in library.candidates if c.effect == "cogging_torque"]
+    for periods in of_rotor:
+        yield _wave_curve("sensor", periods), partial(_misread, speed, periods * angle)
+
+
+def _wave_curve(equation: str, periods: float) -> Curve:
+    turned = np.linspace(0, 2 * np.pi / periods, KNOTS_IN_PERIOD)
+    return Curve(equation, "angle", turned, True, _wave(periods * turned))
+
+
+def _pushed(push: np.ndarray, shape: Callable[[], np.ndarray]) -> Change:
+    """What a voltage or torque of unknown shape changes."""
+    kick = push[..., None] * shape()[:, None]
+    return Change(kick, np.zeros_like(kick))
+
+
+def _misread(speed: np.ndarray, phase: np.ndarray) -> Change:
+    """What a speed reading that swings with a phase, by its own size, changes."""
+    swing = speed[..., None] * _wave(phase)
+    seen = np.stack([np.zeros_like(swing), swing], axis=1)
+    return Change(np.zeros_like(seen), seen)
 
 
 def _direction(speed: np.ndarray, tape: Tape) -> np.ndarray:

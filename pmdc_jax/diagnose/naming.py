@@ -178,9 +178,11 @@ class StepwiseSelection:
         """The current model with the effect that promises most, however little that is, if it then leaves little.
 
         An effect gains more than it promises if parameters of others are biased for lack of it, or if the motor's have
-        moved far to compensate for two effects. Not tried where model-form error may explain what is left.
+        moved far to compensate for two effects. Not tried where model-form error may explain what is left, or a sensor
+        of the speed that misreads it.
         """
-        if len(current.effects) == MOST or found.left >= ALARM or found.is_formula(current):
+        full = len(current.effects) == MOST
+        if full or found.left >= ALARM or found.is_formula(current) or found.is_misread():
             return None
         if current.effects:
             others = [s for s in clear(found) if effect_of(s) not in current.effects]

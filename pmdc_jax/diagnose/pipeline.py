@@ -41,6 +41,8 @@ from .screen import Screen, log_chance
 
 # A knot of a curve with a misfit of so many standard errors is part of a region
 CLEAR = 4.0
+# Units of the curves of each equation; a speed reading swings by a share of the speed
+UNITS = {"mechanical": "N m", "electrical": "V", "sensor": ""}
 # An effect with a smaller p-value without it is kept even if the runs give no interval of any of its parameters
 CERTAIN = 1e-30
 # ... and one whose interval of the amplitude reaches down to this share of the estimate may be none
@@ -237,20 +239,18 @@ def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
         if curve.own:  # of the run that shows it most clearly
             clearest = np.argmax(np.sum(np.square(value / np.maximum(error, 1e-300)), axis=1))
             value, error = value[clearest], error[clearest]
-        unit = "N m" if curve.equation == "mechanical" else "V"
-        learned.append(
-            LearnedCurve(
-                curve.equation,
-                curve.variable,
-                unit,
-                curve.knots,
-                curve.values(value),
-                curve.errors(error),
-                float(np.exp(chance)),
-                curve.reverses,
-            )
+        of_data = LearnedCurve(
+            curve.equation,
+            curve.variable,
+            UNITS[curve.equation],
+            curve.knots,
+            curve.values(value),
+            curve.errors(error),
+            float(np.exp(chance)),
+            curve.reverses,
         )
-    return tuple(sorted(learned, key=lambda c: c.p_value)[:3])
+        learned.append((chance, of_data))
+    return tuple(of_data for _, of_data in sorted(learned, key=lambda pair: pair[0])[:3])
 
 
 def _detectable(found: Screen) -> tuple[Detectable, ...]:

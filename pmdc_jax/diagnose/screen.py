@@ -126,16 +126,23 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
         chance = log_chance(max(gain - common, 0.0) / noise, found.evidence.freedom(block))
         return Signal(gain, chance, of, block)
 
+    pairs = zip(found.curves, found.of_curve, strict=True)
+    gains = np.array([_gain_of_curve(found, curve, block) for curve, block in pairs])
+    misread = [(c.periods, g) for c, g in zip(found.curves, gains, strict=True) if c.is_misread]
     possible = []
     for candidate, block in zip(found.candidates, found.of_candidate, strict=True):
         fit = found.evidence.regress([block])
-        if found.possible(candidate, fit.coefficients[0]):
-            possible.append((candidate, block, max(base - fit.squares, 0.0)))
+        gain = max(base - fit.squares, 0.0)
+        # a reading that swings as often, and explains more beside it, only looks like it
+        imitated = any(g > gain and _swings(candidate, periods) for periods, g in misread)
+        if not imitated and found.possible(candidate, fit.coefficients[0]):
+            possible.append((candidate, block, gain))
     common = common_to_waves(found.evidence, possible)
     of_candidates = [signal(c, b, gain, common.get(c.effect, 0.0)) for c, b, gain in possible]
-    gains = np.array([max(base - _left(found, block), 0.0) for block in found.of_curve])
-    waves = np.array([curve.shapes is not None for curve in found.curves])
-    gains[waves] /= _dispersion(found, gains[waves], found.of_curve[-1])
+    for equation in ("mechanical", "sensor"):
+        waves = [k for k, c in enumerate(found.curves) if c.is_wave and c.equation == equation]
+        if waves:
+            gains[waves] /= _dispersion(found, gains[waves], found.of_curve[waves[0]])
     for k, curve in enumerate(found.curves):
         if drift is not None and curve.reverses:
             # a slowly fluctuating torque is noise; a changing friction, which reverses with the motion, is not
@@ -146,6 +153,21 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
             gains[k] = 0.0
     of_curves = [signal(*one) for one in zip(found.curves, found.of_curve, gains, strict=True)]
     return sorted(of_candidates, key=_log_p), sorted(of_curves, key=_log_p)
+
+
+def _gain_of_curve(found: Screen, curve: Curve, block: Block) -> float:
+    """The gain of a curve; of a swinging speed reading beside the torques that swing as often, for at an even speed
+    these look like it."""
+    beside = []
+    if curve.is_misread:
+        pairs = zip(found.candidates, found.of_candidate, strict=True)
+        beside = [rival for candidate, rival in pairs if _swings(candidate, curve.periods)]
+    return max(_left(found, *beside) - _left(found, *beside, block), 0.0)
+
+
+def _swings(candidate: Candidate, periods: float) -> bool:
+    """Whether a candidate swings with the angle, so many times a turn."""
+    return candidate.own_phase and bool(np.isclose(candidate.columns[0]["periods"], periods))
 
 
 def _is_trace(found: Screen, curve: Curve, block: Block) -> bool:
@@ -242,11 +264,17 @@ def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
     return products(white, rows[0].fit.shared.values.shape[-1], LOCAL, READINGS)
 
 
+def _is_definite(curve: Signal) -> bool:
+    """Whether a curve is too definite for noise to look like it: one that all runs share, or one of a sensor."""
+    assert isinstance(curve.of, Curve)
+    return not curve.of.own or curve.of.is_misread
+
+
 def _without_clearest(found: Screen, rows: Sequence[Rows]) -> list[Series]:
     """The residuals of each run less the most significant candidate or shared curve, and all that is fitted with it."""
     of_candidates, of_curves = signals(found)
     clearest = min(
-        (s for s in (*of_candidates, *of_curves) if s.candidate or not s.block.own),
+        (s for s in (*of_candidates, *of_curves) if s.candidate or _is_definite(s)),
         key=_log_p,
     ).block
     best = found.evidence.regress([clearest])

@@ -184,8 +184,9 @@ def _clearest_misfit(diagnosis: Diagnosis) -> tuple[str, str]:
 
 
 def _curve(curve: LearnedCurve) -> dict[str, Any]:
+    where = {"sensor": "reading of the speed"}.get(curve.equation, f"{curve.equation} equation")
     return {
-        "title": f"{'friction' if curve.reverses else curve.equation + ' equation'} over"
+        "title": f"{'friction' if curve.reverses else where} over"
         f" {AXIS_TITLES.get(curve.variable, curve.variable)}",
         "chance": p_value_words(curve.p_value),
         "figure": figure_json(curve_figure(curve)),

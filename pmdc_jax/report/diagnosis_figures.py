@@ -175,9 +175,13 @@ def curve_figure(curve: LearnedCurve) -> go.Figure:
     )
     style(figure, height=300)
     figure.update_xaxes(title_text=AXIS_TITLES.get(curve.variable, curve.variable))
-    torque = "friction [N·m]" if curve.reverses else "torque [N·m]"
-    kind = torque if curve.unit == "N m" else f"voltage [{curve.unit}]"
-    figure.update_yaxes(title_text=kind, zeroline=True, zerolinecolor=INK)
+    titles = {
+        "mechanical": "friction [N·m]" if curve.reverses else "torque [N·m]",
+        "electrical": "voltage [V]",
+        "sensor": "share of the speed",
+    }
+    title = titles[curve.equation]
+    figure.update_yaxes(title_text=title, zeroline=True, zerolinecolor=INK)
     return figure
 
 

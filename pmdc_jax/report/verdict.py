@@ -11,6 +11,7 @@ from ..diagnose.diagnosis import (
     Detectable,
     Diagnosis,
     EffectFound,
+    LearnedCurve,
     Region,
     unlike_held_out,
     worse_held_out,
@@ -107,17 +108,7 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
     else:
         sentences.append("Something is missing that no effect of the library explains.")
     if diagnosis.curves:
-        curve = diagnosis.curves[0]
-        known = curve.stderr > 0
-        peak = int(np.argmax(np.abs(curve.value) / np.where(known, curve.stderr, np.inf)))
-        torque = "friction" if curve.reverses else "torque opposing motion"
-        kind = torque if curve.unit == "N m" else "voltage at the terminals"
-        value = value_with_unit(curve.value[peak], curve.unit)
-        sentences.append(
-            f"Drawn by the data it looks most like a {kind} over {curve.variable}, clearest with"
-            f" {value} {place_in_words(curve.variable, curve.x[peak])}"
-            f" ({p_value_words(curve.p_value)})."
-        )
+        sentences.append(_curve_sentence(diagnosis.curves[0]))
     if diagnosis.breaks_electrical_equation:
         sentences.append(
             "From sample to sample the current departs from where voltage and speed lead it by"
@@ -136,6 +127,26 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
             " fitted ones. Fit one of the held-out runs, too."
         )
     return [*sentences, "Parameters make up for what is missing: no interval covers that."]
+
+
+def _curve_sentence(curve: LearnedCurve) -> str:
+    """What the clearest unknown term looks like."""
+    chance = p_value_words(curve.p_value)
+    if curve.equation == "sensor":
+        times, share = 2 * np.pi / curve.x[-1], 100 * float(np.max(np.abs(curve.value)))
+        return (
+            f"Drawn by the data it looks most like a speed reading that swings {significant(times)} times a turn, by"
+            f" {percent(share)} of the speed ({chance}): the ripple of a tachometer, or an encoder off its centre."
+        )
+    known = curve.stderr > 0
+    peak = int(np.argmax(np.abs(curve.value) / np.where(known, curve.stderr, np.inf)))
+    torque = "friction" if curve.reverses else "torque opposing motion"
+    kind = torque if curve.unit == "N m" else "voltage at the terminals"
+    value = value_with_unit(curve.value[peak], curve.unit)
+    return (
+        f"Drawn by the data it looks most like a {kind} over {curve.variable}, clearest with"
+        f" {value} {place_in_words(curve.variable, curve.x[peak])} ({chance})."
+    )
 
 
 def disagreement(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> str:
