@@ -29,8 +29,8 @@ BLOCK = 128
 class Tape(eqx.Module):
     """Runs laid end to end; a run begins with a new block, and its last block is padded with samples of weight 0.
 
-    A few empty runs follow, so that recordings that differ in number or length have the same array shapes and share
-    compiled programs.
+    Empty runs and blocks follow, so that recordings that differ in number or length have the same array shapes and
+    share compiled programs.
 
     A sample time, a drive (voltage, current or torque) and a rotor that is free or held make a *grid*; blocks of
     one grid share the exact step. The drive and the load of sample k hold until sample k + 1; a drive with a `rise`
