@@ -68,9 +68,8 @@ def _even_clock(time: Samples) -> tuple[Samples, float]:
 def _followed_share(signal: Samples, late: Samples, step: float) -> tuple[float, float]:
     """Share of the lateness of its stamps that a signal follows, and the standard error of that share.
 
-    The share is 1 for samples taken at their stamps and 0 for samples taken evenly. It is the regression coefficient
-    of the signal's distance from the line between its neighbours on the distance that its slope and the stamps
-    predict. The standard error is infinite where nothing moves.
+    1 for samples taken at their stamps, 0 for even ones: a regression of each sample's distance from the mean of its
+    neighbours on that predicted from slope and stamps. The standard error is infinite where nothing moves.
     """
     lags = np.arange(-SLOPE_SAMPLES, SLOPE_SAMPLES + 1)
     slope = np.correlate(signal, lags / (lags @ lags) / step, "same")

@@ -164,7 +164,7 @@ def _key(
 
 @cache
 def _source() -> str:
-    """Hash of this package's source, the backend, XLA's flags and the versions of libraries."""
+    """Hash of source, backend, XLA's flags and library versions."""
     files = sorted(Path(__file__).parent.rglob("*.py"))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
     built_on = [jax.default_backend(), os.environ.get(FLAGS, ""), *map(version, LIBRARIES)]

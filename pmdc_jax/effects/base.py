@@ -130,7 +130,7 @@ class AbstractEffect(eqx.Module):
         return load
 
     def load_at_rotor(self, load: Scalars) -> Scalars:
-        """The part of the load torque that acts on the rotor itself, N m."""
+        """The load torque that acts on the rotor itself, N m."""
         return load
 
     def grip(self, state: State) -> Grip:

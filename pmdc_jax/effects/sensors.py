@@ -1,4 +1,4 @@
-"""Effects of the sensors on the reported current and speed."""
+"""Effects of sensors on current and speed."""
 
 from __future__ import annotations
 

@@ -134,8 +134,7 @@ class GearBacklash(_TwoInertias):
         return self._held(self.gap_rad, self.teeth(state))
 
     def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars:
-        """The angular frequency at which teeth in contact ring: a step of its inverse is a third of a half period, the
-        time that they touch before they bounce."""
+        """The natural frequency of teeth in contact, rad/s: a step is then a third of the half period of a bounce."""
         del current
         share = self.load_share
         return jnp.sqrt(self.stiffness_Nm_rad / (motor.J * share * (1 - share)))
@@ -146,7 +145,7 @@ class GearBacklash(_TwoInertias):
         return {"gear_speed": speed, "gear_twist": twist}
 
     def linear(self) -> AbstractEffect:
-        """The effect without a gap, its teeth always in contact."""
+        """Without a gap, always in contact."""
         one = jnp.ones_like(self.gap_rad)
         return self._held(0.0 * one, Teeth(one, one, one))
 
