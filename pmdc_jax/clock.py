@@ -23,11 +23,11 @@ ROUNDING = 0.02
 MAX_LATENESS = 3.0
 # Samples on either side over which a slope is taken
 SLOPE_SAMPLES = 5
-# Samples were taken evenly if the share of the lateness of their stamps that they follow is less than this ...
+# Samples count as evenly taken if the signal follows less than this share of the lateness of their stamps ...
 MAX_FOLLOWED_SHARE = 0.5
 # ... by so many standard errors
 STANDARD_ERRORS = 4.0
-# Expected changes whose sum of squares is less than this share of the signal's are rounding errors
+# Expected changes are rounding errors if their sum of squares is less than this share of the signal's
 ROUNDED_SQUARES = 1e-18
 
 

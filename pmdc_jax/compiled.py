@@ -164,7 +164,7 @@ def _key(
 
 @cache
 def _source() -> str:
-    """Hash of source, backend, XLA's flags and library versions."""
+    """Hash of source code, backend, XLA flags and library versions."""
     files = sorted(Path(__file__).parent.rglob("*.py"))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
     built_on = [jax.default_backend(), os.environ.get(FLAGS, ""), *map(version, LIBRARIES)]

@@ -25,7 +25,7 @@ def side_by_side(function: Callable[[A], T], items: Iterable[A]) -> list[T]:
 def side_by_side_until(
     function: Callable[[A], T], items: Sequence[A], enough: Callable[[list[T]], bool]
 ) -> list[T]:
-    """The same, for as many items at a time as there are cores, until the results so far are `enough`."""
+    """The same, in batches of one item per core, until the results so far are `enough`."""
     made: list[T] = []
     for first in range(0, len(items), CORES):
         made += side_by_side(function, items[first : first + CORES])

@@ -44,7 +44,7 @@ class State(NamedTuple):
 
 class Grip(NamedTuple):
     """Limits of a dry element: the torque in N m or voltage in V that opposes forward motion (positive speed or
-    current) and backward motion, both >= 0. At rest it is whatever within these limits keeps the state at zero."""
+    current) and backward motion, both >= 0. At rest it takes the value in between that keeps the state at zero."""
 
     backward: Scalars
     forward: Scalars
@@ -148,7 +148,7 @@ class AbstractEffect(eqx.Module):
         return {}
 
     def repeats_after(self) -> dict[str, Scalars]:
-        """Periods of its own states: shifts by which change nothing else."""
+        """Periods of its own states: a shift of a state by its period changes nothing else."""
         return {}
 
     def linear(self) -> AbstractEffect | None:

@@ -94,7 +94,7 @@ def _seen_speed(
     over_last: Bool[Array, " blocks"] | None,
     block: Int[Array, ""],
 ) -> Scalars:
-    """The speed at a sample, or the mean from there to the next in blocks that report this."""
+    """The speed at a sample, or, in blocks that report means, the mean from there to the next sample."""
     if mean is None or over_last is None:
         return speed
     return jnp.where(over_last[block], mean, speed)

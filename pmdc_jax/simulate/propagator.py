@@ -25,7 +25,7 @@ Held = Float[Array, "*#batch"]
 Vector = tuple[Scalars, ...]  # current, speed, and the states of linear effects
 Slow = dict[str, Scalars]  # the states that are not in the linear part, by name
 
-# Most steps in a sample
+# Largest number of steps in a sample
 FINEST = 32
 # Largest product of an effect's fastest rate (`fastest_rate`) and the step: a decay by no more than exp(-1)
 STIFF = 1.0

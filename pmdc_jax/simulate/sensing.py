@@ -21,11 +21,11 @@ def outputs(
     steps: int | Int[Array, ""],
     mean: State | None = None,
 ) -> Float[Array, "outputs ..."]:
-    """Reported current and speed at a sample, and from what else `reported` makes a delayed or averaged speed.
+    """Current and speed at a sample, and the other values from which `reported` makes a delayed or averaged speed.
 
     With a delayed sensor: the speed at the instant it sees, between this sample and the next. With averaging: the mean
-    speed from this sample to the next, that of the `mean` state. With both: also the part of this mean from before that
-    instant.
+    speed from this sample to the next, that of the `mean` state. With both: also the part of this mean that comes from
+    before that instant.
     """
     seen = [*motor.sensors(state)]
     part_mean = None

@@ -124,7 +124,7 @@ def sensitivities(
     columns = count + 1 + states
     d_prepared = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_prepared)
 
-    # joining takes several passes, so it has the columns of the start only; one more pass at the joined starts has all
+    # joining takes several passes, with the columns of the start only; one more pass at the joined starts has all
     still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
     starts, *_ = _join(prepared, still, tape, own, begins, PASSES)
     passed = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
@@ -209,8 +209,8 @@ def _join(
     """
     motor = prepared[0]
     guess = _guess(motor, own, tape, begins)
-    # the correction of a single pass joins a linear motor exactly; with effects every pass makes at least one more
-    # block of each run exact, so this ends for any motor
+    # the correction of a single pass joins a linear motor exactly; otherwise every pass makes at least one more block
+    # of each run exact, so this ends for any motor
     exact = motor.affine and not motor.switches
     passes = 1 if exact else min(most or len(guess) + 1, len(guess) + 1)
 
@@ -344,7 +344,7 @@ def _stitch(
 
 
 def _recurrence(motor: Motor) -> Float[Array, " states"]:
-    """Period of each state, a shift by which changes nothing else; zero without one."""
+    """Period of each state: a shift by it changes nothing else. Zero without one."""
     known = {name: p for effect in motor.effects for name, p in effect.repeats_after().items()}
     return jnp.stack(
         [jnp.zeros(()), jnp.zeros(()), *(known.get(n, jnp.zeros(())) for n in motor.states)]

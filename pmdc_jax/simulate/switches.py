@@ -118,8 +118,8 @@ def stick_or_reverse(
 
     **Arguments**: `row`, the index of the state; `grips`, the limits at zero and at the end of the step; `before`,
     `after`, the state vector at both ends of the uncorrected step; `begun`, the driving torque (N m) or voltage (V) at
-    the start; `push`, what a unit of it over the whole step adds to the state vector; `decay`, where the state by
-    itself falls by exp(-`decay`) over the step.
+    the start; `push`, what a unit of it over the whole step adds to the state vector; `decay`, the decay rate of the
+    state times the step.
 
     **Source**: time-stepping with set-valued forces, Moreau (1988), doi:10.1007/978-3-7091-2624-0_1, with the
     response of the exact linear step in place of h / J.
@@ -129,7 +129,7 @@ def stick_or_reverse(
     # the guarded denominator keeps the derivative finite where the branch is not taken
     fall = jnp.where(crosses & (direction != 0), before[row] - after[row], 1.0)
     share = jnp.where(direction == 0, 0.0, before[row] / fall)
-    # response to a push from zero crossing to end, over that to one of the whole step, for an exponential motion
+    # response to a push over the rest of the step, relative to one over the whole step: the motion is exponential
     rest = jnp.maximum((1.0 - share) / (1.0 + jnp.expm1(-decay) * share), 1e-12)
     # the force that has opposed the motion so far, and the one that would bring the state to zero at the end; beyond
     # the limits at zero the state slides on, with the mean of the limits at both ends

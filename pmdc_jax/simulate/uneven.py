@@ -16,7 +16,7 @@ from ..motor import Drive, Motor
 if TYPE_CHECKING:
     from ..recording import Recording
 
-# Closer eigenvalues are moved apart to this relative distance, at which a difference quotient is as accurate as this
+# Closer eigenvalues are moved apart to this relative distance, which is then the relative error, too
 NEAR = 1e-7
 # Below this size of the argument a series is more accurate than the quotient
 SMALL = 3e-3
