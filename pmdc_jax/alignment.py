@@ -1,4 +1,4 @@
-"""Channels recorded by different clocks: what follows an edge of the voltage, and when."""
+"""Time shifts between channels, and too slow sampling, judged by the response to edges of the voltage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MAX_SHIFT = 20  # samples, between channels
 SHIFTS = sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs)
 MAX_MISFIT_RATIO = 0.3  # a shift must leave less than this share of the misfit without one
 BEFORE_EDGE = 40  # samples
-AFTER_EDGE = 100  # samples, that of the voltage edge among them
+AFTER_EDGE = 100  # samples, including that of the voltage edge
 
 
 def shifted_channels(run: Recording) -> Iterator[Finding]:
@@ -54,7 +54,7 @@ def slow_sampling(run: Recording) -> Iterator[Finding]:
 
 
 class _Edge(NamedTuple):
-    """What happens about a voltage edge, each (BEFORE + AFTER,), the edge first felt at BEFORE."""
+    """Channels around a voltage edge, each (BEFORE_EDGE + AFTER_EDGE,); the new voltage starts at BEFORE_EDGE."""
 
     voltage: np.ndarray
     current: np.ndarray
@@ -63,9 +63,9 @@ class _Edge(NamedTuple):
 
 
 def _average_edge(run: Recording) -> _Edge | None:
-    """The average over edges, or None if there is none or a channel is absent.
+    """The average over edges, per volt, or None if there is none or a channel is absent.
 
-    The motor's equations are linear, so that such averages obey them, with less noise.
+    The motor's equations are linear in these channels, so the average obeys them, with less noise.
     """
     speed = speed_of(run)
     if run.voltage is None or run.current is None or speed is None:
@@ -86,7 +86,7 @@ def _average_edge(run: Recording) -> _Edge | None:
 
 
 def _electrical_misfit(edge: _Edge, shift: int) -> float:
-    """What v = R i + Kb w + L di/dt leaves with current and speed taken `shift` samples later."""
+    """Relative residual of v = R i + Kb w + L di/dt with current and speed taken `shift` samples later."""
     rows = np.arange(MAX_SHIFT, BEFORE_EDGE + AFTER_EDGE - MAX_SHIFT - 1)
     later = rows + shift
     # two neighbouring currents span R i + L di/dt for any ratio of L / R to the step
@@ -96,7 +96,7 @@ def _electrical_misfit(edge: _Edge, shift: int) -> float:
 
 
 def _mechanical_misfit(edge: _Edge, shift: int) -> float:
-    """What J dw/dt = Kt i - f w - T sign(w) leaves with the current taken `shift` samples later."""
+    """Relative residual of J dw/dt = Kt i - f w - T sign(w) with the current taken `shift` samples later."""
     rows = np.arange(MAX_SHIFT, BEFORE_EDGE + AFTER_EDGE - MAX_SHIFT - 1)
     later = rows + shift
     # integrated once, so that the noise of the speed is not differentiated
@@ -110,7 +110,7 @@ def _misfit(y: np.ndarray, *regressors: np.ndarray) -> float:
 
 
 def _best_shift(misfit: Mapping[int, float]) -> int:
-    """The smallest shift with about the least misfit, if clearly better than none; else 0."""
+    """The smallest shift with about the least misfit, if clearly better than no shift; otherwise 0."""
     unshifted, least = min(misfit[-1], misfit[0], misfit[1]), min(misfit.values())
     if unshifted < 0.01 or least > MAX_MISFIT_RATIO * unshifted:
         return 0

@@ -1,7 +1,7 @@
-"""Whether samples came when their time stamps say, or evenly, and only the stamps are uneven.
+"""Whether samples were taken at their uneven time stamps, or evenly, with only the stamps uneven.
 
-A computer that stamps what a sampling clock sends it does so early and late. Samples that truly came late show it: a
-speed that rises has risen further by then.
+A computer that stamps the samples of a sampling clock stamps some early and some late. Samples that were truly taken
+late show it: a rising speed has risen further by then.
 """
 
 from __future__ import annotations
@@ -14,31 +14,31 @@ from .recording import Recording
 
 Samples = Float[np.ndarray, " samples"]
 
-# Stamps that are more than so many typical steps apart leave a gap, in which outputs are missing; exactly so
-# many, but for rounding, leave none
+# Time stamps more than this many typical steps apart leave a gap, in which outputs are missing; exactly three steps,
+# up to rounding, leave none
 GAP = 3.0 * (1 + 1e-9)
 # Largest distance of a time stamp from an even clock, in steps, that is taken for rounding of the stamps
 ROUNDING = 0.02
-# ... and beyond which it is none that a sampling clock gave
+# Largest distance, in steps, of the stamp of a sample that may have been taken evenly
 MAX_LATENESS = 3.0
 # Samples on either side over which a slope is taken
 SLOPE_SAMPLES = 5
-# Samples that came evenly follow the lateness of their stamps by less than this share of it ...
+# Samples count as evenly taken if the signal follows less than this share of the lateness of their stamps ...
 MAX_FOLLOWED_SHARE = 0.5
-# ... and stay so many standard errors below
+# ... by so many standard errors
 STANDARD_ERRORS = 4.0
-# Squares of what is but rounding, as a share of all
+# Expected changes are rounding errors if their sum of squares is less than this share of the signal's
 ROUNDED_SQUARES = 1e-18
 
 
 def is_even(time: Samples) -> bool:
-    """Whether time stamps are even but for rounding."""
+    """Whether time stamps are even up to rounding."""
     evenly = np.linspace(time[0], time[-1], len(time))
     return bool(np.max(np.abs(time - evenly)) <= ROUNDING * (evenly[1] - evenly[0]))
 
 
 def evenly_stamped(recording: Recording) -> Recording:
-    """A record with even time stamps where its own are not, but its samples came evenly; as it is otherwise."""
+    """The record with even time stamps if its own are uneven but its samples were taken evenly; otherwise unchanged."""
     if is_even(recording.time) or not is_evenly_sampled(recording):
         return recording
     even, _ = _even_clock(recording.time)
@@ -46,7 +46,7 @@ def evenly_stamped(recording: Recording) -> Recording:
 
 
 def is_evenly_sampled(recording: Recording) -> bool:
-    """Whether samples came evenly: as their time stamps say, or, where these are uneven, by how the motion goes on."""
+    """Whether samples were taken evenly: by their time stamps, or, if these are uneven, judged by the motion."""
     if is_even(recording.time):
         return True
     even, step = _even_clock(recording.time)
@@ -59,17 +59,17 @@ def is_evenly_sampled(recording: Recording) -> bool:
 
 
 def _even_clock(time: Samples) -> tuple[Samples, float]:
-    """The even time stamps nearest to some, by least squares, and their step."""
+    """The even time stamps nearest to the given ones, by least squares, and their step."""
     ticks = np.arange(len(time))
     step, begin = np.polyfit(ticks, time, 1)
     return begin + ticks * step, float(step)
 
 
 def _followed_share(signal: Samples, late: Samples, step: float) -> tuple[float, float]:
-    """By what share of how late its stamps are a signal is further on, and the standard error of that.
+    """Share of the lateness of its stamps that a signal follows, and the standard error of that share.
 
-    By regression of what straight lines from neighbour to neighbour miss of the signal on what its slope makes of the
-    stamps; infinitely uncertain where nothing moves.
+    1 for samples taken at their stamps, 0 for even ones: a regression of each sample's distance from the mean of its
+    neighbours on that predicted from slope and stamps. The standard error is infinite where nothing moves.
     """
     lags = np.arange(-SLOPE_SAMPLES, SLOPE_SAMPLES + 1)
     slope = np.correlate(signal, lags / (lags @ lags) / step, "same")

@@ -1,4 +1,4 @@
-"""What JAX compiles is kept from one run of the command to the next; the library keeps nothing."""
+"""Compiled programs are kept on disk from one run of the command to the next; used as a library, nothing is kept."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import platform
 import warnings
 from pathlib import Path
 
-# Where this package keeps programs of its own, for this process and those that it starts
+# Environment variable with the folder of this package's own programs, for this process and those that it starts
 PROGRAMS = "PMDC_PROGRAMS"
-# JAX reads these when it is first imported, so a command that computes nothing pays nothing. All is
-# kept, however quickly compiled, for there is much of it.
+# JAX reads these variables when it is first imported, so a command that computes nothing need not import it. All
+# programs are kept, however quick to compile, because there are many.
 SETTINGS = {
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
@@ -19,11 +19,11 @@ SETTINGS = {
 
 
 def keep_compiled() -> None:
-    """Have JAX, and `compiled`, keep what is compiled in this process, where JAX must not have been imported yet.
+    """Have JAX and `compiled` keep the programs of this process. To be called before JAX is imported.
 
-    The folder is that of the environment variable PMDC_CACHE, else one in the user's cache folder.
-    Nothing is kept where the variable is empty or the folder cannot be written; what is set of
-    JAX's own variables stays.
+    The folder is that of the environment variable PMDC_CACHE, by default one in the user's cache folder.
+    Nothing is kept if the variable is empty or the folder cannot be written. JAX's own variables keep
+    values that are already set.
     """
     folder = _folder()
     if folder is None:
@@ -32,12 +32,12 @@ def keep_compiled() -> None:
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
-    # a full disk, a damaged file: JAX then compiles, and that is all that anyone needs
+    # on a full disk or with a damaged file JAX simply compiles, so its warning helps nobody
     warnings.filterwarnings("ignore", r"Error (reading|writing) persistent compilation cache")
 
 
 def programs() -> Path | None:
-    """The folder of the programs that `compiled` keeps, None where it keeps none."""
+    """The folder of the programs that `compiled` keeps; None if it keeps none."""
     named = os.environ.get(PROGRAMS)
     return Path(named) if named else None
 
@@ -61,13 +61,13 @@ def _folder() -> Path | None:
 
 
 def _processor() -> str:
-    """A name for this kind of processor: homes are shared, and code for another may crash here."""
+    """A name for this kind of processor: machines share home folders, and programs compiled on another may crash."""
     features = hashlib.sha256(_features().encode()).hexdigest()[:12]
     return f"{platform.machine()}-{features}"
 
 
 def _features() -> str:
-    """What the processor can do, on Linux; its name elsewhere."""
+    """The processor's instruction set flags on Linux; its name elsewhere."""
     try:
         with Path("/proc/cpuinfo").open(encoding="utf-8", errors="replace") as lines:
             return next(line for line in lines if line.lower().startswith(("flags", "features")))

@@ -1,4 +1,5 @@
-"""What JAX compiles: kept by the command, in less time what runs but a few times, and room for it where much is run."""
+"""Compilation: programs that the command keeps on disk, quick compilation of what runs rarely, and freeing of old
+programs."""
 
 from __future__ import annotations
 
@@ -28,10 +29,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Leaf = jax.Array | np.ndarray
 
-# Without its newer emitter of kernels XLA compiles in two thirds of the time. What it makes is as fast but for dry
-# friction and teeth, which take a quarter longer.
+# Without its newer kernel emitters XLA compiles in two thirds of the time. The programs are as fast, except with dry
+# friction and teeth, where they take a quarter longer.
 QUICKLY = {"xla_cpu_use_fusion_emitters": False}
-# What else decides what a function of this package is compiled to
+# Libraries whose versions affect what a function of this package is compiled to
 LIBRARIES = (
     "jax",
     "jaxlib",
@@ -44,21 +45,21 @@ LIBRARIES = (
     "numpy",
 )
 FLAGS = "XLA_FLAGS"
-# Bytes of programs that are kept; a diagnosis of recordings of a new shape leaves a few million
+# Most bytes of programs on disk; a diagnosis of recordings of a new shape adds a few million
 MOST = 500_000_000
 
-# Where Linux lists a process's memory maps, and says how many it may have
+# Where Linux lists the memory maps of this process, and their largest number
 MAPS, LIMIT = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
-# Share of them that must be free before new recordings are begun with: a diagnosis takes up to a quarter
+# Share of the maps that must be free before work on new recordings: a diagnosis takes up to a quarter
 FREE = 0.5
 
 
 class Program(NamedTuple):
-    """A function compiled for arguments of one kind, from their arrays to those of what it returns."""
+    """A function compiled for arguments of one kind: it maps their arrays to the arrays of the result."""
 
     run: jax.stages.Compiled
-    structure: Any  # of the tree of arrays that it returns
-    others: Any  # what it returns besides
+    structure: Any  # of the tree of the result's arrays
+    others: Any  # the rest of the result
 
 
 _programs: dict[str, Program] = {}
@@ -66,16 +67,16 @@ _locks: defaultdict[str, Lock] = defaultdict(Lock)
 
 
 def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) -> Callable[P, T]:
-    """`equinox.filter_jit` whose programs the command keeps. JAX itself keeps what XLA makes of a traced function, and
-    traces it anew in every process, which takes longer than all else.
+    """`equinox.filter_jit` whose programs the command keeps on disk. JAX's own cache keeps only what XLA makes of a
+    traced function, which every process traces anew; that takes longer than everything else.
 
-    Called from compiled code, from a library that keeps nothing, or with a function within another one, it is
-    `equinox.filter_jit`.
+    It is plain `equinox.filter_jit` for calls from compiled code, for a function defined within another one, and where
+    no programs are kept, as in use as a library.
 
-    **Arguments**: `function` of this package, which returns arrays, in tuples perhaps, but no modules of equinox, for
-    these cannot be written and read; `options` of XLA.
+    **Arguments**: `function` of this package, which returns arrays, possibly in tuples, but no Equinox modules, because
+    these cannot be written and read; `options`, XLA's.
     """
-    # within compiled code there are no options but its own
+    # within compiled code the options of the outer function apply
     within = eqx.filter_jit(function)
 
     @cache
@@ -101,7 +102,7 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
 
         def of_arrays(*leaves: Leaf) -> T:
             args, kwargs = eqx.combine(structure.unflatten(leaves), static)
-            # not the function itself: traces within other compiled code are found again
+            # instead of `function`, so that its trace is shared with calls from other compiled code
             return cast(Callable, within)(*args, **kwargs)
 
         with _locks[key]:
@@ -119,7 +120,7 @@ def quickly_compiled(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _known(options: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Those options that XLA has in this version: they come and go."""
+    """Those options that this version of XLA has: they change between versions."""
     return {k: v for k, v in options.items() if _is_known(k, v)} if options else None
 
 
@@ -133,10 +134,10 @@ def _is_known(option: str, value: Any) -> bool:
 
 
 def make_room() -> None:
-    """Forget what was compiled for earlier recordings, if it leaves little room for more.
+    """Drop the programs compiled for earlier recordings if few memory maps are left.
 
-    Each shape of recordings is compiled for, each program takes some memory maps, and a process that has as many as
-    Linux allows is killed: after some twelve diagnoses. Elsewhere nothing is done.
+    Every new shape of recordings needs new programs, each takes some memory maps, and a process that reaches Linux's
+    limit is killed: after about twelve diagnoses. Does nothing on other systems.
     """
     if not (MAPS.exists() and LIMIT.exists()):
         return
@@ -152,9 +153,9 @@ def _key(
     options: dict[str, Any] | None,
     leaves: Sequence[Leaf],
     structure: Any,  # of the tree of arrays
-    static: Any,  # what there is besides
+    static: Any,  # the rest of the arguments
 ) -> str:
-    """The name of a program: of all that decides what it is."""
+    """The name of a program: a hash of everything that determines it."""
     kinds = [(x.shape, str(x.dtype), getattr(x, "weak_type", False)) for x in leaves]
     double = jax.config.read("jax_enable_x64")
     of = (function.__module__, function.__qualname__, options, kinds, structure, static, double)
@@ -163,7 +164,7 @@ def _key(
 
 @cache
 def _source() -> str:
-    """This package and what it builds on."""
+    """Hash of source code, backend, XLA flags and library versions."""
     files = sorted(Path(__file__).parent.rglob("*.py"))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
     built_on = [jax.default_backend(), os.environ.get(FLAGS, ""), *map(version, LIBRARIES)]
@@ -171,7 +172,7 @@ def _source() -> str:
 
 
 def _kept(key: str) -> Program | None:
-    """A program that an earlier process kept, None without one that can be read."""
+    """A program that an earlier process kept; None if there is none that can be read."""
     path = _path(key)
     try:
         kept = zlib.decompress(path.read_bytes())
@@ -179,7 +180,7 @@ def _kept(key: str) -> Program | None:
         serialized, structure, others = pickle.loads(kept)
         program = serialize_executable.deserialize_and_load(*serialized)
         os.utime(path)
-    # there is none, or it is damaged: whatever is wrong, another one is made
+    # missing or damaged: whatever is wrong, it is compiled anew
     except Exception:
         return None
     return Program(program, structure, others)
@@ -187,14 +188,15 @@ def _kept(key: str) -> Program | None:
 
 @cache
 def _find_lapack() -> None:
-    """JAX looks for it when it first lowers what calls it; a program that was kept calls it as if it had been found."""
+    """Have JAX load LAPACK, which it does when it first lowers a function that calls it; a program read from disk calls
+    it without that."""
     jax.block_until_ready(jnp.linalg.cholesky(jnp.eye(1)))
 
 
 def _made(
     key: str, function: Callable, leaves: Sequence[Leaf], options: dict[str, Any] | None
 ) -> Program:
-    """A program compiled now, and kept where it can be."""
+    """A program compiled now, and kept if possible."""
     returned: list[Any] = []
 
     def flat(*leaves: Leaf) -> list[Leaf]:
@@ -203,25 +205,25 @@ def _made(
         returned[:] = structure, others
         return out
 
-    # XLA's part is kept by JAX under this name, too, and found there only if the same program was not kept here
+    # JAX's own cache stores the executable under this name too; it is read from there only if it was not kept here
     flat.__name__ = f"program_{key}"
     lowered = jax.jit(flat).lower(*leaves)
-    found = _found_by_jax()  # what it finds for the small steps of a trace does not count
+    found = _found_by_jax()  # hits for small operations during the trace do not count
     run = lowered.compile(_known(options))
     structure, others = returned
-    if _found_by_jax() == found:  # what JAX had kept cannot be taken apart again
+    if _found_by_jax() == found:  # an executable from JAX's cache cannot be serialized
         try:
             serialized = serialize_executable.serialize(run)
             content = pickle.dumps((serialized, structure, others))
             _write(_path(key), zlib.compress(content, level=1))
-        # XLA cannot write it, or the disk is full: then it is made anew the next time
+        # XLA cannot serialize it, or the disk is full: then it is compiled anew the next time
         except Exception:
             pass
     return Program(run, structure, others)
 
 
 def _found_by_jax() -> int:
-    """How many programs JAX has found in its own cache for this thread."""
+    """Number of programs that JAX has found in its own cache for this thread."""
     return _hits()[get_ident()]
 
 
@@ -251,7 +253,7 @@ def _write(path: Path, content: bytes) -> None:
 
 @cache
 def _tidy(folder: Path) -> None:
-    """Once in a process: without what was not used for longest, where there is too much."""
+    """Delete the least recently used programs beyond `MOST` bytes, once in a process."""
     files = [(path.stat().st_mtime, path.stat().st_size, path) for path in folder.iterdir()]
     spare = sum(size for _, size, _ in files) - MOST
     for _, size, path in sorted(files):

@@ -1,4 +1,4 @@
-"""The brushed permanent-magnet DC motor: equations (1) to (9) of the wheelchair-motor paper, once."""
+"""The brushed permanent-magnet DC motor: equations (1) to (9) of the wheelchair-motor paper."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ PARAMETERS = {"R": "ohm", "L": "H", "Kb": "V s/rad", "Kt": "N m/A", "J": "kg m^2
 
 
 class Drive(NamedTuple):
-    """What drives the motor over one sample: exactly one of the first three shares is 1, the others 0.
+    """What drives the motor over one sample: one of `voltage`, `current` and `torque` is 1, the others are 0.
 
-    A run with recorded voltage drives the whole motor; one with only current or torque drives the
-    mechanical half, and the electrical equation stands still. The mechanical one does where the rotor is
-    not `free` to turn: 1, or 0 where it is held.
+    A voltage drives the whole motor; a current or torque drives the mechanical half only, and the electrical
+    equation is switched off. `free` is 1, or 0 for a held rotor, which switches off the mechanical equation.
     """
 
     voltage: Scalars | float = 1.0
@@ -58,9 +57,9 @@ class Motor(eqx.Module):
     ) -> tuple[Float[Array, "2 2 *batch"], Float[Array, "2 2 *batch"]]:
         """Matrices A, B of dx/dt = A x + B u for the linear motor, equations (7) and (8).
 
-        x = (current, speed), u = (drive, load torque). `drive` says whether voltage (the default), current
-        or torque is given; for the latter two the current is not a state and its row is zero, as that of the speed
-        is where the rotor is held.
+        x = (current, speed), u = (driving value, load torque). `drive` says whether voltage (the default), current or
+        torque is given; for the latter two the current is not a state and its row is zero. The row of the speed is
+        zero if the rotor is held.
         """
         v, c, t, free = drive or Drive()
         zero, lightness = jnp.zeros_like(self.R), free / self.J
@@ -74,7 +73,7 @@ class Motor(eqx.Module):
     def transfer_function(
         self,
     ) -> tuple[dict[str, Float[Array, "order *batch"]], Float[Array, "3 *batch"]]:
-        """Numerators by "input -> output" and the common denominator, highest power of s first, equation (9).
+        """Numerators by "input -> output" and the common denominator, highest power of s first; equation (9).
 
         voltage -> speed is Kt / (L J s^2 + (R J + L f) s + R f + Kt Kb).
         """
@@ -94,7 +93,8 @@ class Motor(eqx.Module):
 
     @property
     def affine(self) -> bool:
-        """Whether this is a linear system with inputs, as long as no dry element changes direction."""
+        """Whether this is a linear system with inputs, as long as no dry element changes direction and no teeth touch
+        or part."""
         return all(effect.affine for effect in self.effects)
 
     @property
@@ -104,11 +104,11 @@ class Motor(eqx.Module):
 
     @property
     def toothed(self) -> AbstractEffect | None:
-        """The effect that has teeth."""
+        """The effect with teeth, if there is one."""
         return next((effect for effect in self.effects if effect.contact_state), None)
 
     def with_effects(self, effects: Iterable[AbstractEffect]) -> Motor:
-        """The same motor with other effects than its own."""
+        """The same motor with these effects in place of its own."""
         return eqx.tree_at(lambda motor: motor.effects, self, tuple(effects))
 
     def initial_state(
@@ -118,9 +118,9 @@ class Motor(eqx.Module):
         load: Scalars | float = 0.0,
         angle: Scalars | float = 0.0,
     ) -> State:
-        """State with this current (A) and speed (rad/s), and the effects' states as a run begins with them.
+        """State at the start of a run with this current (A), speed (rad/s), load (N m) and rotor angle (rad).
 
-        `load`, N m, and `angle` of the rotor, rad, as the run begins.
+        The effects' states follow from speed, load and angle.
         """
         shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (current, speed, load, angle, self.R)))
         current, speed, load, angle = (jnp.zeros(shape) + x for x in (current, speed, load, angle))
@@ -130,7 +130,7 @@ class Motor(eqx.Module):
         return State(current, speed, extra)
 
     def at(self, state: State) -> Motor:
-        """The motor with its parameters as the effects make them at this state."""
+        """The motor with its parameters as modified by the effects at this state."""
         return reduce(lambda motor, effect: effect.parameters(motor, state), self.effects, self)
 
     def derivative(
@@ -143,9 +143,9 @@ class Motor(eqx.Module):
     ) -> State:
         """Time derivative of the state.
 
-        **Arguments**: `value`, what drives the motor, in V, A or N m according to `drive`; `load`, N m, opposes
-        positive motion; `moving`, the directions (-1, 0, 1) of current and speed for which the dry elements
-        act, by default those of the state itself.
+        **Arguments**: `value`, the voltage in V, current in A or torque in N m that drives the motor, according to
+        `drive`; `load`, N m, opposes positive motion; `moving`, the directions (-1, 0, 1) of current and speed that
+        the dry elements oppose, by default those of the state.
         """
         v, c, t, free = drive or Drive()
         state = state._replace(current=v * state.current + c * value)
@@ -162,7 +162,7 @@ class Motor(eqx.Module):
         torque = torque + _opposing(self.grip("speed", state), direction_w)
         for effect in self.effects:
             torque = torque + effect.torque(state)
-        # by the reciprocals: they leave the loop over the samples, and a division would break its fusion
+        # times reciprocals, which XLA moves out of the loop over samples; a division would break the loop's fusion
         armature = voltage - motor.R * state.current - motor.Kb * state.speed - drop
         current_rate = v * armature * (1 / motor.L)
         driving = motor.Kt * state.current + t * value
@@ -173,21 +173,21 @@ class Motor(eqx.Module):
         return reduce(lambda load, effect: effect.load_torque(load), self.effects, load)
 
     def grip(self, holds: str, state: State) -> Grip | None:
-        """What all dry elements on "current" (V) or "speed" (N m) can hold together; None without any."""
+        """Combined limits of all dry elements on "current" (V) or "speed" (N m); None without any."""
         grips = [effect.grip(state) for effect in self.effects if effect.holds == holds]
         if not grips:
             return None
         return reduce(lambda a, b: Grip(a.backward + b.backward, a.forward + b.forward), grips)
 
     def sensors(self, state: State) -> tuple[Scalars, Scalars]:
-        """Current in A and speed in rad/s as the sensors report them, but for a delay."""
+        """Current in A and speed in rad/s as the sensors report them, apart from a delay."""
         current, speed = state.current, state.speed
         for effect in self.effects:
             current, speed = effect.sensors(state, current, speed)
         return current, speed
 
     def speed_delay(self) -> Scalars | None:
-        """By how many seconds the reported speed is late; None for not at all."""
+        """Delay of the reported speed in s; None without one."""
         delays = [delay for effect in self.effects if (delay := effect.speed_delay()) is not None]
         return reduce(jnp.add, delays) if delays else None
 

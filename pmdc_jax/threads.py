@@ -1,4 +1,4 @@
-"""Work side by side on all cores."""
+"""Parallel work in threads on all cores."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ CORES = os.cpu_count() or 1
 
 
 def side_by_side(function: Callable[[A], T], items: Iterable[A]) -> list[T]:
-    """What a function makes of every item, as many at a time as there are cores. Not to be nested."""
+    """Results of a function for every item, computed in parallel on all cores. Not to be nested: it could deadlock."""
     return [future.result() for future in [beside(function, item) for item in items]]
 
 
 def side_by_side_until(
     function: Callable[[A], T], items: Sequence[A], enough: Callable[[list[T]], bool]
 ) -> list[T]:
-    """The same, until what was made so far is `enough`."""
+    """The same, in batches of one item per core, until the results so far are `enough`."""
     made: list[T] = []
     for first in range(0, len(items), CORES):
         made += side_by_side(function, items[first : first + CORES])
@@ -35,7 +35,7 @@ def side_by_side_until(
 
 
 def one_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
-    """What calls return, in their order, while the next one is made on another core already. Not to be nested."""
+    """Results of calls in their order, with the next call already running in another thread. Must not be nested."""
     waiting: Future[T] | None = None
     for call in calls:
         before, waiting = waiting, beside(call)
@@ -46,7 +46,7 @@ def one_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
 
 
 def beside(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-    """A call that goes on beside what the caller does, in the caller's precision, which JAX keeps for each thread."""
+    """Run a call in another thread, with the caller's precision, which JAX keeps for each thread."""
     double = jax.config.read("jax_enable_x64")
 
     def call() -> T:
@@ -58,5 +58,5 @@ def beside(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Futur
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    """Kept: in a new thread the first call takes a millisecond longer than the next."""
+    """The threads, kept because the first call in a new thread takes a millisecond longer than later ones."""
     return ThreadPoolExecutor(CORES)

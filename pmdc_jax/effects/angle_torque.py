@@ -19,7 +19,7 @@ PERIODS = ParameterRange("", 0.5, 200.0)
 
 
 class _Angular(AbstractEffect):
-    """What goes with the rotor's angle, which is a state of its own."""
+    """An effect that depends on the rotor's angle, which it adds as a state."""
 
     states: ClassVar = ("angle",)
 
@@ -33,10 +33,10 @@ class _Angular(AbstractEffect):
 
 
 class CoggingTorque(_Angular):
-    """Cogging: T = a sin(n angle + phase), the pull of the magnets on the teeth, whatever the current.
+    """Cogging: T = a sin(n angle + phase), the pull of the magnets on the teeth, independent of current.
 
-    The angle is that of the record where one was recorded, and otherwise counts from the start of the first
-    run, an unknown of every other.
+    The angle is the recorded one if there is one. Otherwise it counts from the start of the first run, and the
+    initial angle of every other run is an unknown.
 
     **Fields**: `amplitude_Nm`, a in N m, > 0, usually 1 to 10 % of the rated torque; `phase_rad` in rad;
     `periods`, n for one revolution, commonly the least common multiple of poles and slots.
@@ -70,12 +70,12 @@ class CoggingTorque(_Angular):
 
 
 class TorqueRipple(_Angular):
-    """Torque ripple: Kt (1 + a sin(n angle + phase)) in place of Kt, of commutation and winding.
+    """Torque ripple: Kt (1 + a sin(n angle + phase)) in place of Kt, due to commutation and winding.
 
-    The back-EMF ripples alike, Kb (1 + e a sin(n angle + phase)), as far as the brushes do not short what of it
-    changes within a segment. The angle is as in `cogging_torque`.
+    The back-EMF has the same ripple, Kb (1 + e a sin(n angle + phase)), except for the share 1 - e that the brushes
+    short-circuit, since it changes within a segment. The angle is as in `cogging_torque`.
 
-    **Fields**: `amplitude`, a, a plain number > 0, usually 0.01 to 0.1; `phase_rad` in rad; `periods`, n for one
+    **Fields**: `amplitude`, a, dimensionless, > 0, usually 0.01 to 0.1; `phase_rad` in rad; `periods`, n for one
     revolution, commonly the number of commutator segments, or twice it; `emf_share`, e, between 0 and 1.
     **Excitation needed**: slow motion over several periods with a current that is not small.
     **Source**: Hanselman, "Brushless Permanent Magnet Motor Design", 2nd edition, chapter 9.
@@ -92,7 +92,7 @@ class TorqueRipple(_Angular):
         "amplitude": ParameterRange("", 1e-5, 1.0),
         "phase_rad": PHASE,
         "periods": PERIODS,
-        # estimates scatter about its ends
+        # beyond 0 and 1, because estimates scatter around them
         "emf_share": ParameterRange("", -0.5, 1.5, "linear"),
     }
 
@@ -119,13 +119,13 @@ def _wave(effect: CoggingTorque | TorqueRipple, state: State) -> Scalars:
 
 
 def _period(effect: CoggingTorque | TorqueRipple) -> dict[str, Scalars]:
-    """The angle after which the torque comes again."""
+    """The angle after which the torque repeats, rad."""
     return {"angle": 2 * jnp.pi * (1 / effect.periods)}
 
 
 def _fitted(effect: CoggingTorque | TorqueRipple, turn: Scalars) -> Scalars:
-    """The factor by which Simpson's rule gives the mean of the wave over a `turn` in rad, however often it comes round:
-    samples of a wave that does so within a step would pass for a slow one.
+    """The factor with which Simpson's rule gives the exact mean of the wave over a `turn` in rad, for any number of
+    periods: without it, a wave with whole periods within a step would be aliased to a slow one.
 
     **Source**: exponential fitting, Ixaru, Vanden Berghe, "Exponential Fitting" (2004), chapter 4.
     """

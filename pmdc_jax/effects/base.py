@@ -1,23 +1,23 @@
-"""What a physical effect may touch.
+"""The base class of physical effects, and what they may override.
 
-An effect is an Equinox module whose fields are its parameters. It plugs into the motor at named places,
-each of which does nothing unless the effect overrides it:
+An effect is an Equinox module whose fields are its parameters. It acts on the motor through these methods and
+attributes, each of which does nothing unless the effect overrides it:
 
-- `is_possible`: what its parameters together may be
+- `is_possible`: constraints between its parameters
 - `terminal_voltage`: the voltage that reaches the winding, V
 - `parameters`: the motor's own parameters at a state, R(temperature), Kt(current), ...
 - `voltage_drop` and `torque`: smooth terms of the electrical and the mechanical equation
-- `load_torque` and `load_at_rotor`: the whole load, and what of it acts on the rotor itself
+- `load_torque` and `load_at_rotor`: the whole load, and the part of it that acts on the rotor itself
 - `grip`: a dry, set-valued term that can hold a state at exactly zero (stiction, brush contact)
-- `teeth` and `without_contact`: flanks that touch and part (a gear)
-- `averaged_over_step`: how it acts on average over a step, or until something switches
-- `states`, `initial_states` and `derivative`: states of its own, how they begin and how they move
-- `repeats_after`: after how much of a state everything is as before
-- `linear`: the linear effect that it is, or nearly is, whose states then join the exact step
-- `fastest_rate`: how much faster it makes the motor
-- `sensors`, `speed_delay` and `speed_before_sensor`: how current and speed are seen, and how the rotor turned
+- `teeth`, `play` and `without_contact`: flanks that touch and part (a gear)
+- `averaged_over_step`: the effect as it acts on average over a step, or until something switches
+- `states`, `initial_states` and `derivative`: states of its own, their initial values and derivatives
+- `repeats_after`: periods of its own states
+- `linear`: the linear effect that it is, or is close to, whose states then join the exact step
+- `fastest_rate`: the fastest rate that it adds to the motor
+- `sensors`, `speed_delay` and `speed_before_sensor`: reported current and speed, and the speed behind a report
 
-New effects are one class here and one row in the table `EFFECTS` of this package.
+A new effect is one class in this package and one row in its table `EFFECTS`.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ class State(NamedTuple):
 
 
 class Grip(NamedTuple):
-    """How much a dry element can hold: the torque in N m or voltage in V that opposes motion forward
-    (positive speed or current) and backward, both >= 0. In between it takes whatever keeps the state at zero."""
+    """Limits of a dry element: the torque in N m or voltage in V that opposes forward motion (positive speed or
+    current) and backward motion, both >= 0. At rest it takes the value in between that keeps the state at zero."""
 
     backward: Scalars
     forward: Scalars
 
 
 class Teeth(NamedTuple):
-    """Two flanks that touch, or do not: on which side (+-1), how far in rad they overlap, and the compression in rad by
-    which they would pass their torque, damping included, if they stuck together. They push and never pull."""
+    """Two flanks that may touch: the side (+-1), their overlap in rad, and the compression in rad that gives the torque
+    on contact, damping included. They push and never pull, so they touch only while both are positive."""
 
     side: Scalars
     overlap: Scalars
@@ -64,9 +64,9 @@ class Teeth(NamedTuple):
 
 
 class ParameterRange(NamedTuple):
-    """Unit of an effect's parameter, and between which values a search may look for it.
+    """Unit of an effect's parameter, and bounds for a search.
 
-    `scale` is "log" for a strictly positive parameter, "linear" for one of either sign. A plain number has
+    `scale` is "log" for a strictly positive parameter, "linear" for one of either sign. A dimensionless parameter has
     the unit "".
     """
 
@@ -80,30 +80,30 @@ class AbstractEffect(eqx.Module):
     """A physical effect that the plain linear motor lacks. See the module for what may be overridden."""
 
     name: ClassVar[str]
-    # in plain English, and as one line of mathematics in the symbols of the motor, for reports
+    # for reports: the name in plain English, and the equation in the symbols of the motor
     label: ClassVar[str]
     formula: ClassVar[str]
     equation: ClassVar[Literal["electrical", "mechanical", "input", "sensor"]]
     ranges: ClassVar[dict[str, ParameterRange]]
     states: ClassVar[tuple[str, ...]] = ()
-    # the variable that its term is a curve over, where it is one
+    # the variable of which its term is a function, if it is one variable
     variable: ClassVar[Literal["speed", "current", "voltage", "angle"] | None] = None
-    # its size is in amperes, and says something only where the current was measured
+    # its parameters depend on the scale of the current, so they mean something only if the current was measured
     needs_current: ClassVar[bool] = False
     # which state a dry element holds at zero
     holds: ClassVar[Literal["speed", "current"] | None] = None
-    # the state by which its teeth come to touch and part
+    # the state that decides whether its teeth touch
     contact_state: ClassVar[str | None] = None
-    # the state of a spring, which a run may begin with wound up in any way
+    # the state of a spring, which may have any twist at the start of a run
     spring_state: ClassVar[str | None] = None
     # with it the motor is still a linear system with inputs, as long as no dry element changes direction and no teeth
-    # come to touch or part
+    # touch or part
     affine: ClassVar[bool] = False
-    # the longest step in s that follows the effect well, or finds the changes of direction
+    # the longest step in s that resolves the effect, or its changes of direction
     longest_step: ClassVar[float] = 1e-3
 
     def is_possible(self) -> bool:
-        """Whether nature allows its parameters together; each for itself is within its range."""
+        """Whether the combination of its parameters is physically possible; each by itself is within its range."""
         return True
 
     def terminal_voltage(self, voltage: Scalars) -> Scalars:
@@ -111,7 +111,7 @@ class AbstractEffect(eqx.Module):
         return voltage
 
     def parameters(self, motor: Motor, state: State) -> Motor:
-        """The motor with R, L, Kb, Kt, J, f as they are at this state."""
+        """The motor with the values of R, L, Kb, Kt, J, f at this state."""
         del state
         return motor
 
@@ -126,11 +126,11 @@ class AbstractEffect(eqx.Module):
         return 0.0
 
     def load_torque(self, load: Scalars) -> Scalars:
-        """The whole load torque, N m, where `load` was recorded."""
+        """The whole load torque, N m, if `load` was recorded."""
         return load
 
     def load_at_rotor(self, load: Scalars) -> Scalars:
-        """The load torque as it acts on the rotor, N m."""
+        """The load torque that acts on the rotor itself, N m."""
         return load
 
     def grip(self, state: State) -> Grip:
@@ -138,33 +138,33 @@ class AbstractEffect(eqx.Module):
         raise NotImplementedError(f"{self.name} has no dry element")
 
     def initial_states(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
-        """The effect's own states where a run begins with this speed (rad/s), load (N m) and angle (rad)."""
+        """The effect's own states at the start of a run with this speed (rad/s), load (N m) and angle (rad)."""
         del load, angle
         return dict.fromkeys(self.states, 0.0 * speed)
 
     def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
-        """Rates of the effect's own states, per second; `motor` with its parameters at this state."""
+        """Time derivatives of the effect's own states; `motor` has its parameters at this state."""
         del motor, state, load
         return {}
 
     def repeats_after(self) -> dict[str, Scalars]:
-        """By how much a state of its own can differ and all else goes on alike."""
+        """Periods of its own states: a shift of a state by its period changes nothing else."""
         return {}
 
     def linear(self) -> AbstractEffect | None:
-        """An effect with the same states and only linear terms, near enough to step stiff ones by."""
+        """An effect with the same states and only linear terms, close enough for the exact step to handle stiffness."""
         return None
 
     def teeth(self, state: State, side: Scalars | None = None) -> Teeth:
-        """How its teeth stand, on the side where they are nearer or the one given; needs `contact_state`."""
+        """Contact of its teeth, on the given side or else on the nearer one; needs `contact_state`."""
         raise NotImplementedError(f"{self.name} has no teeth")
 
     def play(self) -> Scalars | float:
-        """By how much its teeth can be apart, rad."""
+        """The whole play between its teeth, rad."""
         return 0.0
 
     def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
-        """The effect as it acts throughout a step of so many seconds that begins with this state."""
+        """The effect as it acts throughout a step of this length, s, that starts from this state."""
         del state, seconds
         return self
 
@@ -173,7 +173,7 @@ class AbstractEffect(eqx.Module):
         return self
 
     def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars | None:
-        """How much faster, in 1/s, the motor becomes at a current in A; None where `longest_step` is always enough."""
+        """The fastest rate, 1/s, that it adds to the motor at a current in A; None if `longest_step` suffices."""
         del motor, current
         return None
 
@@ -183,12 +183,12 @@ class AbstractEffect(eqx.Module):
         return current, speed
 
     def speed_delay(self) -> Scalars | None:
-        """By how many seconds the reported speed is late; None for not at all."""
+        """Delay of the reported speed in s; None without one."""
         return None
 
     def speed_before_sensor(
         self, reported: Float[np.ndarray, " samples"], time: Float[np.ndarray, " samples"]
     ) -> Float[np.ndarray, " samples"]:
-        """The speed of the rotor, rad/s, from what the sensor reported of it, free of noise, at each time in s."""
+        """The speed of the rotor, rad/s, from the sensor's reports without noise, at each time in s."""
         del time
         return reported

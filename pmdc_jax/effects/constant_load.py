@@ -11,7 +11,7 @@ class ConstantLoad(AbstractEffect):
     """Constant load: a torque T_0 that opposes positive motion, whichever way the motor turns: a weight, a
     spring, the zero error of a torque sensor. It acts where a recorded load does: behind a shaft or gear.
 
-    A run whose load is unknown already has such a torque of its own, beside which this one cannot be seen.
+    A run with unknown load already has such a torque as an unknown, from which this one cannot be distinguished.
 
     **Fields**: `torque_Nm`, T_0 in N m, of either sign.
     **Excitation needed**: motion in both directions, or several speeds.

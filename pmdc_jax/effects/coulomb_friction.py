@@ -35,7 +35,7 @@ class CoulombFriction(AbstractEffect):
 class AsymmetricFriction(AbstractEffect):
     """Coulomb friction that differs with direction: T_f = forward_Nm for w > 0, -backward_Nm for w < 0.
 
-    At rest it takes whatever lies between the two. While the motor turns this is the same torque as
+    At rest it takes any value between the two. While the motor turns this is the same torque as
     `coulomb_friction` of half the sum and a `constant_load` of half the difference.
 
     **Fields**: `forward_Nm`, `backward_Nm`, friction torque in N m in either direction, both >= 0.

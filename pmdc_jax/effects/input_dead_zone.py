@@ -1,4 +1,4 @@
-"""Voltage that the driver stage swallows."""
+"""Voltage that is lost in the driver stage."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from .base import AbstractEffect, ParameterRange, Scalars
 
 
 class InputDeadZone(AbstractEffect):
-    """Dead zone: the winding gets v - clip(v, -width_V, width_V): nothing up to the width, less by it above.
+    """Dead zone: the winding gets v - clip(v, -width_V, width_V): zero up to the width, reduced by it above.
 
-    **Fields**: `width_V`, in V, > 0; dead time of a bridge at 20 kHz makes 0.1 to 1 V of it at 24 V.
+    **Fields**: `width_V`, in V, > 0; the dead time of a bridge at 20 kHz causes 0.1 to 1 V at 24 V.
     **Excitation needed**: small and large voltages in both directions.
     **Source**: Tao, Kokotovic, "Adaptive Control of Systems with Actuator and Sensor Nonlinearities" (1996),
     chapter 2.

@@ -10,7 +10,7 @@ from .base import AbstractEffect, ParameterRange, Scalars, State
 
 
 class QuadraticDrag(AbstractEffect):
-    """Quadratic drag: T_d = c w |w|, of a fan, a pump, or the air around a fast rotor.
+    """Quadratic drag: T_d = c w |w|, as of a fan, a pump, or the air around a fast rotor.
 
     **Fields**: `drag_Nms2_rad2`, c in N m s^2/rad^2, > 0.
     **Excitation needed**: four speeds or more, the highest several times the lowest.

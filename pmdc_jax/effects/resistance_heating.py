@@ -18,7 +18,7 @@ class ResistanceHeating(AbstractEffect):
     `rise` is the relative rise of the resistance over its value at the start of a run, alpha times the
     temperature rise; alpha = 0.00393 / K for copper.
 
-    **Fields**: `rise_per_W`, relative rise for one watt of copper loss in the long run, 1/W (alpha times the
+    **Fields**: `rise_per_W`, relative rise per watt of copper loss in steady state, 1/W (alpha times the
     thermal resistance), > 0; `time_constant_s`, thermal time constant of the winding in s, > 0.
     **Excitation needed**: high current for at least a third of the time constant, then low.
     **Source**: Hughes, Drury, "Electric Motors and Drives", 5th edition, section 1.7; IEC 60034-1.

@@ -1,4 +1,4 @@
-"""What high current does to the magnetic circuit."""
+"""Effects of high current on the magnetic circuit."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 class TorqueConstantSaturation(AbstractEffect):
     """Saturated torque: Kt / (1 + c i^2) in place of Kt.
 
-    Armature reaction weakens the flux under load, and with it the back-EMF as far as the brushes see it.
+    Armature reaction weakens the flux under load, and with it the back-EMF, as far as that appears at the brushes.
 
     **Fields**: `per_A2`, c in 1/A^2, > 0: at a current of 1 / sqrt(c) the torque per ampere is halved; `emf_share`, e,
-    the share of that by which the back-EMF falls, between 0 and 1.
+    between 0 and 1: the relative loss of back-EMF is e times that of torque per ampere.
     **Excitation needed**: high and low torque at known load, or accelerations with high and with low current.
     **Source**: Fitzgerald, Kingsley, Umans, "Electric Machinery", 6th edition, section 7.3 (armature reaction).
     """
@@ -31,7 +31,7 @@ class TorqueConstantSaturation(AbstractEffect):
     variable: ClassVar = "current"
     ranges: ClassVar = {
         "per_A2": ParameterRange("1/A^2", 1e-10, 1e4),
-        # estimates scatter about its ends
+        # beyond 0 and 1, because estimates scatter around them
         "emf_share": ParameterRange("", -0.5, 1.5, "linear"),
     }
 

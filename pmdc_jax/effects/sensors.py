@@ -1,4 +1,4 @@
-"""What sensors do to current and speed."""
+"""Effects of sensors on current and speed."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 class SpeedSensorLag(AbstractEffect):
-    """Lag: the reported speed y follows the speed w with dy/dt = (w - y) / time_constant_s, from y = w.
+    """Lag: the reported speed y follows the speed w with dy/dt = (w - y) / time_constant_s; a run starts with y = w.
 
     **Fields**: `time_constant_s`, in s, > 0; tachometer filters have 1 to 50 ms.
-    **Excitation needed**: speed that changes within a few time constants; the current shows that it does.
+    **Excitation needed**: speed that changes within a few time constants, and a measured current, which shows it.
     **Source**: Astrom, Wittenmark, "Computer-Controlled Systems", 3rd edition, section 7.4 (filters).
     """
 
@@ -54,10 +54,10 @@ class SpeedSensorLag(AbstractEffect):
 
 
 class SpeedSensorDelay(AbstractEffect):
-    """Delay: the reported speed is y(t) = w(t - delay_s); before a run began, w as it began.
+    """Delay: the reported speed is y(t) = w(t - delay_s); before the start of a run, w is taken as at the start.
 
     **Fields**: `delay_s`, in s, > 0; bus and filter delays are 0.1 to 50 ms.
-    **Excitation needed**: fast changes of speed; a lag rolls them off, a delay only moves them.
+    **Excitation needed**: fast changes of speed; a lag attenuates them, a delay only shifts them.
     **Source**: Astrom, Wittenmark, "Computer-Controlled Systems", 3rd edition, section 2.3 (time delays).
     """
 

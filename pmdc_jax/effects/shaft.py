@@ -1,4 +1,4 @@
-"""A load that hangs on the rotor by an elastic shaft, with or without play."""
+"""A load that is coupled to the rotor by an elastic shaft, with or without play."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class _TwoInertias(AbstractEffect):
     load_share: Scalars
 
     def slip(self, state: State) -> Scalars:
-        """rad/s by which the rotor is faster than the load."""
+        """Speed of the rotor relative to the load, rad/s."""
         return state.speed - state.extra[self.states[0]]
 
     def parameters(self, motor: Motor, state: State) -> Motor:
-        """The motor with the inertia that is left on its own side of the shaft."""
+        """The motor with only the inertia on its own side of the shaft."""
         del state
         return eqx.tree_at(lambda m: m.J, motor, motor.J * (1 - self.load_share))
 
@@ -46,11 +46,11 @@ class ShaftCompliance(_TwoInertias):
     (1 - s) J dw/dt = Kt i - f w - T_s,  s J dw_L/dt = T_s - T_load,
     d twist/dt = w - w_L,  T_s = stiffness twist + damping (w - w_L).
 
-    A run begins with both ends at one speed and the shaft twisted by the load; in a fit, as the run itself says.
+    A run starts with both ends at one speed and a shaft twisted by the load; a fit estimates the initial twist.
 
     **Fields**: `stiffness_Nm_rad` in N m/rad, > 0; `damping_Nms_rad` in N m s/rad, > 0; `load_share`, s, the share
     of the inertia behind the shaft, between 0 and 1.
-    **Excitation needed**: steps fast enough to ring the shaft, sampled ten times a period.
+    **Excitation needed**: steps fast enough to excite the shaft's resonance, sampled ten times a period.
     **Source**: Zhang, Furusho, "Speed control of two-inertia system by PI/PID control", IEEE Transactions on
     Industrial Electronics 47 (2000), doi:10.1109/41.847907.
     """
@@ -84,14 +84,14 @@ class GearBacklash(_TwoInertias):
     """Backlash: a compliant shaft, or gear, that carries torque only once its play is taken up.
 
     As `shaft_compliance`, with T_s = stiffness overlap + damping (w - w_L) while the teeth touch, where overlap = twist
-    -+ gap/2 is how far they are pressed together, and nothing inside the gap; teeth push and never pull. Without gap
-    it is nearly a compliant shaft. A run begins with the teeth in contact on the side that the load presses them to,
-    or in the middle without load; in a fit, as the run itself says.
+    -+ gap/2 is how far they are pressed together, and T_s = 0 inside the gap; teeth push and never pull. Without a gap
+    it is nearly a compliant shaft. A run starts with the teeth in contact on the side to which the load presses them,
+    or in the middle without load; a fit estimates each run's initial twist.
 
     **Fields**: `stiffness_Nm_rad` of the teeth in contact in N m/rad, > 0; `damping_Nms_rad` in N m s/rad, > 0;
     `load_share`, s, the share of the inertia behind the gear, between 0 and 1; `gap_rad`, the whole play in rad, > 0,
-    usually 0.001 to 0.1 at the load, and as many times that at the motor as a reduction gear has turns.
-    **Excitation needed**: torque through zero again and again, at two amplitudes.
+    usually 0.001 to 0.1 at the load, and the reduction ratio times that at the motor.
+    **Excitation needed**: torque that passes through zero repeatedly, at two amplitudes.
     **Source**: Nordin, Gutman, "Controlling mechanical systems with backlash: a survey", Automatica 38
     (2002), doi:10.1016/S0005-1098(02)00047-X, section 2.
     """
@@ -129,12 +129,12 @@ class GearBacklash(_TwoInertias):
         return self.gap_rad
 
     def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
-        """As it stays until its teeth touch or part."""
+        """The effect as it stays until its teeth touch or part."""
         del seconds
         return self._held(self.gap_rad, self.teeth(state))
 
     def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars:
-        """The rate at which teeth ring: a step is then a third of the time that they touch before they bounce."""
+        """The natural frequency of teeth in contact, rad/s: a step is then a third of the half period of a bounce."""
         del current
         share = self.load_share
         return jnp.sqrt(self.stiffness_Nm_rad / (motor.J * share * (1 - share)))
@@ -145,7 +145,7 @@ class GearBacklash(_TwoInertias):
         return {"gear_speed": speed, "gear_twist": twist}
 
     def linear(self) -> AbstractEffect:
-        """Without gap."""
+        """Without a gap, always in contact."""
         one = jnp.ones_like(self.gap_rad)
         return self._held(0.0 * one, Teeth(one, one, one))
 
@@ -159,7 +159,7 @@ class GearBacklash(_TwoInertias):
 
 
 class FixedTeeth(GearBacklash):
-    """Backlash whose teeth go on touching, on one side, or not touching, as they stood."""
+    """Backlash whose teeth stay in contact on one side, or stay apart, as in `stood`."""
 
     stood: Teeth
 

@@ -13,7 +13,7 @@ class StribeckFriction(AbstractEffect):
     """Stribeck friction: T_f = (T_c + (T_s - T_c) exp(-(w / w_s)^2)) sign(w), and |T_f| <= T_s at rest.
 
     **Fields**: `coulomb_Nm`, T_c, friction at speed in N m; `static_Nm`, T_s, break-away torque in N m, usually
-    1.1 to 3 T_c; `speed_rad_s`, w_s, over which the one becomes the other, in rad/s; all > 0.
+    1.1 to 3 T_c; `speed_rad_s`, w_s, over which friction falls from T_s to T_c, in rad/s; all > 0.
     **Excitation needed**: fast levels, and slow motion through standstill in both directions.
     **Source**: Olsson, Astrom, Canudas de Wit, Gafvert, Lischinsky, "Friction models and friction
     compensation", European Journal of Control 4 (1998), doi:10.1016/S0947-3580(98)70113-X, equation (5).

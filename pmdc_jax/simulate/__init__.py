@@ -33,7 +33,7 @@ __all__ = [
 
 @double_precision
 def simulate(motor: Motor, recording: Run) -> Recording:
-    """Simulate a motor on what drives a recording, from the recorded start.
+    """Simulate a motor with the inputs of a recording, from its recorded initial state.
 
     **Arguments**: `motor`, of scalars; `recording` or its file, whose voltage (or current, or torque), load and time
     stamps are used; its first current and speed, where recorded, are the initial state, otherwise the motor
@@ -44,7 +44,7 @@ def simulate(motor: Motor, recording: Run) -> Recording:
     """
     motor = jax.tree.map(jnp.asarray, motor)
     (recording,) = recordings_of(recording, to_simulate=True)
-    # whatever was recorded of the speed, what is simulated is that of the moment
+    # the instantaneous speed is simulated, even if the recorded one is a mean
     even = attrs.evolve(uniform(recording), averaging=None)
     tape = Tape.from_recordings([even], unloaded=True)
     outputs = free_run(motor, tape)

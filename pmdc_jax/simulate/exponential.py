@@ -1,4 +1,4 @@
-"""Functions phi_k of small matrices, with which a linear system is stepped exactly."""
+"""Functions phi_k of small matrices, for the exact step of a linear system."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def product(
 def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
     """phi_0 to phi_count of z / 2 and of z.
 
-    phi_0(z) = exp(z), phi_k(z) = sum_j z^j / (j + k)!. A Taylor series of a scaled-down z, doubled up again by
-    phi_p(2 z) = 2^-p (phi_0 phi_p + sum_{j=1..p} phi_j / (p - j)!). Doubled is phi_0 - 1, not phi_0, so that slow
-    modes lose no digits and stiff ones stay dead.
+    phi_0(z) = exp(z), phi_k(z) = sum_j z^j / (j + k)!. By a Taylor series of a scaled-down z, and repeated doubling,
+    phi_p(2 z) = 2^-p (phi_0 phi_p + sum_{j=1..p} phi_j / (p - j)!). phi_0 - 1 is doubled instead of phi_0, so that
+    slow modes lose no digits and stiff ones stay decayed.
 
     **Source**: Hochbruck, Ostermann, "Exponential integrators", Acta Numerica 19 (2010), section 2;
     Skaflestad, Wright, Applied Numerical Mathematics 59 (2009), equation (2.5), doi:10.1016/j.apnum.2008.03.021.

@@ -20,13 +20,13 @@ from .propagator import Propagator, along_grids, pick_grid, steps_in_sample
 from .solver import HeldInput, Input, Walk, held_step_and_mean, walk
 from .tape import BLOCK, Samples, Tape
 
-# Samples in a stride of linear motors, a power of two that divides a block: measured, 8 and 32 are slower.
+# Samples in a stride of linear motors, a power of two that divides a block; 8 and 32 were measured to be slower.
 STRIDE = 16
 
-# Of current (A^2) and speed (rad^2/s^2)
+# Sums of squared errors of current (A^2) and speed (rad^2/s^2)
 Errors = tuple[Float[Array, " population"], Float[Array, " population"]]
 
-# Candidates a thread takes at least, linear and with effects: below this, handing them over costs more than it saves.
+# Fewest candidates for a thread, linear and with effects: with fewer, threads cost more than they save.
 LINEAR_SHARE, SHARE = 256, 32
 
 
@@ -40,39 +40,42 @@ def squared_errors(motors: Motor, tape: Tape) -> Errors:
     least = SHARE if motors.effects else LINEAR_SHARE
     cores = CORES if jax.default_backend() == "cpu" else 1
     shares = max(1, min(cores, size // least))
-    if shares == 1 or size % shares:  # unequal shares would be compiled once more
+    if shares == 1 or size % shares:  # shares of another size would need another compilation
         return _errors(motors, tape, np.asarray(0), 1)
 
     def part(k: int) -> Errors:
         return jax.block_until_ready(_errors(motors, tape, np.asarray(k), shares))
 
-    # XLA walks a population on one core; the cores share it out among them
+    # XLA runs the loop over samples on one core, so the population is divided among threads
     parts = side_by_side(part, range(shares))
     current, speed = (jnp.asarray(np.concatenate(errors)) for errors in zip(*parts, strict=True))
     return current, speed
 
 
-# The widest vectors, where the processor has them: by default XLA uses half of their width.
+# The widest vectors that the processor has: by default XLA uses half of that width.
 @partial(compiled, options={"xla_cpu_prefer_vector_width": 512})
 def _errors(motors: Motor, tape: Tape, share: Int[Array | np.ndarray, ""], shares: int) -> Errors:
-    """Of one of the equal shares of a population."""
+    """Errors of one of the equal shares of a population."""
     if shares > 1:
         size = motors.R.shape[0] // shares
         mine = [
             jax.lax.dynamic_slice_in_dim(x, share * size, size) for x in jax.tree.leaves(motors)
         ]
-        # a slice that is merged into the arithmetic costs it its vector instructions
+        # the barrier keeps XLA from fusing the slices into the arithmetic, which would lose its vector instructions
         motors = jax.tree.unflatten(jax.tree.structure(motors), jax.lax.optimization_barrier(mine))
     return _errors_with_effects(motors, tape) if motors.effects else _errors_of_linear(motors, tape)
 
 
 def _with_its_sample(tape: Tape) -> tuple[Samples, Samples, Bool[Array, " blocks"] | None]:
-    """What was measured, and its weights, with every mean speed over a sample at that sample instead of the next; and
-    which blocks have such speeds, None where none has. One over two samples is in time as it is."""
+    """Measurements and weights, with mean speeds over the last sample moved to where that sample begins; and which
+    blocks have such speeds, None if no speed of the tape is a mean.
+
+    A mean over the last sample and the next is centred already, and stays.
+    """
     if tape.averaging is None:
         return tape.measured, tape.weight, None
     over_last = (jnp.asarray(tape.averaging)[:, 0] == 1)[tape.run]
-    # nobody recorded the mean over the last sample of a run
+    # the mean from the last sample of a run on was not recorded
     ends = jnp.append(jnp.asarray(tape.begins)[1:], True)
 
     def moved(signal: Samples) -> Float[Array, "blocks 2 samples"]:
@@ -91,13 +94,13 @@ def _seen_speed(
     over_last: Bool[Array, " blocks"] | None,
     block: Int[Array, ""],
 ) -> Scalars:
-    """The speed of a sample, or the mean over it, as the block reports it."""
+    """The speed at a sample, or, in blocks that report means, the mean from there to the next sample."""
     if mean is None or over_last is None:
         return speed
     return jnp.where(over_last[block], mean, speed)
 
 
-# Where motors are, and their squared errors of current and speed so far
+# State of the motors, and their squared errors of current and speed so far
 Gathered = tuple[State, tuple[Scalars, ...]]
 
 
@@ -105,12 +108,12 @@ class Stride(NamedTuple):
     """The exact step of linear motors over `STRIDE` samples: x(end) = whole x(start) + from_rest inputs."""
 
     whole: Matrix  # exp(A h)^STRIDE
-    # by what drives at each sample, then by the loads
+    # first axis: the driving values at all samples, then the loads
     from_rest: Float[Array, "inputs 2 population"]
 
 
 def _stride(along: Propagator) -> Stride:
-    """Doubled up from one sample: what the earlier inputs have done is carried on through the later half."""
+    """By repeated doubling from one sample: the response to the earlier inputs is propagated through the later half."""
     whole, from_rest = along.whole[:, :, None], along.inputs[:, :, None]
     for _ in range(STRIDE.bit_length() - 1):
         from_rest = jnp.concatenate([product(whole, from_rest), from_rest], axis=2)
@@ -120,9 +123,9 @@ def _stride(along: Propagator) -> Stride:
 
 
 def _starts(stride: Stride, state: State, value: Samples, load: Samples) -> tuple[State, State]:
-    """Linear motors at the end of a block, and at the start of each of its strides, (strides, population).
+    """States of linear motors at the end of a block, and at the start of each of its strides, (strides, population).
 
-    The inputs of all strides go through one matrix product, so that little is left to do one after the other.
+    The inputs of all strides go through one matrix product, so that little sequential work is left.
     """
     inputs = jnp.concatenate([_in_strides(value), _in_strides(load)], axis=1)
     pushes = jnp.tensordot(inputs, stride.from_rest, 1)
@@ -141,10 +144,10 @@ def _in_strides(samples: Float[Samples, "... samples"]) -> Float[Array, "... str
 
 
 def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
-    """One share of linear motors: its blocks one after another, the whole population in the state.
+    """Errors of one share of linear motors: block after block, with the whole share in the state.
 
-    The strides of a block go side by side: XLA makes one loop over strides and candidates of all the
-    arithmetic of a stride.
+    The strides of a block run in parallel: XLA fuses all the arithmetic of a stride into one loop over strides and
+    candidates.
     """
     grids = along_grids(motors, tape)
     strides, rows = jax.vmap(_stride)(grids), BLOCK // STRIDE
@@ -160,7 +163,7 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
         state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
         stride = jax.tree.map(lambda leaf: leaf[grid], strides)
         end, starts = _starts(stride, state, *samples[:2])
-        # samples of a stride in front, behind them a row for each stride
+        # the samples of a stride along the first axis, then a row for each stride
         by_sample = jax.tree.map(lambda s: jnp.moveaxis(_in_strides(s), -1, 0)[..., None], samples)
 
         def sample(
@@ -189,7 +192,7 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
     start = Walk(motors.initial_state(zero, zero), (nothing, nothing))
     saveat = diffrax.SaveAt(t1=True)
     errors = walk(HeldInput(advance), start, tape.value.shape[0], saveat).seen
-    # rows are summed only here: XLA would merge the sum into the arithmetic and give up vector instructions
+    # rows are summed only here: XLA would fuse the sum into the arithmetic, which would lose its vector instructions
     current, speed = (e[0].sum(0) for e in errors)
     return _finite(current), _finite(speed)
 
@@ -199,7 +202,8 @@ def _finite(errors: Float[Array, " population"]) -> Float[Array, " population"]:
 
 
 def _taken(grids: Float[Array, "grids ..."], grid: Int[Array, ""]) -> Float[Array, "..."]:
-    """One grid's part, by a matrix product: XLA would merge an index into the arithmetic and give up vectors."""
+    """One grid's entry, by a matrix product: XLA would fuse indexing into the arithmetic, which would lose its vector
+    instructions."""
     if len(grids) == 1:
         return grids[0]
     return jnp.tensordot(jnp.where(jnp.arange(len(grids)) == grid, 1.0, 0.0), grids, 1)
@@ -212,7 +216,7 @@ def _repeated(
 
 
 def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
-    """One share of motors with effects, from sample to sample."""
+    """Errors of one share of motors with effects, sample by sample."""
     grids, steps = along_grids(motors, tape), steps_in_sample(motors, tape)
     delay = motors.speed_delay()
     measured, weights, over_last = _with_its_sample(tape)

@@ -1,5 +1,5 @@
-"""What does not change from step to step of a motor whose input is held: how its linear part moves, exactly, by what
-weights the rest acts, and how long a step may be."""
+"""Step matrices, which stay the same from step to step: the exact step of a motor's linear part and the weights of
+the rest; and the number of steps in a sample."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Held = Float[Array, "*#batch"]
 Vector = tuple[Scalars, ...]  # current, speed, and the states of linear effects
 Slow = dict[str, Scalars]  # the states that are not in the linear part, by name
 
-# Steps into which a sample is divided at most
+# Largest number of steps in a sample
 FINEST = 32
-# Over one step what is not in the linear part lets a state fall by no more than exp(-1)
+# Largest product of an effect's fastest rate (`fastest_rate`) and the step: a decay by no more than exp(-1)
 STIFF = 1.0
 
 
 class Stages(NamedTuple):
-    """Weights of ETDRK4 for whatever is not linear."""
+    """Weights of ETDRK4 for whatever is not in the linear part."""
 
     half: Matrix  # exp(A h / 2)
     half_input: Matrix  # h / 2 phi_1(A h / 2)
@@ -43,19 +43,19 @@ class Stages(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """By what the rest of a motor with effects acts over one step."""
+    """Weights over one step for a motor with effects."""
 
     push: Matrix  # h phi_1(A h)
     linear: Matrix  # A
     step: Float[Array, "*#batch"]  # s
-    stages: Stages | None = None  # where the rest changes within a step
-    # what the torque does that teeth begin or cease to pass within a step, in rad of twist, where there are teeth
+    stages: Stages | None = None  # if the rest varies within a step
+    # response to the torque that teeth begin or cease to pass within a step, per rad of compression; None without teeth
     contact: Float[Array, "powers n *#batch"] | None = None
 
 
 class Mean(NamedTuple):
-    """By what the mean of a state over a step is made: all that makes its end, with phi_(k + 1) for every phi_k, and so
-    as exact. The last three of a motor whose rest changes within a step."""
+    """Matrices for the mean of the state over a step: those for its end, with phi_(k + 1) in place of every phi_k, and
+    so as accurate. The last three are for a motor with `Stages`."""
 
     whole: Matrix  # phi_1(A h)
     inputs: Float[Array, "n 2 *#batch"]  # h phi_2(A h) B
@@ -67,36 +67,38 @@ class Mean(NamedTuple):
 
 
 class Look(NamedTuple):
-    """To where within every sample a late sensor looks."""
+    """The instant within each sample at which a delayed sensor sees the speed."""
 
-    along: Propagator  # a step up to there
-    share: Held  # of the sample, more than 0 and at most all of it
+    along: Propagator  # one of the equal steps up to that instant
+    share: Held  # of the sample up to that instant, 0 < share <= 1
 
 
 class Propagator(NamedTuple):
-    """Everything about a motor and a step length that does not change from step to step.
+    """Step matrices of a motor for one step length h.
 
-    x(h) = whole x + inputs u is exact for the linear motor. With effects the step is one of the equal parts of
-    a sample, and the inputs are part of the rest, for which there are `weights`.
+    x(h) = whole x + inputs u is exact for the linear motor. With effects, h is one of the equal steps in a sample, and
+    the inputs act through `weights`, like everything else that is not in the linear part.
     """
 
     whole: Matrix  # exp(A h)
     inputs: Float[Array, "n 2 *#batch"]  # h phi_1(A h) B
     weights: Weights | None = None
-    apart: Propagator | None = None  # the same while teeth do not touch
-    # h (phi_2 - phi_1 / 2)(A h): by what a drive acts that rises within a step, beyond what its mean does
+    apart: Propagator | None = None  # the same while the teeth do not touch
+    # h (phi_2 - phi_1 / 2)(A h): effect of a drive's rise within a step, beyond that of its mean
     ramp: Matrix | None = None
-    look: Look | None = None  # where a sensor is late
-    mean: Mean | None = None  # where a speed is reported as a mean
+    look: Look | None = None  # for a delayed sensor
+    mean: Mean | None = None  # for a speed that is reported as a mean
 
 
 @eqx.filter_jit  # one trace serves all grids
 def propagator(
     motor: Motor, step: Held, drive: Drive, straight: bool = False, averaged: bool = False
 ) -> Propagator:
-    """Exact step of the linear part over `step` seconds, and the weights for what the effects add; of teeth that touch,
-    and beside it of such that do not. `straight` asks for what a drive needs that is not held, `averaged` for the mean
-    of the state."""
+    """Exact step of the linear part over `step` seconds, and the weights for what the effects add.
+
+    With teeth it is made for teeth that touch, and its `apart` for those that do not. `straight` asks for the matrices
+    of a drive that varies linearly instead of being held, `averaged` for those of the mean of the state.
+    """
     A, B = _linear_part(motor, drive)
     along = _by_linear_part(motor, step, A, B, straight, averaged)
     teeth = motor.toothed
@@ -134,7 +136,7 @@ def _by_linear_part(
     doi:10.1006/jcph.2002.6995.
     """
     staged = not motor.affine
-    ramps = straight and not staged  # stages see how a drive rises
+    ramps = straight and not staged  # stages evaluate the drive as it rises
     (half0, half1, *_), phi = phi_functions(A * step, (3 if staged else 1 + ramps) + averaged)
     stages = weights = None
     if staged:
@@ -153,12 +155,12 @@ def _by_linear_part(
 
 
 def _ramp(step: Held, phi: Sequence[Matrix]) -> Matrix:
-    """By what a drive acts that rises within a step, beyond what its mean does."""
+    """Weight of a drive's rise within a step, beyond the effect of its mean."""
     return step * (phi[2] - phi[1] / 2)
 
 
 def _rest(step: Held, phi: Sequence[Matrix]) -> tuple[Matrix, Matrix, Matrix]:
-    """By what the stages of ETDRK4 act: the first one, those in the middle, and the last."""
+    """Weights of the stages of ETDRK4: the first, the two in the middle, and the last."""
     first = step * (phi[1] - 3 * phi[2] + 4 * phi[3])
     return first, step * (2 * phi[2] - 4 * phi[3]), step * (4 * phi[3] - phi[2])
 
@@ -170,14 +172,14 @@ def _mean(
     ramps: bool,
     staged: bool,
 ) -> Mean:
-    """The mean over a step, by `phi` from phi_1 on in place of phi_0."""
+    """Matrices for the mean over a step; `phi` begins with phi_1 instead of phi_0."""
     push = step * phi[1]
     ramp = _ramp(step, phi) if ramps else None
     return Mean(phi[0], product(push, B), push, ramp, *(_rest(step, phi) if staged else ()))
 
 
 def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 *#batch"]]:
-    """A and B of the linear motor, with the states of its linear effects."""
+    """A and B of the linear motor, extended by the states of its linear effects."""
     A, B = motor.state_space(drive)
     linear = tuple(e for effect in motor.effects if (e := effect.linear()) is not None)
     if not linear:
@@ -194,7 +196,7 @@ def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 
 
 
 def along_grids(motor: Motor, tape: Tape) -> Propagator:
-    """The propagator of one step on every grid of the tape, stacked in front."""
+    """The propagators of one step on every grid of the tape, stacked along the first axis."""
     steps, delay = steps_in_sample(motor, tape), motor.speed_delay()
 
     def of_grid(g: int) -> Propagator:
@@ -221,14 +223,14 @@ def pick_grid(
 
 
 def steps_in_sample(motor: Motor, tape: Tape) -> int | Int[Array, ""]:
-    """Into how many equal steps the samples of a tape are divided."""
+    """Number of equal steps in a sample of the tape."""
     current = jnp.max(jnp.abs(jnp.asarray(tape.measured)[:, 0]))
     return steps_within(motor, tape.longest, current)
 
 
 def steps_within(motor: Motor, seconds: float, current: Scalars) -> int | Int[Array, ""]:
-    """Into how many equal steps that time is divided, so that none is longer than the effects allow at currents up to
-    `current` in A."""
+    """Number of equal steps in this time, at most `FINEST`, so that none is longer than the effects allow at currents
+    up to `current` in A."""
     allowed = [e.longest_step for e in motor.effects if e.holds or e.contact_state or not e.affine]
     if not allowed:
         return 1
@@ -236,7 +238,7 @@ def steps_within(motor: Motor, seconds: float, current: Scalars) -> int | Int[Ar
     rates = [rate for e in motor.effects if (rate := e.fastest_rate(motor, current)) is not None]
     if not rates:
         return least
-    # of a population, as most of it needs: what a wild one needs would hold up all
+    # the median of a population: an outlier that needs far more steps would slow down all of it
     needed = jnp.ceil(jnp.median(reduce(jnp.maximum, rates)) * seconds / STIFF)
     return jnp.clip(jnp.nan_to_num(needed, nan=FINEST), least, FINEST).astype(int)
 
@@ -253,5 +255,5 @@ def vector(motor: Motor, state: State) -> Vector:
 
 
 def state_of(motor: Motor, x: Vector, slow: Slow) -> State:
-    """The state of such a vector and of the states that are not in the linear part."""
+    """The state from its `vector` and the states that are not in the linear part."""
     return State(x[0], x[1], slow | dict(zip(linear_states(motor), x[2:], strict=True)))

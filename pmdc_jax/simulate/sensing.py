@@ -1,5 +1,5 @@
-"""What is reported of a simulated motor: by a sensor that is late, or as a mean over a sample, as differences of angles
-are."""
+"""Reported outputs of a simulated motor: a speed may be delayed by its sensor, or be a mean over a sample, as
+differences of angles are."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ def outputs(
     steps: int | Int[Array, ""],
     mean: State | None = None,
 ) -> Float[Array, "outputs ..."]:
-    """Reported current and speed, and what else a report of the latter may be made of.
+    """Current and speed at a sample, and the other values from which `reported` makes a delayed or averaged speed.
 
-    For a late sensor the speed where it looks within the sample that follows; of a speed that is reported as a mean
-    that over this sample, of the `mean` state there, and its part up to where a late sensor looks.
+    With a delayed sensor: the speed at the instant it sees, between this sample and the next. With averaging: the mean
+    speed from this sample to the next, that of the `mean` state. With both: also the part of this mean that comes from
+    before that instant.
     """
     seen = [*motor.sensors(state)]
     part_mean = None
@@ -41,7 +42,7 @@ def outputs(
 
 
 def reports_of(along: Propagator) -> int:
-    """How many `outputs` there are."""
+    """Number of `outputs`."""
     late, averaged = along.look is not None, along.mean is not None
     return 2 + late + averaged + (late and averaged)
 
@@ -49,8 +50,10 @@ def reports_of(along: Propagator) -> int:
 def reported(
     motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]
 ) -> Float[Array, "blocks 2 samples"]:
-    """Current and speed of these `outputs`, the latter as late as the motor's sensor reports it, and as the mean that
-    the tape says; before a run began, as it began."""
+    """Current and speed from `outputs`, with the speed delayed by the motor's sensor and averaged as the tape says.
+
+    Before the start of a run the speed is taken to be that at the start.
+    """
     delay = motor.speed_delay()
     if delay is None and tape.averaging is None:
         return seen
@@ -72,7 +75,7 @@ def reported(
         mean, *parts = others
 
         def ending_within(k: Int[Array, " all"]) -> Float[Array, " all"]:
-            """The mean over one sample's time until a late sensor looks within sample k, or this ends."""
+            """The mean over one sample time up to the instant seen within sample k, or up to its end without delay."""
             if share is None:
                 return sample(mean, k, begun)
             (part,) = parts

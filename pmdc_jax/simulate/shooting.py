@@ -1,8 +1,8 @@
-"""Free run of one motor, and its sensitivities: all blocks side by side, joined by multiple shooting.
+"""Free run of one motor and its sensitivities by multiple shooting: all blocks in parallel, then joined.
 
-One motor on a long record is sequential work. Here every block runs at once from a guessed start, together
-with the derivatives of its samples and its end by that start; Newton's method then joins the blocks. For a
-linear motor one pass is exact; with effects a few are, because a motor forgets how it began.
+Simulating one motor over a long record is sequential work. Here all blocks run at once from guessed starts, together
+with the derivatives of their samples and ends with respect to those starts; Newton's method then joins the blocks. One
+pass is exact for a linear motor; with effects a few suffice, because the influence of a start decays.
 
 **Source**: Bock, Plitt, "A multiple shooting algorithm for direct solution of optimal control problems",
 IFAC Proceedings 17 (1984), doi:10.1016/S1474-6670(17)61205-9; Chartier, Philippe, Computing 51 (1993),
@@ -30,21 +30,22 @@ from .tape import BLOCK, Tape
 
 T = TypeVar("T")
 
-# The last pass corrects to first order what is left, so the joint error is about the square of this.
+# Relative gap between blocks below which no further pass follows. The last pass still corrects the gap to first order,
+# so the remaining error is about the square of this.
 JOINED = 1e-4
 
-# Passes after which a fit gives up on a motor, whose blocks hardly depend on how they begin but by chance: teeth that
-# rattle in their play. There are as many passes as a run has blocks, and nothing to learn from the derivatives.
+# Passes after which a fit gives up on a motor. Where teeth rattle in their play, the end of a block depends chaotically
+# on its start: joining takes as many passes as a run has blocks, and the derivatives are of no use.
 PASSES = 32
 
 Starts = Float[Array, "blocks states"]
 Start = Float[Array, " states"]  # of one block
-# A motor, and its propagators on the grids of a tape; or their derivatives, by columns in front
+# A motor, and its propagators on the grids of a tape; or their derivatives, with the columns as first axis
 Prepared = tuple[Motor, Propagator]
 
 
 class Pass(NamedTuple):
-    """All blocks once, from given starts. Derivatives are by the columns: parameters, load offset, start."""
+    """All blocks simulated once from given starts. Columns of the derivatives: parameters, load offset, start."""
 
     seen: Float[Array, "samples outputs blocks"]
     d_seen: Float[Array, "samples columns outputs blocks"]
@@ -53,23 +54,23 @@ class Pass(NamedTuple):
 
 
 class RunUnknowns(NamedTuple):
-    """What belongs to each run alone: how it begins, and a constant load on top of the recorded one."""
+    """Unknowns of each run: its initial state, and a constant load on top of the recorded one."""
 
     current: Float[Array, " runs"]  # A
     speed: Float[Array, " runs"]  # rad/s
     load_offset: Float[Array, " runs"]  # N m
-    angle: Float[Array, " runs"]  # of the rotor, rad: it matters only to effects that depend on it
-    twist: Float[Array, " runs"]  # of a spring beyond what the load does to it, rad
+    angle: Float[Array, " runs"]  # of the rotor, rad; used only by effects that depend on it
+    twist: Float[Array, " runs"]  # of a spring, beyond that due to the load, rad
 
     @classmethod
     def as_recorded(cls, tape: Tape) -> RunUnknowns:
-        """As the tape has them: no load besides the recorded one, and no spring wound up."""
+        """The values on the tape, with no load besides the recorded one and no additional twist."""
         current, speed = jnp.asarray(tape.initial).T
         none = jnp.zeros_like(current)
         return cls(current, speed, none, jnp.asarray(tape.angle), none)
 
 
-# How many columns the sensitivities have for them
+# Columns of the sensitivities for the unknowns of a run
 LOCAL = len(RunUnknowns._fields)
 
 
@@ -79,7 +80,7 @@ def free_run(
 ) -> Float[Array, "blocks 2 samples"]:
     """Current (A) and speed (rad/s) as the sensors report them, simulated freely.
 
-    `own` is what belongs to each run alone, as recorded unless given.
+    `own`, the unknowns of each run, is by default as recorded.
     """
     own = own or RunUnknowns.as_recorded(tape)
     prepared = (motor, along_grids(motor, tape))
@@ -98,10 +99,10 @@ def sensitivities(
     tape: Tape,
     own: RunUnknowns | None = None,
 ) -> tuple[Float[Array, "blocks 2 samples"], Float[Array, "blocks 2 samples columns"]]:
-    """Free run, and its derivatives by `parameters` and then by what belongs to the run alone.
+    """Free run, and its derivatives with respect to `parameters` and then to the unknowns of the sample's own run.
 
-    `assemble` makes a motor of the parameters; the rest is as in `free_run`. A motor whose runs depend on their
-    beginning by chance gives NaN.
+    `assemble` makes a motor from the parameters; the rest is as in `free_run`. All is NaN if `PASSES` passes do not
+    join the blocks, as for a motor that depends chaotically on its initial state.
     """
     own = own or RunUnknowns.as_recorded(tape)
     count = len(parameters)
@@ -123,7 +124,7 @@ def sensitivities(
     columns = count + 1 + states
     d_prepared = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_prepared)
 
-    # joined with few columns, for that takes several passes; the derivatives are then those at the joined starts
+    # joining takes several passes, with the columns of the start only; one more pass at the joined starts has all
     still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
     starts, *_ = _join(prepared, still, tape, own, begins, PASSES)
     passed = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
@@ -154,13 +155,13 @@ def _along_columns(
 
 
 def _among_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "... columns"]:
-    """Derivatives by parameters and load offset, spread out among all columns."""
+    """Derivatives with respect to parameters and load offset, padded with zeros to all columns."""
     zero = jnp.zeros((*own.shape[:-1], 2))
     return jnp.concatenate([own[..., :count], zero, own[..., count:], zero], -1)
 
 
 def _begins(motor: Motor, own: RunUnknowns, tape: Tape) -> Starts:
-    """How the run of each block begins."""
+    """Initial state of the run of each block."""
     first = jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs))
     load = jnp.asarray(tape.load)[first, 0] + own.load_offset
     state = motor.initial_state(own.current, own.speed, load, own.angle)
@@ -173,7 +174,8 @@ def _begins(motor: Motor, own: RunUnknowns, tape: Tape) -> Starts:
 
 
 def _guess(motor: Motor, own: RunUnknowns, tape: Tape, begins: Starts) -> Starts:
-    """Starts of the blocks by what was measured there: most of the way, and rarely all of it."""
+    """Guessed starts of the blocks: current and speed as measured there, or else as the run begins, and the angle from
+    the measured speed."""
     known = (tape.weight[:, :, 0] > 0).T
     current, speed = jnp.where(known, tape.measured[:, :, 0].T, begins[:, :2].T)
     length = jnp.asarray(tape.sample_time)[tape.grid]
@@ -187,8 +189,8 @@ def _guess(motor: Motor, own: RunUnknowns, tape: Tape, begins: Starts) -> Starts
     return jnp.where(jnp.asarray(tape.begins)[:, None], begins, guess)
 
 
-# The starts of the last pass, the joined ones, that pass (None where nobody asks for its results, only for their
-# shapes), the largest gap that was left, and how many passes there were
+# Starts of the last pass, joined starts, that pass (None where only the shapes of its results are wanted), largest
+# relative gap that it left, and number of passes
 Joining = tuple[Starts, Starts, Any, Float[Array, ""], Int[Array, ""]]
 
 
@@ -200,14 +202,15 @@ def _join(
     begins: Starts,
     most: int | None = None,
 ) -> tuple[Starts, Starts, Pass]:
-    """Starts at which every block begins where the one before it ended; those of the last pass, and that pass.
+    """Joined starts, at which every block begins where the one before it ended; starts of the last pass; and that pass.
 
-    `still` are the derivatives of the prepared motor by the starts: none. What `most` passes do not join is NaN.
+    `still` are the derivatives of the prepared motor with respect to the starts, all zero. The joined starts are NaN if
+    `most` passes are not enough.
     """
     motor = prepared[0]
     guess = _guess(motor, own, tape, begins)
-    # a linear motor is joined exactly by the correction of its one pass; any other block is exact once the one
-    # before it is, so this ends however hard the motor
+    # the correction of a single pass joins a linear motor exactly; otherwise every pass makes at least one more block
+    # of each run exact, so this ends for any motor
     exact = motor.affine and not motor.switches
     passes = 1 if exact else min(most or len(guess) + 1, len(guess) + 1)
 
@@ -231,7 +234,7 @@ def _join(
     return joined, starts, run
 
 
-@eqx.filter_jit  # one trace serves `_join` and, of the same columns, whoever else asks
+@eqx.filter_jit  # one trace serves `_join` and other callers with as many columns
 def _pass(
     prepared: Prepared,
     d_prepared: Prepared,
@@ -240,10 +243,10 @@ def _pass(
     starts: Starts,
     load_offset: Float[Array, " runs"],
 ) -> Pass:
-    """Run every block from its start, with tangents. The last columns are the starts themselves."""
+    """Simulate every block from its start, with derivatives, whose last columns are with respect to the start."""
     motor, grids = prepared
     d_motor, d_grids = d_prepared
-    # where all blocks share one grid they share its matrices: copies of each would be read at every step
+    # if there is one grid only, all blocks share its matrices: a copy for each would be read at every step
     grid = tape.grid if tape.sample_time.shape[0] > 1 else jnp.zeros(1, int)
     along, drive = pick_grid(grids, tape, grid)
     along = _blocks_last(along, 0)
@@ -298,7 +301,7 @@ def _pass(
 
 
 def _turned(before: State, after: State, turn: Float[Array, " blocks"]) -> State:
-    """The state with the rotor turned as it was measured to, where it was."""
+    """The state after a sample, with the rotor turned by the measured angle `turn` where it is not NaN."""
     if "angle" not in after.extra:
         return after
     followed = before.extra["angle"] + jnp.nan_to_num(turn)
@@ -315,9 +318,9 @@ def _stitch(
 ) -> Starts:
     """Newton's correction: each block starts where the corrected one before it ends.
 
-    Far from the end of the road Newton's straight line overshoots. So with `limits`, the size of the states and
-    after how much of them all is as before: whole periods of a state are carried on as they are, and no
-    other change of a start is taken to grow along the block, for a motor forgets how it began.
+    Far from the solution Newton's linear extrapolation overshoots. Therefore `limits`, the sizes and the periods of the
+    states (see `_recurrence`): a change of a start by whole periods is passed on to the end of the block unchanged, and
+    any other change may not grow along the block, because the influence of a start decays.
     """
     by_start = jnp.moveaxis(passed.d_end[-starts.shape[1] :], 0, -1)
 
@@ -341,14 +344,14 @@ def _stitch(
 
 
 def _recurrence(motor: Motor) -> Float[Array, " states"]:
-    """After how much of each state all is as before; zero for never."""
+    """Period of each state: a shift by it changes nothing else. Zero without one."""
     known = {name: p for effect in motor.effects for name, p in effect.repeats_after().items()}
     return jnp.stack(
         [jnp.zeros(()), jnp.zeros(()), *(known.get(n, jnp.zeros(())) for n in motor.states)]
     )
 
 
-# How a block begins or ends, and its derivatives by all columns
+# State at the start or end of a block, and its derivatives with respect to all columns
 WithTangents = tuple[Start, Float[Array, "states columns"]]
 
 
@@ -360,7 +363,7 @@ def _stitch_tangents(
     d_begins: Float[Array, "columns blocks states"],
     count: int,
 ) -> tuple[Starts, Float[Array, "blocks states columns"]]:
-    """The same, and the derivatives of the starts by all columns."""
+    """`_stitch` without limits, and the derivatives of the starts with respect to all columns."""
     states = starts.shape[1]
     by_column = jnp.moveaxis(passed.d_end, 0, -1)
     by_start = by_column[..., -states:]
@@ -388,7 +391,7 @@ def _stitch_tangents(
 
 
 def _blocks_last(along: Propagator, axis: int) -> Propagator:
-    # a block's step length is a scalar, its matrices have two axes in front of the batch
+    # as the batch axis, which comes after the two axes of the matrices
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), along)
 
 

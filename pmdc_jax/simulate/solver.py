@@ -29,23 +29,23 @@ from .propagator import (
 )
 from .switches import computed_once, contact_correction, mended_mean, stick_or_reverse
 
-Time = float | Float[Array | np.ndarray, ""]  # of the solver: it counts steps
+Time = float | Float[Array | np.ndarray, ""]  # of the solver: a count of steps
 
 
 class Input(NamedTuple):
-    """What acts on a motor over a step."""
+    """The inputs of a motor over one step."""
 
     drive: Drive
-    value: Scalars  # of what drives, V, A or N m: held, or the mean of a straight line
+    value: Scalars  # driving voltage V, current A or torque N m: held, or its mean if it varies linearly
     load: Scalars  # N m
-    rise: Scalars | None = None  # of the value in all, where it is not held
+    rise: Scalars | None = None  # change of the driving value over the step; None if it is held
 
     def at(self, share: Scalars | float) -> Scalars:
-        """The value after such a share of the step."""
+        """The driving value after this share of the step."""
         return self.value if self.rise is None else self.value + (share - 0.5) * self.rise
 
     def part(self, middle: Scalars | float, share: Scalars | float) -> Input:
-        """What acts over such a share of the step, about its `middle`."""
+        """The inputs over a part of the step: `middle` and length of the part as shares of the step."""
         if self.rise is None:
             return self
         return self._replace(value=self.at(middle), rise=share * self.rise)
@@ -60,10 +60,10 @@ def held_step(
 ) -> State:
     """The state one sample later, in `steps` equal steps, for one of which `along` is made.
 
-    Motors whose effects leave them linear: exact. Otherwise the linear part is exact and the rest goes by the
-    four stages of ETDRK4, in which dry elements act in the direction the step began with, and teeth touch or not as
-    they then did. A step in which a held state crosses zero, or teeth touch or part, is then mended (`switches`), so
-    that friction sticks at exactly zero and a gear knocks without any smoothing.
+    Exact for a motor whose effects leave it linear. Otherwise the linear part is exact and the rest is integrated by
+    the four stages of ETDRK4. Throughout a step dry elements act in the direction of motion at its start, and teeth
+    touch or not as they did then. A step in which a held state crosses zero, or teeth touch or part, is then corrected
+    (see `switches`), so that friction sticks at exactly zero and a gear knocks without any smoothing.
     """
     return held_step_and_mean(motor, along, acting, state, steps)[0]
 
@@ -75,8 +75,10 @@ def held_step_and_mean(
     state: State,
     steps: int | Int[Array, ""] = 1,
 ) -> tuple[State, State | None]:
-    """The state one sample later as by `held_step`, and its mean over this sample, as exact but where something
-    switches within a step: None where `along` is not made for it."""
+    """The state one sample later as by `held_step`, and its mean over this sample.
+
+    The mean is as accurate as the state, except in a step in which something switches; None if `along` has no `mean`.
+    """
     if along.weights is None:
         return _linear_step(motor, along, acting, state)
     if isinstance(steps, int) and steps == 1:
@@ -103,7 +105,7 @@ def _linear_step(
         driven = _times(made_by.inputs, inputs)
         if bend is not None:
             driven = _add(driven, _times(_known(made_by.ramp), bend))
-        # the state last: two fused multiply-adds, where a sum of sums would take an addition more
+        # onto the driven part: two fused multiply-adds, where adding two sums would take one more addition
         return _times(made_by.whole, x, driven)
 
     current, speed = reached(along)
@@ -115,7 +117,7 @@ def _linear_step(
 
 
 def _bend(motor: Motor, acting: Input, state: State) -> Vector:
-    """By what the rates of a step differ between its ends, of a drive that rises on a straight line."""
+    """Change of the derivative from start to end of a step due to a drive that varies linearly."""
     low, high = (
         vector(motor, motor.derivative(state, acting.at(end), acting.load, acting.drive))
         for end in (0.0, 1.0)
@@ -157,8 +159,8 @@ def _step(
             hold, ahead = motor.grip(holds, still), motor.grip(holds, state_of(motor, moved, slow))
             if hold is not None and ahead is not None:
                 push, decay = weights.push[:, row] * unit, -weights.linear[row, row] * weights.step
-                # a branch, though most blocks have something to mend: without it XLA computes the whole step anew
-                # for each intermediate result, and a population takes twice as long
+                # a branch, although most blocks need the correction: without it XLA recomputes the whole step for
+                # each intermediate result, and a population takes twice as long
                 moved = jax.lax.cond(
                     jnp.any(jnp.sign(x[row]) * moved[row] <= 0),
                     partial(stick_or_reverse, row),
@@ -174,7 +176,7 @@ def _step(
 def _unswitched(
     motor: Motor, along: Propagator, weights: Weights, acting: Input, state: State
 ) -> tuple[State, State, State | None]:
-    """The rate at which a step begins, and how it ends and its mean if dry elements and teeth go on as they began."""
+    """Derivative at the start of a step, and the state at its end and its mean if nothing switches within it."""
     h, linear, always = weights.step, weights.linear, jnp.all(weights.step > 0)
     mean, averaging = None, along.mean
     moving = (jnp.sign(state.current), jnp.sign(state.speed))
@@ -199,7 +201,7 @@ def _unswitched(
         return state_of(motor, begun, s0), state_of(motor, moved, _shifted(slow, h, s0)), mean
 
     def rest(x: Vector, slow: Slow, when: float) -> tuple[Vector, Slow]:
-        """What the linear part leaves over, and the rates of the states that are not in it."""
+        """Derivatives less those of the linear part, and derivatives of the states that are not in it."""
         rate, slow = rates(x, slow, when)
         return computed_once((_add(rate, _times(-linear, x)), slow), always)
 
@@ -212,7 +214,7 @@ def _unswitched(
     n3, s3 = rest(end, _shifted(slow, h, s2), 1.0)
 
     def on_top(of: Vector, first: Matrix, middle: Matrix, last: Matrix) -> Vector:
-        """The stages on top of what the linear part does."""
+        """The contributions of the stages, added to that of the linear part."""
         return _add(of, _times(first, n0), _times(middle, _add(n1, n2)), _times(last, n3))
 
     moved = on_top(moved, first, middle, last)
@@ -235,7 +237,7 @@ def _shifted(slow: Slow, weight: Held, rates: Slow) -> Slow:
 
 
 def _times(matrix: Matrix, x: Vector, onto: Vector | None = None) -> Vector:
-    """Matrix times vector, on top of another vector where one is given."""
+    """Matrix times vector, plus `onto` if given."""
 
     def row(i: int) -> Scalars:
         products = [matrix[i, j] * x_j for j, x_j in enumerate(x)]
@@ -249,17 +251,18 @@ def _add(*vectors: Vector) -> Vector:
 
 
 class Walk(NamedTuple):
-    """Carried through the solve: the motor's state, and what is seen or gathered on the way."""
+    """What is carried through the solve: the motor's state, and the outputs or sums of errors so far."""
 
     state: Any
     seen: Any
 
 
 class HeldInput(diffrax.AbstractSolver):
-    """Advances the motor, or a whole population of it, by held samples; time counts steps.
+    """Advances one motor or a whole population with held inputs; its time counts steps.
 
-    `advance(walk, step number) -> walk` applies `held_step`. Population and blocks lie inside the state, so
-    that diffrax's loop condition stays a scalar; `vmap` outside would copy every buffer at every step.
+    `advance(walk, step number) -> walk` applies `held_step`, over one sample or one block. Population and blocks are
+    axes of the state, so that diffrax's loop condition stays a scalar; an outer `vmap` would copy every buffer at
+    every step.
     """
 
     advance: Callable[[Walk, Int[Array, ""]], Walk]
@@ -292,7 +295,7 @@ class HeldInput(diffrax.AbstractSolver):
 
 def walk(solver: HeldInput, start: Walk, steps: int, saveat: diffrax.SaveAt) -> Any:
     """Take `steps` steps through diffrax and return what `saveat` asks for."""
-    # diffrax traces its step twice, and that of a motor with effects takes half a second
+    # jitted, because diffrax traces its step twice, which takes half a second for a motor with effects
     traced_once = HeldInput(jax.jit(solver.advance))
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: y),

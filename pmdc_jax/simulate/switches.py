@@ -1,7 +1,7 @@
-"""What switches within a step: dry elements that come to rest, teeth that touch or part.
+"""Switching within a step: dry elements that come to rest, teeth that touch or part.
 
-A step is taken as if all went on as it began, and then mended: until the switch the motor moved as it did, and what
-is new from then on pushes for what is left of the step.
+A step is first taken as if nothing switched, and then corrected: up to the switch its motion is right, and from then
+on the change of the force acts for the rest of the step.
 """
 
 from __future__ import annotations
@@ -20,15 +20,17 @@ from .exponential import Matrix, phi_functions
 
 T = TypeVar("T")
 
-# Shares of a step at which it is known what a push does that lasts so long: those of Chebyshev
+# Durations of a push, as shares of a step, at which its response is evaluated: Chebyshev nodes
 SHARES = (1 - np.cos(np.pi * (np.arange(6) + 0.5) / 6)) / 2
 TO_POWERS = np.linalg.inv(np.vander(SHARES, increasing=True))
 
 
 def computed_once(values: T, always: Bool[Array, ""]) -> T:
-    """The same values, behind a branch that is always taken: XLA, which would compute them anew for each of all that
-    depends on them, computes them once. A play of teeth is simulated in half the time. An accelerator, which would
-    have to ask the processor what to do, computes them anew."""
+    """The same values, behind a branch that is always taken, so that XLA on CPU computes them once.
+
+    Without it XLA recomputes them for everything that depends on them; with it a gear with backlash is simulated in
+    half the time. On an accelerator, where a branch has to wait for the host, the values are left as they are.
+    """
 
     def behind_a_branch(values: T) -> T:
         return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
@@ -39,8 +41,8 @@ def computed_once(values: T, always: Bool[Array, ""]) -> T:
 def contact_response(
     A: Matrix, push: Float[Array, "n *#batch"], step: Float[Array, ""]
 ) -> Float[Array, "powers n *#batch"]:
-    """What a constant push does that lasts for a share of the step until its end, over that share: the coefficients
-    of h phi_1(share A h) push as a polynomial of the share."""
+    """Response, at the end of a step, to a constant push over the last `share` of it, divided by that share: the
+    coefficients of h phi_1(share A h) push as a polynomial in the share."""
     at = SHARES.reshape(-1, *[1] * A[0, 0].ndim)
     _, (_, phi1) = phi_functions(step * at * A[:, :, None], 1)
     pushed = step * (phi1 * push[None, :, None]).sum(1)
@@ -55,13 +57,14 @@ def contact_correction(
     rate: State,
     after: State,
 ) -> tuple[Scalars, ...]:
-    """What the end of a step changes by where teeth touch or part within it.
+    """Correction to the end of a step in which teeth touch or part.
 
-    When they do is found by the parabola through what decides it, at both ends of the step, with its slope at the
-    begin; and so is how the torque goes on that they then begin or cease to pass.
+    The instant of switching, and the torque that the teeth begin or cease to pass from then on, come from parabolas
+    through overlap and compression at both ends of the step, with their slopes at its start.
 
-    **Arguments**: `contact`, what that torque does to the motor as it then is; `rate`, of the state at the begin;
-    `after`, how the step ends if they do not.
+    **Arguments**: `step`, s; `contact`, the response to that torque of the motor as it is after the switch (see
+    `contact_response`); `before`, `rate`, the state at the start and its derivative; `after`, the state at the end if
+    nothing switched.
     """
     start = effect.teeth(before)
     touched = start.touch
@@ -74,7 +77,7 @@ def contact_correction(
     first, slope = jax.jvp(stand, (before,), (rate,))
     last, slope = stand(after), slope * step
     bend = last - first - slope
-    # teeth touch once both rise through zero, and part once the push falls through it
+    # teeth touch once overlap and compression have both risen through zero, and part once compression falls through it
     way = jnp.where(touched, -1.0, 1.0)
     goes = (way * first < 0) & (way * last > 0)
     root = jnp.sqrt(jnp.where(goes, slope**2 - 4 * bend * first, 1.0))
@@ -85,8 +88,8 @@ def contact_correction(
     new = jnp.where(switches, way * side, 0.0)
     torque = new * (first[1] + when * (slope[1] + when * bend[1]))
     rise, bend = new * (slope[1] + 2 * when * bend[1]), new * 2 * bend[1]
-    # a push that goes on as a parabola: the polynomial of a constant one, integrated once for its slope, twice for
-    # its bend
+    # the torque varies as a parabola: the response to a constant one, integrated once for its slope and twice for its
+    # curvature
     sizes, power = [], left
     for p in range(1, len(contact) + 1):
         sizes.append(power * (torque + left / (p + 1) * (rise + left / (p + 2) * bend)))
@@ -108,13 +111,15 @@ def stick_or_reverse(
     push: Float[Array, "n *#batch"],
     decay: Scalars,
 ) -> tuple[Scalars, ...]:
-    """Mend a step in which the state that a dry element holds comes to zero, or is there.
+    """Correct a step in which the state that a dry element acts on reaches zero, or starts there.
 
-    For a part of the step the state moved on as it did before; for the rest of it the element takes
-    whatever, within its limits, ends the step at zero: if it can, the state sticks, at exactly zero.
-    `grips` are those at zero and where the step would end; `begun` is the driving torque (or voltage) at the start
-    of the step; `push` is what a unit of it over the whole step adds to the state, which by itself falls by
-    exp(-`decay`).
+    Until it reaches zero, the state moves as computed. For the rest of the step the element exerts whatever force,
+    within its limits, brings the state to zero at the end: if the limits allow it, the state sticks at exactly zero.
+
+    **Arguments**: `row`, the index of the state; `grips`, the limits at zero and at the end of the step; `before`,
+    `after`, the state vector at both ends of the uncorrected step; `begun`, the driving torque (N m) or voltage (V) at
+    the start; `push`, what a unit of it over the whole step adds to the state vector; `decay`, the decay rate of the
+    state times the step.
 
     **Source**: time-stepping with set-valued forces, Moreau (1988), doi:10.1007/978-3-7091-2624-0_1, with the
     response of the exact linear step in place of h / J.
@@ -124,9 +129,10 @@ def stick_or_reverse(
     # the guarded denominator keeps the derivative finite where the branch is not taken
     fall = jnp.where(crosses & (direction != 0), before[row] - after[row], 1.0)
     share = jnp.where(direction == 0, 0.0, before[row] / fall)
-    # what a push from then on does, over what it does in the whole step: the state moves on an exponential
+    # response to a push over the rest of the step, relative to one over the whole step: the motion is exponential
     rest = jnp.maximum((1.0 - share) / (1.0 + jnp.expm1(-decay) * share), 1e-12)
-    # what already acts against the motion; then the same force, chosen anew, over what is left of the step
+    # the force that has opposed the motion so far, and the one that would bring the state to zero at the end; beyond
+    # the limits at zero the state slides on, with the mean of the limits at both ends
     hold, (backward, forward) = grips[0], jax.tree.map(lambda a, b: (a + b) / 2, *grips)
     acting = jnp.where(direction > 0, forward, jnp.where(direction < 0, -backward, 0.0))
     needed = acting + after[row] / (push[row] * rest)
@@ -135,19 +141,19 @@ def stick_or_reverse(
     taken = jnp.where(direction == 0, needed - _breakaway_excess(hold, begun, needed), taken)
     change = jnp.where(crosses, (acting - taken) * rest, 0.0)
     sticks = crosses & (taken == needed)
-    # the other states follow this one, so they answer with the square of the time that is left
+    # the other states respond only through this one, so with the square of the remaining time
     mended = [x + push[k] * change * rest for k, x in enumerate(after)]
     mended[row] = jnp.where(sticks, 0.0, after[row] + push[row] * change)
     return tuple(mended)
 
 
 def mended_mean(before: Scalars, unmended: Scalars, mended: Scalars) -> Scalars:
-    """By how much the mean speed over a step changes as its end is mended.
+    """Change of the mean speed over a step due to the correction of its end.
 
-    The change grows on a straight line from where the speed would come to zero; the same from half the step on, where
+    The change grows linearly from the instant at which the speed reaches zero, or from the middle of the step where
     something else switches.
 
-    **Arguments**: the speed as the step begins, and as it ends without and with what switches.
+    **Arguments**: the speed at the start of the step, and at its end without and with the correction.
     """
     crosses = before * unmended <= 0
     fall = jnp.where(crosses & (before != 0), before - unmended, 1.0)
@@ -156,10 +162,10 @@ def mended_mean(before: Scalars, unmended: Scalars, mended: Scalars) -> Scalars:
 
 
 def _breakaway_excess(hold: Grip, begun: Scalars, mean: Scalars) -> Scalars:
-    """What is left over, as a mean over the step, of a force beyond what holds a state at zero.
+    """Mean over the step of a force on a state at rest, as far as it exceeds what holds the state there.
 
-    The force goes on a straight line from what it has `begun` with, through its `mean` at half the step; where it
-    comes to exceed the limit the state breaks loose, and not before.
+    The force varies linearly, from `begun` at the start through `mean` in the middle of the step; the state breaks
+    loose at the instant at which the force exceeds the limit.
     """
     end = 2 * mean - begun
     toward = jnp.sign(end)

@@ -21,23 +21,23 @@ if TYPE_CHECKING:
 # on the host as laid out, or on the device
 Samples = Array | np.ndarray
 
-# Samples in a block. Blocks are walked one after another for a population, side by side for one motor: long
-# enough that a block forgets most of how it began, short enough that filling up the last one costs little.
+# Samples in a block. A population is simulated block after block, one motor in all blocks in parallel: long enough that
+# the influence of a block's start has mostly decayed at its end, short enough that padding the last one costs little.
 BLOCK = 128
 
 
 class Tape(eqx.Module):
-    """Runs laid end to end; a run begins with a new block, and its last block is filled up with weight 0.
+    """Runs laid end to end; a run begins with a new block, and its last block is padded with samples of weight 0.
 
-    So that recordings of another number or length meet the same array shapes, and with them programs that are compiled
-    already, runs of a few blocks of which nothing was measured follow.
+    Empty runs and blocks follow, so that recordings that differ in number or length have the same array shapes and
+    share compiled programs.
 
     A sample time, a drive (voltage, current or torque) and a rotor that is free or held make a *grid*; blocks of
     one grid share the exact step. The drive and the load of sample k hold until sample k + 1; a drive with a `rise`
-    goes on straight until then.
+    varies linearly until then.
     """
 
-    value: Float[Samples, "blocks samples"]  # mean over each sample of what drives: V, A or N m
+    value: Float[Samples, "blocks samples"]  # mean of the drive over each sample: V, A or N m
     load: Float[Samples, "blocks samples"]  # N m, zero where unknown
     measured: Float[Samples, "blocks 2 samples"]  # current A, speed rad/s; zero where missing
     weight: Float[Samples, "blocks 2 samples"]  # 1 where measured, else 0
@@ -50,13 +50,14 @@ class Tape(eqx.Module):
     load_unknown: Bool[Samples, " runs"]
     angle: Float[Samples, " runs"]  # rad at the start, zero where unknown
     angle_known: Bool[Samples, " runs"]
-    # rad over each sample by the measured speed, where the simulated rotor is to turn as the real one; else NaN
+    # angle in rad over each sample by the measured speed, where the simulated rotor is to follow it; else NaN
     turn: Float[Samples, "blocks samples"]
-    # longest sample time, rounded up to few values: it decides how a sample is divided
+    # longest sample time in s, rounded up to 1 ms times a power of two: it decides into how many steps a sample is
+    # divided, for which programs are compiled
     longest: float = eqx.field(static=True)
-    # by how much what drives rises over each sample; None where all that drives is held
+    # change of the drive over each sample; None if all drives are held
     rise: Float[Samples, "blocks samples"] | None = None
-    # how much of a reported speed is its mean over the last sample, and over the next; None where all of it is as it is
+    # shares in the reported speed of its mean over the last sample and over the next; None if no speed is a mean
     averaging: Float[Samples, "runs 2"] | None = None
 
     @classmethod
@@ -71,9 +72,9 @@ class Tape(eqx.Module):
 
         **Arguments**: `recordings`, each with a uniform sample time (see `pmdc_jax.simulate.uniform`);
         `unloaded` declares the load of runs without a load column to be zero instead of unknown; `follow` makes
-        the rotor turn as measured where the speed was: torques that depend on its angle keep step with
-        the real ones, which a free run would lose after a few turns; `straight`, whether voltages and torques go on
-        a straight line from sample to sample instead of being held.
+        the rotor turn by the measured speed where there is one, so that torques that depend on its angle stay in phase
+        with the real ones, which a free run would lose after a few turns; `straight`, whether voltages and torques
+        vary linearly from sample to sample instead of being held.
         """
         runs = [_Run(recording, straight) for recording in recordings]
         rises = straight or any(recording.uneven is not None for recording in recordings)
@@ -109,7 +110,7 @@ class Tape(eqx.Module):
             tape["begins"][first] = True
             first += run.blocks
         tape["run"][first : first + spare] = np.arange(len(runs), len(runs) + spare)
-        # what is filled up begins anew in every block, so that nobody waits for it to be joined
+        # every block of padding begins anew, so that joining the blocks never waits for it
         tape["begins"][first:], tape["turn"][first:] = True, 0.0
 
         def of_runs(values: Iterable[float | Sequence[float]]) -> np.ndarray:
@@ -136,11 +137,11 @@ class Tape(eqx.Module):
 
     @property
     def runs(self) -> int:
-        """Number of runs, with those of which nothing was measured."""
+        """Number of runs, including the empty ones."""
         return self.initial.shape[0]
 
     def of_runs(self, runs: Sequence[int]) -> Tape:
-        """The tape of some runs, filled up to a usual shape with blocks of others, of which nothing counts."""
+        """The tape of some runs, padded to one of few array shapes with blocks of other runs at weight 0."""
         mine = np.isin(np.asarray(self.run), runs)
         blocks = np.argsort(~mine, kind="stable")[: _round_up(int(mine.sum()))]
         counting = replace(self, weight=self.weight * mine[:, None, None])
@@ -149,7 +150,7 @@ class Tape(eqx.Module):
         return replace(counting, **{n: s if s is None else s[blocks] for n, s in signals.items()})
 
     def blocks_of(self, run: int) -> Bool[np.ndarray, " blocks"]:
-        """Which blocks are of one run."""
+        """Mask of the blocks of one run."""
         return np.asarray(self.run) == run
 
     def samples_of(
@@ -163,7 +164,7 @@ class Tape(eqx.Module):
         return int(np.asarray(self.grid)[self.blocks_of(run)][0])
 
     def drive_of(self, run: int) -> Drive:
-        """What drives one run."""
+        """The drive of one run."""
         return Drive(*(float(np.asarray(share)[self.grid_of(run)]) for share in self.drive))
 
     def sample_time_of(self, run: int) -> float:
@@ -172,7 +173,7 @@ class Tape(eqx.Module):
 
 
 class _Run:
-    """One recording as the tape needs it: what drives it, what was measured, how it starts."""
+    """One recording as the tape needs it: drive, load, measurements and initial state."""
 
     def __init__(self, recording: Recording, straight: bool) -> None:
         self.length = len(recording.time)
@@ -195,7 +196,7 @@ class _Run:
         else:
             self.rise = np.diff(value, append=value[-1]) if goes_on else np.zeros(self.length)
             self.value = value + self.rise / 2
-        # rounded: two runs of one clock must share a grid, whatever the last bits of their time stamps
+        # rounded: two runs of one clock must share a grid even if their time stamps differ in the last bits
         self.grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held)
         self.initial = (_first(self.current), _first(self.speed))
 
@@ -218,7 +219,7 @@ def _first(samples: np.ndarray | None) -> float:
 
 
 def _round_up(blocks: int) -> int:
-    """To a power of two where little is to be simulated, then to multiples of 32, then by a sixteenth at most."""
+    """Up to a power of two from 8 to 32; then to a multiple of 32, or of 1/16 of the next power of two if larger."""
     power = max(8, _power_of_two(blocks))
     step = min(power, max(32, power // 16))
     return -(-blocks // step) * step

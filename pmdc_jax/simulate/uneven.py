@@ -1,7 +1,7 @@
-"""A record of an uneven clock beside the even one that it is laid on: what drives between, and how the motor moves.
+"""Records with uneven time stamps: their drive on the solver's even clock, and the simulated motion at their stamps.
 
-The solver steps along the even clock. What drives an even sample is then a straight line with the mean and the first
-moment of what was recorded, and a recorded sample is compared with the motion within the even sample where it lies.
+The solver steps along the even clock. The drive over an even sample is a straight line with the mean and the first
+moment of the recorded drive, and a recorded sample is compared with the motion within the even sample where it lies.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from ..motor import Drive, Motor
 if TYPE_CHECKING:
     from ..recording import Recording
 
-# Eigenvalues are taken apart to this share, at which a difference quotient has as many digits right
+# Closer eigenvalues are moved apart to this relative distance, which is then the relative error, too
 NEAR = 1e-7
-# Series are better than quotients below
+# Below this size of the argument a series is more accurate than the quotient
 SMALL = 3e-3
 
 
 class Pieces(NamedTuple):
-    """Stretches of time in which no sample begins, neither of the record nor of the even clock."""
+    """The intervals between neighbouring instants at which a sample begins, of the record or of the even clock."""
 
-    time: Float[np.ndarray, " pieces"]  # s, when it begins
-    begins: Float[np.ndarray, " pieces"]  # s after its even sample
+    time: Float[np.ndarray, " pieces"]  # start, s
+    begins: Float[np.ndarray, " pieces"]  # start after that of the even sample, s
     length: Float[np.ndarray, " pieces"]  # s
-    even: Int[np.ndarray, " pieces"]  # the even sample that it is a part of
-    value: Float[np.ndarray, " pieces"]  # of what drives, as it begins
-    slope: Float[np.ndarray, " pieces"]  # 1/s
+    even: Int[np.ndarray, " pieces"]  # index of the even sample that it is a part of
+    value: Float[np.ndarray, " pieces"]  # driving value at the start, V, A or N m
+    slope: Float[np.ndarray, " pieces"]  # of the driving value, per second
     load: Float[np.ndarray, " pieces"]  # N m, zero where unknown
 
 
 def flows_on(run: Recording) -> bool:
-    """Whether what drives goes straight from sample to sample: a measured current does, whatever a voltage may do."""
+    """Whether the drive always varies linearly from sample to sample, as a measured current does."""
     return run.drive == "current"
 
 
 def pieces_of(run: Recording, straight: bool) -> Pieces:
-    """The pieces of a run on an even clock, driven as recorded: held, or `straight` from sample to sample."""
+    """The pieces of a run on an even clock, with the recorded drive held, or linear between samples if `straight`."""
     record, step = run.recorded, run.sample_time
     drive = np.asarray(getattr(record, record.drive))
     edges = np.union1d(np.append(run.time, run.time[-1] + step), record.time)
@@ -56,8 +56,8 @@ def pieces_of(run: Recording, straight: bool) -> Pieces:
 
 
 def mean_and_rise(run: Recording, pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
-    """What drives each even sample of a run: its mean, and the rise of the straight line that has its first moment
-    too."""
+    """Mean of the drive over each even sample of a run, and the rise over it of the straight line that also has the
+    drive's first moment."""
     _, begins, length, even, value, slope, _ = pieces
     step, rise = run.sample_time, slope * length
     middle = begins + length / 2 - step / 2
@@ -76,8 +76,8 @@ def seen_at_record(
 ) -> Float[np.ndarray, "recorded 2"]:
     """Current A and speed rad/s at the time stamps of a record, from those `seen` at the samples of its `even` clock.
 
-    Exact for the linear motor, and for what the true drive does otherwise than the straight line that has its mean
-    and its first moment. What effects do besides within an even sample grows in proportion to time.
+    Exact for the linear motor, including the difference between the recorded drive and the straight line in its place.
+    The contribution of effects is taken to grow in proportion to time within an even sample.
     """
     pieces = pieces_of(even, straight)
     time, begins, length, at, value, slope, loads = pieces
@@ -88,7 +88,7 @@ def seen_at_record(
     after, held, rising = _advances(A, np.concatenate([[step], begins, length]))
 
     def moved(by: slice, of: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-        """From those even samples on, along the straight line."""
+        """Linear motion from even samples `of` on, along the straight line, by some of the `_advances`."""
         rate = seen[of] @ A.T + np.outer(line[of], B[:, 0]) + np.outer(load[of], B[:, 1])
         bend = np.outer(rise[of] / step, B[:, 0])
         return seen[of] + _times(held[by], rate) + _times(rising[by], bend)
@@ -96,7 +96,8 @@ def seen_at_record(
     whole, beginning, along = slice(0, 1), slice(1, len(at) + 1), slice(len(at) + 1, None)
     missed = seen[1:] - moved(whole, np.arange(len(seen) - 1))
     missed = np.append(missed, np.zeros((1, 2)), 0)[at] * (begins / step)[:, None]
-    # what the true drive does otherwise: by the pieces of an even sample, and then from sample to sample
+    # the response to the drive's difference from the straight line: over the pieces of an even sample, and then from
+    # sample to sample
     apart = value - line[at] - rise[at] * begins / step
     pushed = np.outer(apart, B[:, 0]) + np.outer(loads - load[at], B[:, 1])
     pushed = _times(held[along], pushed)
@@ -113,7 +114,7 @@ def _through_pieces(
     pushed: Float[np.ndarray, "pieces 2"],
     samples: int,
 ) -> tuple[Float[np.ndarray, "pieces 2"], Float[np.ndarray, "samples 2"]]:
-    """From rest as each even sample begins: the state before each of its pieces, and at its end."""
+    """States before each piece and at the end of each even sample, from rest at the start of that sample."""
     state, before = np.zeros((samples, 2)), np.empty((len(at), 2))
     nth = np.arange(len(at)) - np.searchsorted(at, at)
     for n in range(nth.max() + 1):
@@ -126,7 +127,7 @@ def _through_pieces(
 def _accumulated(
     after: Float[np.ndarray, "2 2"], pushed: Float[np.ndarray, "samples 2"]
 ) -> Float[np.ndarray, "samples 2"]:
-    """x(k) = `after` x(k - 1) + `pushed`(k) from rest, by sums over twice as many samples each time."""
+    """x(k) = `after` x(k - 1) + `pushed`(k) from rest, by sums over a number of samples that doubles each time."""
     total, count = pushed.copy(), 1
     while count < len(total):
         total[count:] += total[:-count] @ after.T
@@ -139,10 +140,10 @@ def _times(matrices: Float[np.ndarray, "#n 2 2"], x: Float[np.ndarray, "n 2"]) -
 
 
 def _advances(A: Float[np.ndarray, "2 2"], length: np.ndarray) -> list[np.ndarray]:
-    """Over each length of time, what becomes of a state, of a rate that is held, and of one that grows from nothing
+    """Response over each length of time h to an initial state, to a constant rate, and to a rate that grows from zero
     by 1/s: phi_0, h phi_1 and h^2 phi_2 of A h, each (lengths, 2, 2).
 
-    By Newton's interpolation on the eigenvalues, for there are many lengths and one matrix.
+    By Newton's interpolation on the eigenvalues, because there are many lengths and one matrix.
 
     **Source**: Higham, "Functions of Matrices" (2008), definition 1.4.
     """

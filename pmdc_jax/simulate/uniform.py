@@ -1,4 +1,4 @@
-"""A recording as the solver needs it: one sample time, and speed even where only the angle was measured."""
+"""A recording as the solver needs it: with one sample time, and with a speed if only the angle was measured."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from ..clock import GAP, is_even
 from ..errors import InputError
 from ..recording import OVER_LAST, Recording
 
-# An even clock ticks no more often than so many times for every sample
+# Most ticks of an even clock per recorded sample
 MOST = 20
-# ... and any that leaves this share of the most samples a tick of their own is as good
+# An even clock is good enough if this share of the samples has ticks of their own, relative to the best clock
 ALIKE = 0.98
 
 
 def uniform(recording: Recording) -> Recording:
     """The recording on a uniform grid of time, with speed in place of angle.
 
-    Evenly sampled recordings keep their samples, and have the mean speed over every sample where only the angle was
-    measured. Otherwise whatever drives and the load, which hold between
-    samples, are averaged over each interval of the grid, so that no volt-second is lost, and the outputs are
-    interpolated linearly; inside gaps, and past the end, they are missing (NaN). The record goes along as `uneven`.
-    A rotor that stands still throughout is held: there is nothing to learn from its speed.
+    Evenly sampled recordings keep their samples; if only the angle was measured, their speed is its mean over every
+    sample. Otherwise voltage, torque and load, which hold between samples, are averaged over each interval of the grid,
+    so that no volt-second is lost. Current and speed are interpolated linearly; inside gaps, and past the end, they are
+    missing (NaN). The record is kept as `uneven`. A rotor that stands still throughout is taken as held, because its
+    speed tells nothing.
 
-    **Raises**: `InputError` where a gap is so long that next to nothing was recorded.
+    **Raises**: `InputError` if gaps are so long that the grid has more than `MOST` ticks per sample.
     """
     if recording.stands_still:
         recording = attrs.evolve(recording, speed=None, angle=None, held=True)
@@ -62,9 +62,9 @@ def uniform(recording: Recording) -> Recording:
 
 
 def _even_clock(time: np.ndarray) -> np.ndarray:
-    """An even clock begun with the first sample: that of the mean step of time, but for gaps, or of the median,
-    whichever leaves more samples a tick of their own; rounded if that hardly matters, so that runs of one clock share
-    a grid."""
+    """An even clock that starts at the first sample. Its step is the mean step of time without gaps, or the median,
+    whichever gives more samples a tick of their own. The mean is rounded to two digits where that hardly matters, and
+    otherwise to three like the median, so that runs of one clock share a grid."""
     steps, passed = np.diff(time), time - time[0]
     typical = np.median(steps)
     mean = np.mean(steps[steps <= GAP * typical])
@@ -94,7 +94,7 @@ def _interpolate(time: np.ndarray, samples: np.ndarray, grid: np.ndarray) -> np.
 
 def _slope(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
     """The derivative of a cubic spline, rad/s: a difference would be a mean over two steps, which looks like a lag."""
-    from scipy.interpolate import CubicSpline  # late, for it takes long to load
+    from scipy.interpolate import CubicSpline  # here, because it is slow to import
 
     known = ~np.isnan(angle)
     speed = np.full_like(angle, np.nan)
