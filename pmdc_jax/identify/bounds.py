@@ -46,9 +46,9 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
 def effect_bounds(
     effects: Sequence[type[AbstractEffect]], recordings: Sequence[Recording]
 ) -> dict[str, tuple[float, float]]:
-    """Search bounds of the parameters of effects, by their units: three decades up to about the torque, speed, voltage
-    or current of the recordings, time constants from a fifth of a sample to three runs. Parameters in other units, or
-    in those of a signal that was not recorded, keep the range of their table."""
+    """Search bounds of effect parameters by unit: three decades up to about the torque, speed, voltage or current of
+    the recordings, and time constants that their length and sampling can show. Parameters in other units, or in that
+    of a signal that was not recorded, keep the range of their table."""
     _, Kb, _ = _armature(recordings)
     torque, speed, _, step, duration = _motion(recordings, Kb)
     volts, amperes = (max(_largest(recordings, n), 1e-9) for n in ("voltage", "current"))
@@ -81,7 +81,7 @@ def _largest(recordings: Sequence[Recording], name: str) -> float:
 
 
 def _armature(recordings: Sequence[Recording]) -> tuple[float, float, float]:
-    """R, Kb and L by least squares on means over short stretches; L is zero where the current was not recorded."""
+    """R, Kb and L by least squares on means over short stretches; L is zero where the recordings do not show it."""
     rows = []
     for run in recordings:
         speed = np.zeros(len(run)) if run.held else run.speed

@@ -53,7 +53,7 @@ def missing_friction(given: Prepared, fit: Fit) -> Missing | None:
     rows = _rows(given, fit)
     residuals = [series._replace(values=series.values[..., -1]) for series in rows]
     found = _regressed(rows, plain(residuals), count)
-    if found.score(count) <= CLEARLY:  # standard errors for white noise are too small if anything
+    if found.score(count) <= CLEARLY:  # too large rather than too small where the noise is coloured
         return None
     found = _regressed(rows, whitener(found.left), count)
     score = found.score(count)

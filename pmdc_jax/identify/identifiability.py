@@ -1,4 +1,4 @@
-"""Explains in words which combinations of parameters the recordings do not determine."""
+"""Explanations of the parameter directions that the data do not determine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a fit to the results of an identification: estimates, intervals and the fit of every run."""
+"""Results of an identification: estimates, intervals and the fit of every run."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ def _intervals(
 
 
 def _released_from_bounds(problem: Problem, polished: Fit) -> Fit:
-    """The fit without those coordinates held at a bound that are there arbitrarily: an unseen direction of several
-    parameters contains them, so another point along it fits as well."""
+    """The fit with those coordinates released from their bound that an unseen direction of several parameters leaves
+    arbitrary."""
 
     def released(held: Sequence[int]) -> Fit:
         return polished._replace(optimum=polished.optimum._replace(at_bound=tuple(held)))

@@ -31,7 +31,7 @@ ANYWHERE = 3.0
 
 
 class Information(NamedTuple):
-    """What the runs tell about the coordinates: covariance, intervals and unseen directions."""
+    """What the runs tell about the coordinates."""
 
     covariance: Float[np.ndarray, "parameters parameters"]
     inflation: Float[np.ndarray, " parameters"]  # of the variance, over that for white residuals
@@ -125,9 +125,8 @@ def _ratio_or_one(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _by_parts(
     parts: Sequence[Part], root: Float[np.ndarray, "parameters seen"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Jackknife variances from leaving out one part after another, zero where white noise may explain their size; and
-    the reach of a 95 % interval in standard errors, from Student's t where these variances count: longer where few
-    parts decide."""
+    """Jackknife variances, zero where white noise may explain their size; and the reach of a 95 % interval in standard
+    errors, from Student's t where these variances count: longer where few parts decide."""
     moved, shares = [], []
     for part in parts:
         known, axes = np.linalg.eigh(root.T @ part.hessian @ root)

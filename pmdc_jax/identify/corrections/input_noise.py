@@ -1,6 +1,6 @@
 """Measurement noise in the record of what drives the motor is removed where the motor did not feel it.
 
-A simulation takes the recorded voltage for true. The noise of its sensor then moves the simulated motor but not the
+A simulation takes the recorded voltage as exact. The noise of its sensor then moves the simulated motor but not the
 real one: the residuals look like a missing effect, and the parameters are biased (errors in variables). The rough part
 of a voltage can also be real, as from a controller that responds to a noisy speed. The outputs tell: they contain the
 response to the rough part, or they do not.

@@ -25,13 +25,13 @@ from ..problem import Problem
 
 # A step is this many times the change of the voltage in the samples beside it, and this share of the voltage's range
 STANDS_OUT, LARGE = 10.0, 0.05
-# With fewer steps in all there is no telling whether they share one delay; a run with more than one step in this many
+# With fewer steps in all it cannot be told whether they share one delay; a run with more than one step in this many
 # samples is not switched
 FEWEST, SAMPLES = 4, 20
 # Most numbers in the array of step responses
 NUMBERS = 2e7
-# Steps without a clock come anywhere within a sample: least standard deviation of their positions, in samples; and how
-# far outside the sample, and how many of them, as a share, estimates may lie
+# Steps without a clock come anywhere within a sample: SPREAD is the least standard deviation of their places in it;
+# OUTSIDE is how far outside it an estimate may lie, in samples, and also the share of estimates that may lie farther
 SPREAD, OUTSIDE = 0.15, 0.2
 # Gain in log-likelihood that each step must bring
 EACH = 5.0
