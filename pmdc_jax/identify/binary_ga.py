@@ -40,10 +40,10 @@ class Params(BaseParams):
 
 
 class BinaryGA(PopulationBasedAlgorithm):
-    """Chromosomes of bits, roulette by rank, one-point crossover, bit flips, and the best survives.
+    """Binary chromosomes, rank-based roulette selection, one-point crossover, bit-flip mutation and elitism.
 
     Each of the `n` coordinates of the unit cube is coded in `bits` bits: 60 in all for the paper's six
-    parameters. Population 20, crossover 0.75 and mutation 0.04 are the paper's.
+    parameters. Population 20, crossover rate 0.75 and mutation rate 0.04 are the paper's.
 
     **Source**: PECCON 2017, section III; Goldberg, "Genetic Algorithms in Search, Optimization and Machine
     Learning", chapters 1 and 3.
@@ -80,7 +80,7 @@ class BinaryGA(PopulationBasedAlgorithm):
         chance = (size - rank) / (size * (size + 1) / 2)
         parents = jax.random.choice(select, size, (2, size), p=chance)
         first, second = self._encode(state.population)[parents]
-        # a cut at the very end leaves the first parent whole
+        # a cut is always inside the chromosome, so that crossover takes genes from both parents
         point = jax.random.randint(cut, (size, 1), 1, length)
         crossed = jax.random.uniform(mate, (size, 1)) < params.crossover_rate
         child = jnp.where(crossed & (jnp.arange(length) >= point), second, first)

@@ -1,4 +1,4 @@
-"""Between which values to search, derived from the recordings."""
+"""Search bounds of the parameters, derived from the recordings."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from ..recording import Recording
 
 # How far a crude estimate may be off, as a factor either way. Wide: the search is cheap.
 CRUDE = 30.0
-# ... and L where the current rises over many samples, as when a scope catches it
+# The same for L where the rise of the current is sampled finely, as by an oscilloscope
 FINELY = 5.0
-# Means are taken over so many samples, and fewer in short runs
+# Samples in a stretch that is averaged, and least number of stretches: in short runs they are shorter
 STRETCH, STRETCHES = 20, 30
-# Back-EMF constant, V s/rad, where nothing tells of it
+# Back-EMF constant, V s/rad, where the recordings do not show it
 USUAL = 0.05
-# By how much what an effect does may be smaller than what drives the motor, and still show
+# How much smaller than the signals of the motor an effect may be and still show
 DECADES = 1e3
 
 
 def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, float]]:
-    """Search bounds of R, L, Kb, Kt, J and f in SI, a decade and a half either way of crude estimates.
+    """Search bounds of R, L, Kb, Kt, J and f in SI around crude estimates: a decade and a half either way for R, Kb and
+    Kt, three for J, and for f from four and a half below to one above.
 
-    R and Kb from the balance v = R i + Kb w + L di/dt over short stretches (stall current and no-load speed); Kt around
-    Kb, its equal in SI; J and f from the torque that is there, the speed that it keeps up and the change of speed that
-    it brings about; L from R and the time constants that the sampling can show, or from that balance if it is larger.
+    R and Kb are estimated from the balance v = R i + Kb w + L di/dt over short stretches (stall current and no-load
+    speed); Kt equals Kb in SI; J and f follow from typical values of torque, change of speed and speed; L follows from
+    R and the time constants that the sampling can show, or from that balance if it is larger there.
     """
     R, Kb, L = _armature(recordings)
     torque, speed, change, step, duration = _motion(recordings, Kb)
@@ -45,8 +46,9 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
 def effect_bounds(
     effects: Sequence[type[AbstractEffect]], recordings: Sequence[Recording]
 ) -> dict[str, tuple[float, float]]:
-    """Where to search for the parameters of effects that show, by their units: three decades below the torque, speed,
-    voltage and current of the recordings. What is not measured in those keeps the range of its table."""
+    """Search bounds of effect parameters by unit: three decades up to about the torque, speed, voltage or current of
+    the recordings, and time constants that their length and sampling can show. Parameters in other units, or in that
+    of a signal that was not recorded, keep the range of their table."""
     _, Kb, _ = _armature(recordings)
     torque, speed, _, step, duration = _motion(recordings, Kb)
     volts, amperes = (max(_largest(recordings, n), 1e-9) for n in ("voltage", "current"))
@@ -68,7 +70,7 @@ def effect_bounds(
                 low = max(low, high / DECADES if given.scale == "log" else -high)
             elif given.unit == "s":
                 low, high = max(low, step / 5), min(high, 3 * duration)
-            # no run shows a unit that none was recorded in
+            # the range is empty if no signal of this unit was recorded
             shown = (low, high) if low < high else (given.lower, given.upper)
             bounds[f"{effect.name}.{field}"] = shown
     return bounds
@@ -79,7 +81,7 @@ def _largest(recordings: Sequence[Recording], name: str) -> float:
 
 
 def _armature(recordings: Sequence[Recording]) -> tuple[float, float, float]:
-    """R, Kb and L by least squares on means over short stretches; L is zero where no current shows it."""
+    """R, Kb and L by least squares on means over short stretches; L is zero where the recordings do not show it."""
     rows = []
     for run in recordings:
         speed = np.zeros(len(run)) if run.held else run.speed
@@ -91,9 +93,9 @@ def _armature(recordings: Sequence[Recording]) -> tuple[float, float, float]:
         inputs = np.stack(inputs, 1)
         scale = np.linalg.norm(inputs, axis=0) + 1e-300
         R, Kb, L = np.linalg.lstsq(inputs / scale, voltage, rcond=1e-6)[0] / scale
-        # short-circuited, it shows no more than how one is to the other
+        # a short-circuited motor shows only the ratio of R to Kb
         steady = (np.linalg.norm(voltage) or USUAL * scale[1]) / scale
-        # a motor that only stalls, or only runs light, shows one of the two: then the other is open
+        # one that only stalls or only runs without load shows one of the two: the other is a guess
         unseen = steady[1] if np.any(inputs[:, 1]) else USUAL
         return (R if R > 0 else steady[0]), (Kb if Kb > 0 else unseen), max(L, 0.0)
     gains = [
@@ -111,7 +113,7 @@ def _armature(recordings: Sequence[Recording]) -> tuple[float, float, float]:
 
 
 def _motion(recordings: Sequence[Recording], Kt: float) -> tuple[float, float, float, float, float]:
-    """Typical torque N m, speed rad/s and its change rad/s, shortest sample time and longest run in s."""
+    """Typical torque N m, speed rad/s and change of speed rad/s, shortest sample time s and longest duration s."""
     torque, speed, change = [1e-9], [1e-9], [1e-9]
     for run in recordings:
         if run.torque is not None:
@@ -123,7 +125,7 @@ def _motion(recordings: Sequence[Recording], Kt: float) -> tuple[float, float, f
         if run.speed is not None:
             speed.append(_rms(run.speed))
             change.append(float(np.nanstd(run.speed)))
-        elif run.voltage is not None and not run.held:  # as if it ran light
+        elif run.voltage is not None and not run.held:  # no-load speed
             speed.append(_rms(run.voltage) / Kt)
             change.append(_rms(run.voltage) / Kt)
     step = min(run.sample_time for run in recordings)
@@ -136,7 +138,7 @@ def _around(value: float) -> tuple[float, float]:
 
 
 def _stretches(columns: np.ndarray, sample_time: float) -> np.ndarray:
-    """Means of voltage, current and speed over short stretches, and how fast the current changes in each, A/s."""
+    """Means of voltage, current and speed over short stretches, and the rate of change of the current in each, A/s."""
     length = max(2, min(STRETCH, columns.shape[1] // STRETCHES))
     whole = columns.shape[1] // length
     parts = columns[:, : whole * length].reshape(len(columns), whole, length)

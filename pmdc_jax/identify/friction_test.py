@@ -1,7 +1,7 @@
-"""Whether dry friction would explain what is left of a fit without any: most motors have some, and f makes up for it.
+"""Score test for dry friction in a fit without it: most motors have some, and f compensates for it.
 
-A score test: what a constant torque against the simulated motion would change in the outputs is one more column of the
-regression that the fit ends with, in rows that are white once it has taken away what it can. No motor is fitted anew.
+The response of the outputs to a constant torque against the simulated motion is one more column of the regression at
+the end of the fit, on rows filtered so that its residuals are white. No motor is fitted again.
 
 **Source**: Rao, Proceedings of the Cambridge Philosophical Society 44 (1948), doi:10.1017/S0305004100023987.
 """
@@ -24,36 +24,36 @@ from .noise_model import Series, Whitener, plain, whitener
 from .polish import Fit
 from .prepare import Prepared
 
-# So many standard errors are no chance
+# Standard errors above zero at which friction is significant
 CLEARLY = 5.0
-# ... and of its own by which a parameter makes up for it
+# Shift of a parameter, in its own standard errors, with which it compensates for friction
 MAKES_UP = 2.0
-# The effect that is it
+# The effect to suggest
 DRY = "coulomb_friction"
-# A direction with less than this share of the squares is none
+# Least eigenvalue of a normalised normal matrix, over the largest, of a direction that the rows determine
 VISIBLE = 1e-9
 
-# Numerators and the common denominator
+# Numerators for current and speed, and the common denominator
 LoadFilter = tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "3"]]
 
 
 class Missing(NamedTuple):
-    """What a fit says that it lacks."""
+    """Dry friction that a fit lacks."""
 
     friction_Nm: float
-    errors: float  # by how many standard errors it is more than none
+    errors: float  # its value in standard errors
     moved: Float[np.ndarray, " parameters"]  # how far the coordinates would move with it
 
 
 def missing_friction(given: Prepared, fit: Fit) -> Missing | None:
-    """The dry friction that a fit lacks by the runs it was fitted to; None if it has some, or lacks none clearly."""
+    """The dry friction that a fit to the training runs lacks; None if it has some already or lacks none clearly."""
     problem, count = given.problem, len(given.problem.free)
     if any(effect.holds == "speed" for effect in problem.parameters.effects):
         return None
     rows = _rows(given, fit)
     residuals = [series._replace(values=series.values[..., -1]) for series in rows]
     found = _regressed(rows, plain(residuals), count)
-    if found.score(count) <= CLEARLY:  # by errors that are too small, if the noise is coloured
+    if found.score(count) <= CLEARLY:  # too large rather than too small where the noise is coloured
         return None
     found = _regressed(rows, whitener(found.left), count)
     score = found.score(count)
@@ -62,11 +62,11 @@ def missing_friction(given: Prepared, fit: Fit) -> Missing | None:
 
 
 def of_friction(missing: Missing | None, found: Identification) -> Iterator[str]:
-    """What to say of the friction that a fit lacks, if some parameter makes up for it by more than its own error, or
-    the fit leaves far more than noise, and no error is to be believed."""
+    """A message on the friction that a fit lacks, if a parameter compensates for it by more than `MAKES_UP` of its
+    standard errors, or if the residuals are far larger than the noise, so that no standard error is reliable."""
     if missing is None or found.covariance is None:
         return
-    # of the sought, not of the tied
+    # of the free parameters, which come before the tied ones
     errors = np.sqrt(np.diag(found.covariance))[: len(missing.moved)]
     moved = np.abs(missing.moved) / np.where(errors > 0, errors, np.inf)
     most = int(np.argmax(moved))
@@ -84,8 +84,9 @@ def of_friction(missing: Missing | None, found: Identification) -> Iterator[str]
 
 
 def _rows(given: Prepared, fit: Fit) -> list[Series]:
-    """Of every training run: the derivatives by the motor's parameters, what dry friction of one newton metre would
-    change, the derivatives by what is the run's own, and last the residual; in A and rad/s."""
+    """Columns of the regression for each training run, in A and rad/s: the derivatives with respect to the motor's
+    parameters, the response to 1 N m of dry friction, the derivatives with respect to the run's own unknowns, and last
+    the residual."""
     problem, tape = given.problem, given.problem.tape
     motor, count = problem.parameters(fit.coordinates), len(problem.free)
     of_grid = {tape.grid_of(run): run for run in training_runs(given)}
@@ -107,7 +108,7 @@ def _rows(given: Prepared, fit: Fit) -> list[Series]:
 
 
 def _load_filter(motor: Motor, tape: Tape, run: int) -> LoadFilter:
-    """The linear motor from a load that is held from sample to sample to current and speed."""
+    """Discrete transfer functions of the linear motor, from a load held between samples to current and speed."""
     A, B = map(np.asarray, motor.state_space(tape.drive_of(run)))
     whole = expm(tape.sample_time_of(run) * np.block([[A, B[:, 1:]], [np.zeros((1, 3))]]))
     numerators, denominator = ss2tf(whole[:2, :2], whole[:2, 2:], np.eye(2), np.zeros((2, 1)))
@@ -122,19 +123,19 @@ def _response(
 
 
 class _Regression(NamedTuple):
-    """Least squares of the residuals on the columns that all runs have in common and each run's own."""
+    """Least squares of the residuals on the columns shared by all runs and on each run's own."""
 
     coefficients: Float[np.ndarray, " shared"]
     errors: Float[np.ndarray, " shared"]
     left: list[Series]
 
     def score(self, k: int) -> float:
-        """By how many standard errors a coefficient is above zero; zero where no row shows it."""
+        """A coefficient in standard errors; zero where no row depends on it."""
         return float(self.coefficients[k] / self.errors[k]) if self.errors[k] > 0 else 0.0
 
 
 def _regressed(rows: Sequence[Series], white: Whitener, count: int) -> _Regression:
-    shared = [*range(count + 1), -1]  # the motor's, that of friction, and the residual
+    shared = [*range(count + 1), -1]  # the motor's columns, that of friction, and the residual
     own = slice(count + 1, count + 1 + LOCAL)
     total, of_own = np.zeros((len(shared), len(shared))), []
     for run, series in enumerate(rows):
@@ -158,7 +159,7 @@ def _regressed(rows: Sequence[Series], white: Whitener, count: int) -> _Regressi
 
 
 def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """The inverse on what the rows can see of it."""
+    """The inverse on the directions that the rows determine."""
     lengths = np.sqrt(np.diag(matrix))
     units = np.outer(*2 * [np.where(lengths > 0, lengths, 1.0)])
     return np.linalg.pinv(matrix / units, VISIBLE, hermitian=True) / units

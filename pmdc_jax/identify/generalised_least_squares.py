@@ -1,7 +1,7 @@
-"""The last fit: to residuals that a filter makes white, where those of plain least squares are not.
+"""The last fit: generalised least squares, with whitened residuals, where those of plain least squares are coloured.
 
-Where a torque fluctuates, plain least squares lets the slow part of the residuals, most of which is noise, outvote
-the rest: in torque noise of 20 ms this fit has a seventh of its scatter in R, a third in L, six tenths in Kt and J.
+Where a torque fluctuates, plain least squares gives too much weight to the slow part of the residuals, which is mostly
+noise: with a torque noise of 20 ms correlation time, this fit has 1/7 of its scatter in R, 1/3 in L, 0.6 in Kt and J.
 
 **Source**: Aitken, Proceedings of the Royal Society of Edinburgh 55 (1936), with a filter estimated from the residuals
 of plain least squares.
@@ -20,17 +20,17 @@ from .polish import WORTH, Fit, polish, reweighted
 from .prepare import Prepared
 from .whitening import Whitening
 
-# Gauss-Newton steps from one fit to white residuals to another
+# Gauss-Newton steps at most from a plain fit to one with whitened residuals
 STEPS = 8
-# A fit to white residuals may leave so many times the plain squares of the fit that leaves least of them
+# Largest sum of plain squared residuals of the whitened fit, over that of plain least squares
 NEAR = 1.1
 
 
 def last_fit(given: Prepared, plainly: Fit, near: Fit, white: Whitener) -> tuple[Prepared, Fit]:
-    """The fit to residuals that a filter makes white, found from a fit `near` it, if plain least squares asks for it.
+    """The fit with whitened residuals, started from a fit `near` it; the plain fit if its residuals are white already.
 
-    Not where it is far from reproducing the runs as they are, as where the motor has an effect that the model lacks
-    or a formula is not quite nature's: the filter then takes what is missing for noise.
+    The plain fit is also kept where the other one reproduces the runs clearly worse, because the motor has an effect
+    that the model lacks or a formula is only approximate: the filter then takes what is missing for noise.
     """
     if white.is_white or _is_exact(given, plainly):
         return given, plainly
@@ -40,7 +40,7 @@ def last_fit(given: Prepared, plainly: Fit, near: Fit, white: Whitener) -> tuple
 
 
 def _is_exact(given: Prepared, fit: Fit) -> bool:
-    """Whether nothing is left but rounding errors, as of a simulation without noise."""
+    """Whether the residuals are only rounding errors, as in a fit to a simulation without noise."""
     there = given.problem.samples > 0
     return bool(np.all(fit.noise[there] < 2 * FLOOR * given.problem.sizes[there]))
 
@@ -48,23 +48,23 @@ def _is_exact(given: Prepared, fit: Fit) -> bool:
 def sharpened(
     given: Prepared, near: Fit, white: Whitener, worth: float = WORTH
 ) -> tuple[Prepared, Fit]:
-    """The problem of fitting to residuals that a filter makes white, and its solution from a plain fit nearby."""
+    """The problem with whitened residuals, and its solution started from a plain fit nearby."""
     given = whitened(given, white)
     known = reweighted(given.problem, near)
     return given, polish(given.problem, near.optimum, STEPS, worth, known)
 
 
 def squares_of(given: Prepared, polished: Fit) -> float:
-    """The sum of squares that a fit leaves of the training runs."""
+    """The sum of squared residuals of a fit over the training runs."""
     residuals = np.asarray(polished.evaluation.residuals)
     return float(np.square(residuals[given.problem.fitted_blocks]).sum())
 
 
 def whitened(given: Prepared, white: Whitener) -> Prepared:
-    """The problem of fitting to residuals that a filter makes white."""
+    """The problem with whitened residuals."""
     tape, noise = given.problem.tape, np.asarray(given.problem.noise)
     filters = [np.zeros((0, 2, 2))] * tape.runs
-    # hold-outs are nothing to learn a filter from
+    # hold-out runs have no filter, only the scale of the noise
     scales = [np.diag(1 / noise)] * tape.runs
     for run, A, S in zip(training_runs(given), white.filters, white.scales, strict=True):
         both = np.ix_(*2 * [_outputs(tape, run)])
@@ -75,18 +75,18 @@ def whitened(given: Prepared, white: Whitener) -> Prepared:
 
 
 def training_runs(given: Prepared) -> list[int]:
-    """The runs that count."""
+    """Indices of the training runs."""
     return [run for run, role in enumerate(given.roles) if role == "train"]
 
 
 def residuals_of(given: Prepared, fit: Fit) -> list[Series]:
-    """What is measured less what is simulated, A and rad/s, of every training run in the order of time."""
+    """Measured minus simulated outputs, A and rad/s, of each training run in the order of time."""
     signal = -np.asarray(fit.evaluation.residuals) * fit.noise[:, None]
     return [series_of(given.problem.tape, run, signal) for run in training_runs(given)]
 
 
 def series_of(tape: Tape, run: int, signal: np.ndarray) -> Series:
-    """A signal (blocks, 2, samples, ...) of one run in the order of time, of the outputs that it has."""
+    """The part of a signal (blocks, 2, samples, ...) of one run, in the order of time, for its measured outputs."""
     mine = tape.blocks_of(run)
     part = np.moveaxis(signal[mine], 1, 2)
     values = part.reshape(-1, *part.shape[2:])
@@ -97,6 +97,6 @@ def series_of(tape: Tape, run: int, signal: np.ndarray) -> Series:
 
 
 def _outputs(tape: Tape, run: int) -> np.ndarray:
-    """The outputs that a run has."""
+    """Indices of the outputs that a run has measured."""
     weight = np.asarray(tape.weight)[tape.blocks_of(run)]
     return np.flatnonzero(weight.any((0, 2)))

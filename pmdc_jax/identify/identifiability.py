@@ -1,4 +1,4 @@
-"""Directions that the recordings cannot see, in words."""
+"""Explanations of the parameter directions that the data do not determine."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def moved_by(direction: np.ndarray, parameters: Parameters) -> tuple[str, ...]:
 def explain(
     unseen: Sequence[np.ndarray], parameters: Parameters, recordings: Sequence[Recording]
 ) -> tuple[Direction, ...]:
-    """Say of each unseen direction which parameters it moves together, why it is unseen, and how to mend it."""
+    """For each unseen direction: which parameters it moves together, why the data do not determine it, and a remedy."""
     directions = []
     for vector in unseen:
         names = moved_by(vector, parameters)
         directions.append(Direction(names, *_reason(set(names), recordings)))
-    # two directions that move the same parameters are one thing to say
+    # directions that move the same parameters are reported once
     return tuple(dict.fromkeys(directions))
 
 

@@ -1,4 +1,4 @@
-"""What an identification returns: plain records, read by the command line and the report."""
+"""The result of an identification: plain records, read by the command line and the report."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Role = Literal["train", "holdout"]
 
 @frozen
 class Estimate:
-    """One parameter: its value (SI), standard error, 95 % interval, unit and what to make of it.
+    """One parameter: its value (SI), standard error, 95 % interval, unit and status.
 
-    `stderr` and `ci95` are None where the data do not determine the parameter; `value` too where no run has
-    anything to do with it.
+    `stderr` and `ci95` are None where the data do not determine the parameter or it is at a bound; `value` too
+    where it affects no run.
     """
 
     value: float | None
@@ -32,7 +32,7 @@ class Estimate:
 
 @frozen
 class Direction:
-    """A combination of parameters that the recordings cannot see, why, and how to mend it."""
+    """A combination of parameters that the recordings do not determine, why, and a remedy."""
 
     parameters: tuple[str, ...]
     why: str
@@ -41,7 +41,7 @@ class Direction:
 
 @frozen
 class RunFit:
-    """How one run is reproduced in free-run simulation from its estimated initial state.
+    """How a free-run simulation from the estimated initial state reproduces one run.
 
     `*_rmse` in A and rad/s; `*_fit_percent` is 100 (1 - |y - yhat| / |y - mean y|); None where the run
     does not hold that quantity. The `current*` and `speed*` arrays have the shape of `time` (s).
@@ -64,19 +64,19 @@ class RunFit:
 
 @frozen
 class Search:
-    """How the search went: best and median fitness after each generation, then each refined start."""
+    """Record of the search: best and median fitness of the generations, and the fitness of each refined start."""
 
     method: str
     evaluations: int
     best: np.ndarray  # (generations,)
     median: np.ndarray  # (generations,)
     refined: np.ndarray  # (starts,) fitness after refinement, ascending
-    times_found: int  # how many of the starts ended at the best
+    times_found: int  # how many of the starts ended in the best optimum
 
 
 @frozen
 class Identification:
-    """The motor found, how sure we are, and how well it reproduces every run."""
+    """The identified motor, the uncertainty of its parameters, and how well it reproduces every run."""
 
     motor: Motor
     parameters: Mapping[str, Estimate]
@@ -89,10 +89,10 @@ class Identification:
     search: Search
     findings: tuple[Finding, ...]
     # of the coordinates (logarithms of positive parameters, others as they are), in the order of `covariance_names`;
-    # zero rows for parameters that are fixed
+    # zero rows for those held at a bound
     covariance: np.ndarray = field(repr=False)
     covariance_names: tuple[str, ...] = ()
     messages: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()  # those messages which say that the model lacks something
-    # by output (current, speed) of which far more is left than the white noise of its runs, how many times as much
+    # RMS of the residuals over their white noise, for outputs (current, speed) for which it is large
     missed: Mapping[str, float] = field(factory=dict)

@@ -1,4 +1,4 @@
-"""How likely recordings are by a fit, whatever the colour of what it leaves: what tells of the sensors themselves."""
+"""Likelihood of recordings under a fit with coloured residuals, which decides on corrections for their sensors."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from .noise_model import Series, whitener
 from .polish import Fit
 from .prepare import Prepared
 
-# Records are taken otherwise than they came if that is so much likelier, by the logarithm
+# Gain in log-likelihood from which a recording is interpreted in another way than by default
 LIKELIER = 30.0
 
 
 def negative_log_likelihood(given: Prepared, fit: Fit) -> float:
-    """Minus the logarithm of the likelihood of the training runs as recorded, but for a constant.
+    """Negative log-likelihood of the training runs as recorded, up to a constant.
 
-    That of Gaussian innovations: what is left of the residuals when an autoregression has foretold what it can.
+    Of Gaussian innovations: the one-step prediction errors of an autoregressive model of the residuals.
 
-    **Arguments**: `fit`, to these recordings or to some that were mended.
+    **Arguments**: `fit`, to these recordings or to corrected ones.
     **Source**: Ljung, "System Identification", 2nd edition, section 7.4.
     """
     tape, seen, total = given.problem.tape, np.asarray(fit.evaluation.seen), 0.0

@@ -1,4 +1,4 @@
-"""A population around a fit: where a slope leads no further than the next of many optima."""
+"""Population search around a fit, where a gradient leads only to the nearest of many local optima."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from .problem import Problem
 from .refine import Optimum
 from .search import search
 
-# Evaluated as fast as a smaller one: what takes long is to go through the samples one after another
+# As fast to evaluate as a smaller one: the time goes into walking through the samples one after another
 POPULATION, GENERATIONS = 64, 20
-# Candidates, the best one first, of which one is to have derivatives in all runs
+# Ranks of the candidates, best first, that are tried until one can be evaluated with derivatives in all runs
 RANKS = (0, 1, 3, 7, 15, 31)
-# So many samples, if not those of one run, tell a few parameters from others
+# Samples that suffice to determine a few parameters (at least one run is used)
 ENOUGH = 2**13
 
 
 def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: int) -> Optimum:
-    """The best point of a search (`search`) among some parameters around those of a fit, while all others stay.
+    """The best point of a population search over some parameters around those of a fit, with all others fixed.
 
-    **Arguments**: `factors`, by parameter: it is sought within so many times and one over so many times what it is.
+    **Arguments**: `factors`, by name of the effect parameter: it is sought between its value over the factor and its
+    value times the factor, within the range of its table; `seed` of the search.
     **Returns**: the best point at which the problem can be evaluated; that of the fit, if there is none.
     """
     parameters, coordinates = problem.parameters, np.array(fit.coordinates)
@@ -43,7 +44,7 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     known = {name: float(value) for name, value in parameters.known.items()}
     known |= {name: value for name, value in values.items() if name not in factors}
     sought = Parameters.of(bounds, parameters.effects, known, parameters.ties)
-    # a fit that cannot be simulated leaves none
+    # a fit that cannot be simulated has no finite noise
     noise = np.where(np.isfinite(fit.noise), fit.noise, problem.noise)
     found = search(
         sought,
@@ -64,7 +65,7 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
 
 
 def _telling_runs(problem: Problem, fit: Fit) -> Tape:
-    """The few runs of which a fit leaves most, each begun and loaded as its own unknowns say."""
+    """The few runs with the largest residuals per block, with the initial state and load of their own unknowns."""
     tape, unknowns = problem.tape, fit.unknowns
     run = np.asarray(tape.run)[problem.fitted_blocks]
     residuals = np.nan_to_num(np.asarray(fit.evaluation.residuals)[problem.fitted_blocks])

@@ -1,4 +1,4 @@
-"""How large the noise of the measurements is."""
+"""Standard deviation and resolution of measured signals."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from jaxtyping import Float
 
 from ..differences import noise_by_differences
 
-# A channel without noise (a simulation) is still scaled by something: this share of its size.
+# Least noise of an output, as a share of its root mean square: a simulation without noise needs some scale, too.
 FLOOR = 1e-5
-# Steps that are this share of the largest one are none
+# Steps below this share of the largest one are rounding errors
 ROUNDING = 1e-9
-# Numbers that differ by this share of the largest one are equal, and of 20 bits nobody knows the last
+# Remainders below this share of the largest number are zero; a common divisor below this share (20 bits) is none
 MULTIPLE, RESOLVED = 1e-8, 1e-6
 
 
 def white_noise(signals: Sequence[np.ndarray]) -> float | None:
-    """Standard deviation of the white part of some signals of one kind, None without any.
+    """Standard deviation of the white noise in signals of one kind, None if none has more than two samples.
 
-    From second differences, which leave a smooth motion out; by their median, which leaves jumps out. No less
-    than what rounding to the quanta of the sensor does, which most differences do not show.
+    Estimated from second differences, which remove smooth motion, by their median, which ignores jumps. It is at least
+    the rounding noise of the sensor's resolution, which most differences do not show.
     """
     known = [s[~np.isnan(s)] for s in signals]
     if not any(len(s) > 2 for s in known):
@@ -32,27 +32,28 @@ def white_noise(signals: Sequence[np.ndarray]) -> float | None:
 
 
 def noise_of_sensor(measured: np.ndarray, left: np.ndarray) -> float:
-    """Standard deviation of the white noise of a sensor by what a model leaves of it, zero where too little is known.
+    """Standard deviation of a sensor's white noise from the residuals `left` by a model, zero with too few samples.
 
-    No less than its steps make: most of what is left of a motor at rest does not change, however coarse an encoder is.
+    It is at least the rounding noise of the sensor: at rest the residuals hardly change, however coarse an encoder is.
     """
     white = white_noise([left])
     return max(white, resolution_noise([measured])) if white else 0.0
 
 
 def is_coarse(signal: np.ndarray) -> bool:
-    """Whether a signal moves in steps that its noise does not blur: errors then last as long as it stands still."""
+    """Whether a signal is quantised in steps that its noise does not blur: errors then last while it is constant."""
     known = signal[~np.isnan(signal)]
     return bool(np.std(np.diff(known, 2)) / np.sqrt(6.0) < 2 * resolution_noise([known]))
 
 
 def resolution_noise(signals: Sequence[np.ndarray]) -> float:
-    """Standard deviation of what rounding to the quanta of the sensor does."""
+    """Standard deviation of the rounding error due to the resolution of the sensor: quantum / sqrt(12)."""
     return quantum(np.concatenate([np.diff(s) for s in signals])) / np.sqrt(12.0)
 
 
 def resolution(values: Float[np.ndarray, " values"]) -> float:
-    """The largest number of which all values are multiples, zero if there is none: by Euclid, of both signs."""
+    """The largest number of which all values are multiples, zero if there is none: by Euclid's algorithm, with
+    remainders of either sign."""
     sizes = np.unique(np.abs(values))
     least, found = MULTIPLE * sizes[-1], 0.0
     for size in sizes[sizes > least]:
@@ -65,13 +66,13 @@ def resolution(values: Float[np.ndarray, " values"]) -> float:
 
 
 def quantum(steps: Float[np.ndarray, " steps"]) -> float:
-    """The step of which all steps are multiples, zero if there is none; those that are not known do not count."""
+    """The step of which (nearly) all steps are multiples, zero if there is none; NaN are ignored."""
     sizes = np.abs(steps[~np.isnan(steps)])
-    # a number divided by another one differs from itself by its last bits
+    # differences of equal values that were computed by division may be a rounding error instead of zero
     sizes = sizes[sizes > ROUNDING * np.max(sizes, initial=0.0)]
     if not len(sizes):
         return 0.0
-    # the smallest one may be none, the next ones may be two or more
+    # the smallest step may be an outlier, a quantile may be a multiple of the quantum
     for smallest in (np.quantile(sizes, 0.01), np.min(sizes)):
         step = _of_multiples(sizes, float(smallest))
         off = np.abs(sizes / step - np.round(sizes / step))
@@ -81,7 +82,7 @@ def quantum(steps: Float[np.ndarray, " steps"]) -> float:
 
 
 def _of_multiples(sizes: Float[np.ndarray, " steps"], step: float) -> float:
-    """The step of which sizes are multiples, from one of a few digits: the larger the multiple the more it tells."""
+    """The step of which the sizes are multiples, refined from a rough one: larger multiples determine it better."""
     for reach in (10, 100, np.inf):
         near = sizes[sizes < reach * step]
         counts = np.round(near / step)

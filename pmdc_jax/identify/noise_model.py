@@ -1,8 +1,8 @@
-"""The colour of the noise: an autoregression of the residuals, and what is left when it is taken out.
+"""The colour of the noise: an autoregressive model of the residuals, and the filter that whitens them.
 
-Residuals of a free run are coloured even where the sensors are white: a torque that fluctuates is filtered by the
-motor. Tests for white noise would take that for an effect. So residuals, and whatever is regressed on them, are
-passed through the filter that makes the noise white, and every run is weighed by what its own noise then is.
+The residuals of a free run are coloured even if the sensor noise is white, since the motor filters the fluctuations
+of its torque. Tests for white noise would mistake that for an effect. Residuals, and the columns that they are
+regressed on, are therefore passed through the whitening filter, and each run is weighted by its own innovations.
 
 **Source**: Ljung, "System Identification", 2nd edition, section 7.4 (prediction errors); Lütkepohl, "New
 Introduction to Multiple Time Series Analysis" (2005), sections 3.2 and 4.3.
@@ -19,34 +19,34 @@ from jaxtyping import Bool, Float
 
 from .whitening import band, remembered
 
-# Orders that are tried, none longer than a `CHUNK`; the Bayesian criterion chooses.
+# Orders that are tried, none above `CHUNK`; the Bayesian information criterion chooses.
 ORDERS = (1, 2, 4, 8, 12, 20, 30)
-# Noise of different runs is alike if its logarithm differs by no more
+# Noise of different runs is equal if its logarithm differs by less
 ALIKE = 0.2
-# Frequencies of a run, from the lowest on, that are its slowest
+# Number of frequencies of a run, from the lowest on, that count as slow
 SLOWEST = 15
 
 Rows = Float[np.ndarray, "samples outputs *columns"]
 
 
 class Series(NamedTuple):
-    """Signals of one run in the order of time, of the outputs that it has."""
+    """Signals of one run in the order of time, for the outputs that it has measured."""
 
     values: Rows
     known: Bool[np.ndarray, " samples"]  # where all outputs were measured
     kind: tuple[float, tuple[int, ...]]  # sample time and outputs: runs of a kind share a filter
 
 
-@frozen(eq=False)  # one is the same as itself alone
+@frozen(eq=False)  # compared by identity
 class Whitener:
-    """For every run a filter, shared by runs of a kind, and the matrix that gives what is left unit variance."""
+    """For each run a filter, shared by runs of a kind, and the matrix that scales its output to unit variance."""
 
     filters: list[Float[np.ndarray, "order outputs outputs"]]
     scales: list[Float[np.ndarray, "outputs outputs"]]
 
     @property
     def is_white(self) -> bool:
-        """Whether the noise is white, and as large in every run."""
+        """Whether the noise is white and equally large in all runs of the same outputs."""
         sizes: dict[tuple[int, ...], list[np.ndarray]] = {}
         for S in self.scales:
             sizes.setdefault(S.shape, []).append(np.sqrt(np.diag(np.linalg.inv(S @ S.T))))
@@ -54,15 +54,15 @@ class Whitener:
         return alike and not any(len(A) for A in self.filters)
 
     def __call__(self, run: int, series: Series) -> Float[np.ndarray, "rows *columns"]:
-        """The rows of a run, white if the series is its noise, those of all outputs side by side in time."""
+        """The filtered rows of a run, white if the series is its noise; the outputs of a sample follow one another."""
         rest = _filtered(series, self.filters[run], self.scales[run])
         return rest.reshape(-1, *rest.shape[2:])
 
 
 def whitener(residuals: Sequence[Series]) -> Whitener:
-    """Fit the filters to the residuals of every run.
+    """Fit the filters to the residuals of all runs.
 
-    **Arguments**: `residuals`, one `Series` a run, `values` (samples, outputs).
+    **Arguments**: `residuals`, one `Series` per run, `values` (samples, outputs).
     """
     of_kind = {}
     for kind in dict.fromkeys(series.kind for series in residuals):
@@ -77,16 +77,16 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
 
 
 def plain(residuals: Sequence[Series]) -> Whitener:
-    """No filter at all, only the scale of every run."""
+    """A whitener without filters, only with the scale of each run."""
     filters = [np.zeros((0, *2 * s.values.shape[1:2])) for s in residuals]
     return Whitener(filters, _scales(residuals, filters))
 
 
 def _slow_power(white: Rows) -> float:
-    """By how much the slowest part of what ought to be white is stronger than the rest, at least one.
+    """Power of the whitened residuals at their lowest frequencies, over what white noise may have there; at least one.
 
-    A short filter cannot take out errors that last: those of a coarse encoder while the motor hardly turns. A run with
-    such noise counts for less.
+    A short filter cannot remove errors that last, such as those of a coarse encoder while the motor hardly turns. A
+    run with such noise is given less weight.
     """
     count = min(SLOWEST, len(white) // 4)
     if not count:
@@ -110,9 +110,9 @@ def _scales(
 
 
 def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order outputs outputs"]:
-    """Coefficients A_k of r(t) = sum_k A_k r(t - k) + white noise, of the order that the criterion likes best.
+    """Coefficients A_k of r(t) = sum_k A_k r(t - k) + white noise, of the order with the lowest criterion.
 
-    Runs are weighed by their own variance: noise may differ between them.
+    Each run is weighted by the inverse of its variance, because noise may differ between runs.
     """
     outputs, longest = residuals[0].values.shape[1], max(ORDERS)
     lagged = [_lagged(series, longest) for series in residuals]

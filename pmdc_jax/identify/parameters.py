@@ -1,4 +1,4 @@
-"""Which parameters are sought, and how a vector of search coordinates makes a motor."""
+"""The parameters to identify, and the mapping from a vector of search coordinates to a motor."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Coordinates = Float[Array, "*population parameters"]
 
 
 class Parameters(eqx.Module):
-    """The sought parameters, their bounds, and the rest, which is known or tied.
+    """The free parameters with their bounds, and those that are known or tied.
 
     A coordinate is the natural logarithm of its parameter, or the parameter itself where the effect's table
     says so; effects' parameters are named like coulomb_friction.torque_Nm.
@@ -39,11 +39,11 @@ class Parameters(eqx.Module):
         known: Mapping[str, float] | None = None,
         ties: Sequence[tuple[str, str]] = (),
     ) -> Parameters:
-        """Seek everything that is neither known nor tied.
+        """Make every parameter free that is neither known nor tied.
 
-        **Arguments**: `bounds` of R, L, Kb, Kt, J, f in SI, lower > 0; `effects`, whose parameters are sought
-        in the ranges of their own table unless `bounds` holds others; `known` values; `ties`, pairs (a, b)
-        for a = b, of which only b is sought.
+        **Arguments**: `bounds` of R, L, Kb, Kt, J, f in SI, lower > 0; `effects`, whose parameters have the
+        ranges of their own table unless `bounds` holds others; `known` values in SI; `ties`, pairs (a, b) for
+        a = b, of which only b is free.
         """
         ranges = {name: (*bounds[name], True) for name in PARAMETERS}
         for effect in effects:
@@ -90,7 +90,7 @@ class Parameters(eqx.Module):
     def with_tied(
         self, covariance: Float[np.ndarray, "n n"]
     ) -> tuple[tuple[str, ...], Float[np.ndarray, "m m"]]:
-        """Names and covariance of the sought coordinates and of those that are tied to one of them."""
+        """Names and covariance of the free coordinates and of those that are tied to one of them."""
         tied = {target: source for target, source in self.ties if source in self.names}
         rows = [self.names.index(tied.get(name, name)) for name in (*self.names, *tied)]
         return (*self.names, *tied), covariance[np.ix_(rows, rows)]
@@ -115,7 +115,7 @@ def effects_named(names: Sequence[str]) -> tuple[type[AbstractEffect], ...]:
 
 
 def check_names(option: str, names: Sequence[str]) -> None:
-    """Refuse a name that is no parameter of the motor."""
+    """Raise `InputError` for a name that is not a parameter of the motor."""
     for name in names:
         if name not in PARAMETERS:
             raise InputError(

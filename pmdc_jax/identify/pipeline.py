@@ -1,4 +1,4 @@
-"""From recordings to an `Identification`: check, bound, search, refine, judge."""
+"""From recordings to an `Identification`: check, bound, search, refine, assess."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def identify(
     """Identify a motor from recordings of it.
 
     **Arguments**: `recordings` to fit, or their files, at least one; `holdout`, runs kept out of the fit; `tie`, pairs
-    such as ("Kt", "Kb") of parameters that are one; `known`, values in SI that are not sought; `unloaded` declares that
-    runs without a load column have no load (otherwise a constant unknown one); `effects`, names of effects
-    to identify too; `search`, a key of `pmdc_jax.identify.search.METHODS`; `seed` of the search; `progress`,
-    called now and then with what is being done and how good the fit is.
+    such as ("Kt", "Kb") of parameters set equal, of which only the second is fitted; `known`, fixed values in SI;
+    `unloaded` declares that runs without a load column have no load (otherwise a constant unknown one); `effects`,
+    names of effects to identify too; `search`, a key of `pmdc_jax.identify.search.METHODS`; `seed` of the search;
+    `progress`, called now and then with the current activity and the fitness.
 
     **Returns**: the motor, its parameters with uncertainty and status, and the fit of every run.
 

@@ -1,4 +1,4 @@
-"""Gauss-Newton to the bottom of an optimum, each output weighed by what its own residuals turn out to be."""
+"""Final Gauss-Newton iterations of a fit, each output weighted by the standard deviation of its own residuals."""
 
 from __future__ import annotations
 
@@ -27,26 +27,27 @@ from .problem import (
 )
 from .refine import Optimum
 
-# Steps after which a fall of the cost by no more than so much ends the polish: dry elements leave kinks where a
-# straight line foretells more than there is to gain
+# The polish stops if the cost fell by less than IDLE over the last PATIENCE steps: dry elements leave kinks, at which
+# the linearised model predicts a larger reduction than there is
 PATIENCE, IDLE = 5, 1e-5
-# Gauss-Newton steps of the polish, and the fall of the sum of squares, in noise variances, below which a step is
-# not worth it: the square of 0.03 standard errors.
+# Gauss-Newton steps at most, and the predicted reduction of the sum of squares, in noise variances, below which no
+# step is taken: the square of 0.03 standard errors
 POLISH = 20
 WORTH = 1e-3
-# ... and that a step may foretell where none is found that lowers it, at the kinks of dry elements: of 0.3 errors
+# Predicted reduction that still counts as converged where no step lowers the sum of squares, at the kinks of dry
+# elements: the square of 0.3 standard errors
 AT_KINK = 0.1
-# By which shares of the play of its teeth a run is tried to begin twisted, from where its load presses them to
+# Initial twists tried for a run, as shares of the gear's backlash, from where the load presses the teeth
 BACKLASH_STARTS = np.linspace(-1.0, 1.0, 9)
-# At how many angles of the period of a torque a rotor is tried to begin, and at most
+# Initial rotor angles tried per period of an angle-dependent torque (the shortest one), and at most
 ANGLES, MOST_ANGLES = 8, 32
-# Curvature added to every coordinate in a step, as if each were known to within a factor of e beforehand:
-# nothing to one that the data see, and it keeps one that they do not see where it is.
+# Curvature added to every coordinate in a step, as a prior that knows each to within a factor of e: negligible for a
+# coordinate that the data determine, while one that they do not determine stays where it is
 RIDGE = 1.0
 
 
 class Fit(NamedTuple):
-    """A motor fitted to the runs: where that ended, what is simulated there, and the noise as the residuals show it."""
+    """A motor fitted to the runs: the optimum, the simulation there, and the noise estimated from the residuals."""
 
     optimum: Optimum
     evaluation: Evaluation
@@ -54,17 +55,17 @@ class Fit(NamedTuple):
 
     @property
     def unknowns(self) -> Unknowns:
-        """Where it ended."""
+        """The unknowns at the optimum."""
         return self.optimum.unknowns
 
     @property
     def coordinates(self) -> Float[Array, " parameters"]:
-        """The search coordinates where it ended."""
+        """The search coordinates at the optimum."""
         return self.optimum.unknowns.coordinates
 
     @property
     def fitness(self) -> float:
-        """What it leaves, in noise variances; infinite where nothing can be simulated."""
+        """Mean square of the residuals in noise variances; infinite where the simulation fails."""
         return self.optimum.fitness
 
     @property
@@ -80,11 +81,11 @@ def polish(
     worth: float = WORTH,
     known: Evaluation | None = None,
 ) -> Fit:
-    """Gauss-Newton to the bottom, while each output is weighed by what its own residuals turn out to be.
+    """Gauss-Newton iterations in which each output is weighted by the standard deviation of its own residuals.
 
-    The claim of convergence is the gradient's: no step within the bounds would lower the sum of squares by
-    more than what a step is `worth`, in noise variances (`AT_KINK`, where no step is found that does). A coordinate
-    held at a bound is let go where the gradient points back inside. The evaluation at the start may be `known`.
+    Convergence is judged by the gradient: no step within the bounds is predicted to lower the sum of squares by more
+    than `worth`, in noise variances (`AT_KINK` where no step that lowers it is found). A coordinate held at a bound is
+    released where the gradient points back inside. `known` is the evaluation at the start, if there is one already.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
     trial, held, share = end.unknowns, set(end.at_bound), 1.0
@@ -95,7 +96,7 @@ def polish(
         if len(costs) > PATIENCE and costs[-1 - PATIENCE] - costs[-1] < IDLE:
             break
         if not np.isfinite(best.cost):
-            break  # what cannot be simulated has no slope to follow
+            break  # a failed simulation has no gradient
         if reached.cost > best.cost + 1e-9 and share > 1e-3:
             share /= 4  # the last step was too long
         elif reached.cost <= best.cost + 1e-9:
@@ -121,35 +122,35 @@ def polish(
 
 
 def _damped_log_step(parameters: Parameters, step: np.ndarray) -> np.ndarray:
-    """A step along which a positive parameter rises on a straight line, and not as an exponential: what is nearly zero,
-    as friction that something else hid, would rise to infinity."""
+    """A step s in which a positive parameter grows linearly, p (1 + s), instead of by exp(s): one that is nearly zero,
+    such as friction hidden by another effect, would otherwise grow without limit."""
     rises = np.zeros(len(step), bool)
     rises[: len(parameters.names)] = parameters.logarithmic
     return np.where(rises & (step > 0), np.log1p(np.maximum(step, 0.0)), step)
 
 
 class _Weighed(NamedTuple):
-    """A point, evaluated, each output weighed by its own residuals."""
+    """An evaluated point, each output weighted by its own residuals."""
 
     unknowns: Unknowns
     evaluation: Evaluation
     noise: np.ndarray
     matrix: np.ndarray
-    # sum of the logarithms of the noise, which the maximum of the likelihood makes least; of white residuals that of
-    # their squares
+    # what maximum likelihood minimises: the sum of the logarithms of the outputs' noise; for whitened residuals, the
+    # logarithm of their sum of squares
     cost: float
     fitness: float
 
 
 def _variance(problem: Problem, best: _Weighed) -> float:
-    """Mean square of the weighed residuals; at least the noise that they are weighed by, of which a simulation without
-    any leaves next to nothing."""
+    """Mean square of the weighted residuals. Unless they are whitened it is at least 1, the noise they are weighted by:
+    fitted to a simulation without noise they are next to nothing."""
     mean = best.matrix[-1, -1] / problem.most_samples
     return mean if problem.whitening is not None else max(mean, 1.0)
 
 
 def reweighted(problem: Problem, fit: Fit) -> Evaluation:
-    """The evaluation at a fit to plain residuals, as a problem with another noise weighs it."""
+    """The evaluation at a fit to plain residuals, weighted as in a problem with another noise."""
     return weighed(problem, _scaled(fit.evaluation, fit.noise / np.asarray(problem.noise)))
 
 
@@ -166,17 +167,17 @@ def _weighed(problem: Problem, unknowns: Unknowns, known: Evaluation | None = No
             over = squares * stretch**2 / np.maximum(problem.samples, 1.0)
             cost = float(np.log(np.maximum(noise, 1e-300)).sum() + over.sum() / 2)
     fitness = float(squares.sum()) / problem.most_samples
-    # what cannot be simulated is infinitely bad
+    # a failed simulation is infinitely bad
     cost, fitness = (x if np.isfinite(x) else np.inf for x in (cost, fitness))
     return _Weighed(unknowns, scaled, noise, matrix, cost, fitness)
 
 
 def best_backlash_start(problem: Problem, unknowns: Unknowns, begun: RunUnknowns) -> Unknowns:
-    """Every run's own unknowns as they are, or as they had `begun` with the teeth of its gear elsewhere in their play,
-    whichever fits best.
+    """Each run's own unknowns as they are, or `begun` with the teeth of its gear elsewhere within the backlash,
+    whichever fits the run best.
 
-    No slope leads there: when teeth first meet changes all that follows, and a run that begins at rest may be fitted as
-    well as it goes by a speed that it never had.
+    No gradient leads there: the moment at which the teeth first meet changes all that follows, and a run that begins
+    at rest may be fitted as well as possible by an initial speed that it never had.
     """
     motor = problem.parameters(unknowns.coordinates)
     play = sum(float(effect.play()) for effect in motor.effects)
@@ -186,10 +187,10 @@ def best_backlash_start(problem: Problem, unknowns: Unknowns, begun: RunUnknowns
 
 
 def best_initial_angle(problem: Problem, unknowns: Unknowns) -> Unknowns:
-    """The own unknowns of runs that do not count as they are, or with the rotor at another angle as they began,
-    whichever fits best; of several waves, first within the longest period, then by whole periods of each.
+    """Each hold-out run's own unknowns as they are, or with another initial angle of the rotor, whichever fits best.
 
-    From half a period away slopes lead to another optimum, or nowhere.
+    With several angle-dependent torques, angles within the longest period are tried first, then shifts by whole
+    periods of each. From half a period away the gradient leads to another optimum, or nowhere.
     """
     waves = [e.repeats_after() for e in problem.parameters(unknowns.coordinates).effects]
     periods = [float(wave["angle"]) for wave in waves if "angle" in wave]
@@ -210,7 +211,7 @@ def best_initial_angle(problem: Problem, unknowns: Unknowns) -> Unknowns:
 def _whichever_fits(
     problem: Problem, unknowns: Unknowns, trials: Sequence[RunUnknowns]
 ) -> Unknowns:
-    """Every run's own unknowns as they are, or those of the trial that fits it best."""
+    """Each run's own unknowns as they are, or those of the trial that fits it best."""
     if not trials:
         return unknowns
     tried = [unknowns.runs, *trials]
@@ -224,7 +225,7 @@ def _whichever_fits(
 
 
 def _squares_of_runs(problem: Problem, evaluation: Evaluation) -> Float[np.ndarray, " runs"]:
-    """What each run leaves; infinitely much where it cannot be simulated."""
+    """Sum of squared residuals of each run; infinite where its simulation fails."""
     with np.errstate(over="ignore", invalid="ignore"):
         of_block = np.square(np.asarray(evaluation.residuals)).sum((1, 2))
     sound = np.nan_to_num(of_block, nan=np.inf)
@@ -234,9 +235,10 @@ def _squares_of_runs(problem: Problem, evaluation: Evaluation) -> Float[np.ndarr
 def fit_run_unknowns(
     problem: Problem, unknowns: Unknowns, passes: int = 4
 ) -> tuple[Unknowns, Evaluation]:
-    """Fit only what belongs to each run: its initial state, and its load where nobody knows it.
+    """Fit only what belongs to each run: its initial state, and its load where that is unknown.
 
-    A step that makes a run worse, as where teeth of a gear meet at another time, is taken shorter for that run.
+    A step that makes a run worse, because the teeth of a gear meet at another time for example, is shortened for that
+    run.
     """
     still = eqx.tree_at(lambda p: p.free, problem, jnp.zeros_like(problem.free))
     run = np.asarray(problem.tape.run)
@@ -253,7 +255,7 @@ def fit_run_unknowns(
         changes = zip(unknowns.runs, step, strict=True)
         trial = RunUnknowns(*(x + share * change for x, change in changes))
         reached = evaluate(still, unknowns._replace(runs=trial))
-        # not where it cannot be simulated
+        # false where the trial cannot be simulated
         better = _squares_of_runs(problem, reached) <= _squares_of_runs(problem, best)
         share = np.where(better, 1.0, share / 4)
         unknowns = unknowns._replace(runs=_select_runs(jnp.asarray(better), trial, unknowns.runs))
@@ -262,7 +264,7 @@ def fit_run_unknowns(
 
 
 def with_holdout_unknowns(problem: Problem, fit: Fit) -> Fit:
-    """A fit in which runs that do not count have found what belongs to each of them, too, where nobody knows a load."""
+    """The fit with the own unknowns of the hold-out runs fitted too, if the load of any of them is unknown."""
     if not np.any(~np.asarray(problem.fitted_runs) & np.asarray(problem.tape.load_unknown)):
         return fit
     unknowns, evaluation = fit_run_unknowns(problem, fit.unknowns)
@@ -277,7 +279,7 @@ def with_holdout_unknowns(problem: Problem, fit: Fit) -> Fit:
 
 
 def _scaled(evaluation: Evaluation, stretch: Float[np.ndarray, "2"]) -> Evaluation:
-    """Residuals and derivatives over another noise."""
+    """Residuals and derivatives multiplied by a factor for each output."""
     return evaluation._replace(
         residuals=evaluation.residuals * stretch[:, None],
         jacobian=evaluation.jacobian * stretch[:, None, None],
@@ -285,21 +287,21 @@ def _scaled(evaluation: Evaluation, stretch: Float[np.ndarray, "2"]) -> Evaluati
 
 
 def _select_runs(chosen: Bool[Array, " runs"], one: RunUnknowns, other: RunUnknowns) -> RunUnknowns:
-    """What belongs to some runs from the one, and what belongs to the others from the other."""
+    """The unknowns of `one` for the chosen runs, those of `other` for the rest."""
     return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), one, other)
 
 
 def _select_blocks(
     blocks: Bool[Array, " blocks"], one: Evaluation, other: Evaluation
 ) -> Evaluation:
-    """One evaluation in some blocks, another one in the others."""
+    """`one` in the chosen blocks, `other` in the rest."""
     return jax.tree.map(jax.vmap(jnp.where), *(Evaluation(*3 * [blocks]), one, other))
 
 
 def gauss_newton_step(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.ndarray, float]:
-    """The step that lowers the sum of squares most, and by how much.
+    """The Gauss-Newton step, and the reduction of the sum of squares that it predicts.
 
-    **Arguments**: `matrix`, as from `normal_matrix`; `held`, which of the `count` coordinates stay.
+    **Arguments**: `matrix`, as from `normal_matrix`; `held`, which of the `count` coordinates stay fixed.
     """
     gradient, hessian = matrix[:-1, -1].copy(), matrix[:-1, :-1].copy()
     if not np.all(np.isfinite(matrix)):
@@ -315,17 +317,17 @@ def gauss_newton_step(matrix: np.ndarray, held: set[int], count: int) -> tuple[n
     visible = values > 1e-12 * values.max(initial=1e-300)
     along = np.where(visible, along, 0.0)
     shrunk = along / np.where(visible, values, 1.0)
-    # rounding errors would carry away what no residual depends on
+    # an unknown that no residual depends on must not drift by rounding errors
     return -(vectors @ shrunk) / lengths * moves, float(along @ shrunk)
 
 
 def _own_noise(
     problem: Problem, squares: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Standard deviation of the residuals of each output, and the old scale over the new; white ones keep theirs.
+    """Standard deviation of the residuals of each output, and the old scale over the new; whitened ones keep theirs.
 
-    At least the share `FLOOR` of what is measured: where there is no noise, the likelihood is greatest if one output
-    is met exactly, whatever becomes of the other.
+    It is at least `FLOOR` times the root mean square of the measurement: without noise, the likelihood is greatest
+    where one output is met exactly, whatever becomes of the other.
     """
     if problem.whitening is not None:
         return np.asarray(problem.noise), np.ones(2)

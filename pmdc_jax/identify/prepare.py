@@ -1,4 +1,4 @@
-"""Recordings checked and laid out as the least-squares problem that they make."""
+"""Checks recordings and lays them out as a least-squares problem."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class Prepared(NamedTuple):
-    """Checked recordings, training runs first, and the least-squares problem they make."""
+    """Checked recordings, training runs first, and their least-squares problem."""
 
     runs: list[Recording]  # evenly sampled
     roles: list[Role]
@@ -41,31 +41,31 @@ class Prepared(NamedTuple):
     known: Mapping[str, float]
     ties: tuple[tuple[str, str], ...]
     problem: Problem
-    # which runs have a speed by their angles
+    # which runs have a speed computed from their angle
     differentiated: tuple[bool, ...] = ()
-    # what was corrected of the records; see `corrections`
-    # ... by run: standard deviation of what was taken out of the record of its drive, for the motor did not feel it
+    # results of the corrections (see `corrections`):
+    # standard deviation of the noise removed from the drive, by name of the run
     input_noise: Mapping[str, float] = MappingProxyType({})
-    # ... of what the speeds are means
+    # how the recorded speeds are averaged, None if they are instantaneous
     averaging: Averaging | None = None
-    # ... when the voltages act, if not from their sample to the next
+    # when the voltages act, None if they are held from their sample to the next
     timing: Timing | None = None
-    # ... whether steps of the voltages were placed between samples
+    # whether steps of the voltages were placed between samples
     stepped: bool = False
 
     @property
     def straight(self) -> bool:
-        """Whether the voltages go straight from sample to sample."""
+        """Whether the voltages are linear from sample to sample instead of held."""
         return self.timing is not None and self.timing.straight
 
     def with_tape(self, **fields: Array | None) -> Prepared:
-        """The same runs with other samples on the tape."""
+        """The same runs with some fields of the tape replaced."""
         tape = replace(self.problem.tape, **fields)
         return self._replace(problem=replace(self.problem, tape=tape))
 
     @property
     def training(self) -> list[Recording]:
-        """The runs that are fitted."""
+        """The training runs."""
         return [run for run, role in zip(self.runs, self.roles, strict=True) if role == "train"]
 
     def parameters(
@@ -73,7 +73,7 @@ class Prepared(NamedTuple):
         effects: Sequence[type[AbstractEffect]],
         bounds: Mapping[str, tuple[float, float]] | None = None,
     ) -> Parameters:
-        """Those of a motor with these effects, within `bounds` of the latter or those of their tables."""
+        """The parameters of a motor with these effects; `bounds` overrides those of the search and of the effects."""
         bounds = {**search_bounds(self.training), **(bounds or {})}
         return Parameters.of(bounds, effects, {**self.untouched, **self.known}, self.ties)
 
@@ -118,7 +118,7 @@ def prepare(
             "with every parameter known nothing is left to identify",
             "Leave one out, R say: it then stays near its value, or tells that something is amiss",
         )
-    # hold-outs lie on the tape too, but do not count: only what is their own is fitted to them
+    # hold-out runs are on the tape too, but only their own unknowns may be fitted to them
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True))
     problem = Problem(
         parameters,
@@ -185,7 +185,7 @@ def _signals(recordings: Sequence[Recording], name: str) -> list[np.ndarray]:
 
 
 def _untouched(recordings: Sequence[Recording], tie: Sequence[tuple[str, str]]) -> dict[str, float]:
-    """Parameters that no run has anything to do with, not even by a tie, at a harmless value."""
+    """Parameters that affect no run, not even through a tie, with a harmless value."""
     touched = {"held": "R L", "torque": "J f", "current": "Kt J f", "voltage": "R L Kb Kt J f"}
     kinds = {"held" if r.held else r.drive for r in recordings}
     known = {name for kind in kinds for name in touched[kind].split()}

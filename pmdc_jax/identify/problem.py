@@ -1,4 +1,4 @@
-"""Recordings as a least-squares problem: what may move, and the residuals with their derivatives."""
+"""Recordings as a least-squares problem: the unknowns, and the residuals with their derivatives."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from ..simulate import LOCAL, RunUnknowns, Tape, sensitivities
 from .parameters import Parameters
 from .whitening import Whitening
 
-# A simulation of which a parameter moves any sample by so many times its noise, a change by rounding would move by
-# its noise: it has derivatives on paper alone, and counts as failed
+# Derivative of an output by an unknown, in noise standard deviations, from which a simulation counts as failed: it is
+# so sensitive that rounding errors make its derivatives meaningless
 WILD = 1e12
 
 
 class Unknowns(NamedTuple):
-    """What a refinement moves: search coordinates, and what each run does not tell."""
+    """The unknowns of a fit: the search coordinates, and what each run has of its own."""
 
     coordinates: Float[Array, " parameters"]
     runs: RunUnknowns
 
 
 class Problem(eqx.Module):
-    """A least-squares problem: runs on tape, the noise to scale by, what may move and which runs count.
+    """A least-squares problem: runs on tape, the noise to scale by, the free coordinates and the runs to fit.
 
-    Runs that do not count (hold-outs) are simulated all the same, and their own unknowns can be fitted.
+    Hold-out runs are simulated too, and their own unknowns can be fitted.
     """
 
     parameters: Parameters
@@ -40,32 +40,32 @@ class Problem(eqx.Module):
     free: Bool[Array, " parameters"]
     fitted_runs: Bool[Array, " runs"]
     whitening: Whitening | None = None  # in place of the noise, where residuals are correlated
-    # what else may have moved the outputs of each run, A and rad/s: of it residuals tell nothing
+    # response of the outputs, A and rad/s, to each nuisance parameter of a run: projected out of the residuals
     nuisance: Float[Array, "blocks 2 samples nuisances"] | None = None
 
     @property
     def outputs(self) -> int:
-        """How many outputs the runs that count have measured."""
+        """How many of the two outputs the training runs have measured."""
         return int(np.count_nonzero(np.asarray(self.tape.weight)[self.fitted_blocks].any((0, 2))))
 
     @property
     def fitted_blocks(self) -> Bool[np.ndarray, " blocks"]:
-        """Which blocks are of runs that count."""
+        """Which blocks belong to training runs."""
         return np.asarray(self.fitted_runs)[np.asarray(self.tape.run)]
 
     @property
     def samples(self) -> Float[np.ndarray, "2"]:
-        """How many samples of each output count."""
+        """Number of measured samples of each output in the training runs."""
         return np.asarray(self.tape.weight)[self.fitted_blocks].sum((0, 2))
 
     @property
     def most_samples(self) -> float:
-        """How many samples of the output count of which most do, one at least."""
+        """Number of measured samples of the output that has more of them, at least one."""
         return max(float(self.samples.max()), 1.0)
 
     @property
     def sizes(self) -> Float[np.ndarray, "2"]:
-        """Root mean square of each output as measured in the runs that count; zero where it was not."""
+        """Root mean square of each output as measured in the training runs; zero where it was not measured."""
         squares = np.square(np.asarray(self.tape.measured)[self.fitted_blocks]).sum((0, 2))
         return np.sqrt(squares / np.maximum(self.samples, 1.0))
 
@@ -76,20 +76,20 @@ class Problem(eqx.Module):
 
     @property
     def has_spring(self) -> bool:
-        """Whether a spring may be wound up as a run begins."""
+        """Whether an effect has a spring, which may be wound up at the start of a run."""
         return any(effect.spring_state for effect in self.parameters.effects)
 
     @property
     def turnable(self) -> Bool[Array, " runs"]:
-        """Which runs may begin at any angle."""
+        """Which runs have an unknown initial rotor angle."""
         tape, known = self.tape, jnp.asarray(self.tape.angle_known)
-        # where nobody knows an angle, that of the first run is the zero from which phases count
+        # if no angle is known, that of the first run is the reference for the phases
         zero = ~jnp.any(known) & (jnp.arange(tape.runs) == 0)
         measured = jax.ops.segment_sum(jnp.sum(tape.weight, (1, 2)), tape.run, tape.runs) > 0
         return measured & ~known & ~zero
 
     def moves(self) -> Bool[Array, "runs columns"]:
-        """Which coordinates and which of its own unknowns each run may tell of."""
+        """Which coordinates and which of its own unknowns each run can determine."""
         tape = self.tape
         first = jnp.argmax(jnp.asarray(tape.run)[None, :] == jnp.arange(tape.runs)[:, None], axis=1)
         drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid][first] > 0, tape.drive)
@@ -112,17 +112,17 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
-    """Simulate every run of the problem and compare."""
-    # Levenberg-Marquardt traces under an empty mesh; under no mesh at all everything would be traced once more
+    """Simulate every run of the problem and compare it with the measurement."""
+    # Levenberg-Marquardt traces under an empty mesh; without a mesh everything would be traced a second time
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-        # whitened apart, for the simulation takes long to compile
+        # without whitening and nuisance, so that the simulation, slow to compile, is compiled only once
         bare = replace(problem, whitening=None, nuisance=None)
         simulated = (_evaluate if bare.parameters.effects else _evaluate_linear)(bare, unknowns)
         return weighed(problem, _less_nuisance(problem, simulated))
 
 
 def weighed(problem: Problem, plain: Evaluation) -> Evaluation:
-    """A free run with its residuals over the noise, those made white where the problem asks for it."""
+    """The evaluation with whitened residuals and derivatives, if the problem has a whitening filter."""
     return plain if problem.whitening is None else _whitened(problem, plain)
 
 
@@ -136,12 +136,12 @@ def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
     return Evaluation(seen, jnp.where(wild[:, None, None], jnp.inf, residuals), jacobian)
 
 
-# what is compiled quickly runs as fast where there are no effects, and up to a third longer where there are
+# `quickly_compiled` programs are as fast as others without effects, and up to a third slower with them
 _evaluate, _evaluate_linear = compiled(_evaluated), quickly_compiled(_evaluated)
 
 
 def _less_nuisance(problem: Problem, plain: Evaluation) -> Evaluation:
-    """A free run with residuals and derivatives that are orthogonal to what else may have moved its outputs."""
+    """The evaluation with residuals and derivatives orthogonal to the responses to the nuisance parameters, if any."""
     return plain if problem.nuisance is None else _orthogonal(problem, plain)
 
 
@@ -156,7 +156,7 @@ def _orthogonal(problem: Problem, plain: Evaluation) -> Evaluation:
     )
     count = nuisance.shape[-1]
     gram, along = products[..., :count], products[..., count:]
-    # runs with fewer unknowns have columns of zeros
+    # runs with fewer nuisance parameters have columns of zeros
     gram = (
         gram + jnp.eye(count) * jnp.where(jnp.diagonal(gram, axis1=1, axis2=2) > 0, 0, 1)[:, None]
     )
@@ -177,7 +177,7 @@ def _whitened(problem: Problem, plain: Evaluation) -> Evaluation:
 def normal_matrix(
     evaluation: Evaluation, tape: Tape, fitted_runs: Bool[Array, " runs"] | np.ndarray
 ) -> Float[Array, "unknowns unknowns"]:
-    """[J r]' [J r] over all unknowns: coordinates, then the locals run by run, then the residual."""
+    """[J r]' [J r], columns: the coordinates, the own unknowns of run after run, and last the residual."""
     _, r, jacobian = evaluation
     both = jnp.concatenate([jacobian, r[..., None]], -1)
     of_block = jnp.einsum("bcsi,bcsj->bij", both, both)
@@ -188,7 +188,7 @@ def normal_matrix(
 
 
 def _columns(count: int, runs: int) -> np.ndarray:
-    """Where each run's columns lie among all unknowns and the residual."""
+    """Indices of each run's columns among all unknowns and the residual."""
     own = count + LOCAL * np.arange(runs)[:, None] + np.arange(LOCAL)
     shared = np.broadcast_to(np.arange(count), (runs, count))
     return np.concatenate([shared, own, np.full((runs, 1), count + LOCAL * runs)], 1)

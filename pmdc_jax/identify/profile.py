@@ -1,4 +1,4 @@
-"""Profile likelihood intervals, where a parabola is a poor picture of the sum of squares."""
+"""Profile likelihood intervals, for parameters in which the sum of squares is not quadratic."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ import numpy as np
 from .polish import gauss_newton_step
 from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
-# A coordinate (natural logarithm) surer than this is as good as quadratic: its profile is not drawn.
+# For a coordinate (natural logarithm) with a smaller standard error the sum of squares is close enough to quadratic.
 QUADRATIC = 0.05
 ROUNDS = 5  # of the search for each end of the interval
-REFITS = 3  # Gauss-Newton steps of the other unknowns to each trial, at most
-# ... after which one more would lower the sum of squares by no larger share of the rise that is looked for
+REFITS = 3  # Gauss-Newton steps of the other unknowns for each trial, at most
+# Refits end when one more step would lower the sum of squares by less than this share of the rise that is sought
 CLOSE = 0.05
 
 
 class _Point(NamedTuple):
-    """A point on the profile: the normal matrix there, and the sum of squares that one more step foretells."""
+    """A point on the profile: the normal matrix there, and the sum of squares predicted after one more step."""
 
     unknowns: Unknowns
     matrix: np.ndarray
     squares: float
-    gain: float  # of that step
+    gain: float  # reduction by that step
 
 
 def profile_interval(
     problem: Problem, best: Unknowns, index: int, spread: float, inflation: float, reach: float
 ) -> tuple[float, float]:
-    """Ends of the interval of one coordinate in which the refitted sum of squares stays low.
+    """Ends of the profile likelihood interval of one coordinate.
 
-    With the coordinate held at a trial value everything else is refitted; the interval ends where the sum of
+    With the coordinate held at a trial value, all other unknowns are refitted; the interval ends where the sum of
     squares, over the noise variance, has risen by `reach`^2 times `inflation`.
 
-    **Arguments**: `index` of the coordinate; `spread`, its standard error, to start from; `inflation`, how much
-    larger its variance is than white residuals would give; `reach`, 1.96 for 95 %.
+    **Arguments**: `best`, the optimum; `index` of the coordinate; `spread`, its standard error, to start from;
+    `inflation`, its variance over that for white residuals; `reach` in standard errors, 1.96 for 95 %.
 
     **Source**: Venzon, Moolgavkar, Applied Statistics 37 (1988), doi:10.2307/2347496; scaled for correlated
     residuals as a quasi-likelihood, McCullagh (1983).
@@ -51,7 +51,7 @@ def profile_interval(
             trial = centre + sign * min(distance, abs(limit - centre))
             point = _refitted(problem, point, index, trial, close)
             rise = np.sqrt(max(point.squares - lowest.squares, 1e-12) / inflation)
-            # the root of the rise is a straight line where the picture is quadratic
+            # the root of the rise grows linearly with distance where the sum of squares is quadratic
             distance = abs(trial - centre) * min(max(reach / rise, 0.3), 3.0)
             if abs(rise / reach - 1) < 0.02:
                 break
@@ -60,7 +60,7 @@ def profile_interval(
 
 
 def _refitted(problem: Problem, point: _Point, index: int, value: float, close: float) -> _Point:
-    """The point of the profile where the coordinate has a value, found from another one."""
+    """The point of the profile at a value of the coordinate, found from another point."""
     for _ in range(REFITS):
         point = _point(problem, _moved(problem, point, index, value), index)
         if not close < point.gain < np.inf:
@@ -69,7 +69,7 @@ def _refitted(problem: Problem, point: _Point, index: int, value: float, close: 
 
 
 def _moved(problem: Problem, point: _Point, index: int, value: float) -> Unknowns:
-    """The coordinate at a value, and all other unknowns where a step along the profile leads with it."""
+    """The unknowns with the coordinate at a value and all others moved along the profile by a Gauss-Newton step."""
     unknowns, count = point.unknowns, len(point.unknowns.coordinates)
     delta, matrix = value - float(unknowns.coordinates[index]), point.matrix.copy()
     matrix[:-1, -1] += delta * matrix[:-1, index]

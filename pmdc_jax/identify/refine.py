@@ -24,16 +24,17 @@ class Optimum(NamedTuple):
     unknowns: Unknowns
     fitness: float  # squared residuals over the noise variances, over the samples of the output that has most
     at_bound: tuple[int, ...]  # which coordinates were held at a bound
-    converged: bool  # by the gradient, not by the solver's word
+    converged: bool  # judged by the gradient, not by the solver's own criterion
 
 
 Columns = Float[Array, " columns"]
-# The problem, where its unknowns began, what they are measured in, and the sum of squares that the residuals are over
+# The problem, the start and the scales of its unknowns, and the sum of squares that normalises the residuals
 Task = tuple[Problem, Columns, Columns, Float[Array, ""]]
 
 
-# Levenberg-Marquardt needs of the residuals r and their Jacobian J no more than J'J, J'r and r'r. So it is given
-# the smallest residual vector with the same ones, as long as there are unknowns instead of samples.
+# Levenberg-Marquardt depends on the residuals r and their Jacobian J only through J'J, J'r and r'r. It is therefore
+# given the shortest residual vector with the same products: its length is the number of unknowns plus one, instead of
+# the number of samples.
 @eqx.filter_custom_jvp
 def compressed(flat: Columns, args: Task) -> Float[Array, " columns+1"]:
     return _factor(flat, args)[:, -1]
@@ -52,13 +53,13 @@ def _compressed_jvp(
 
 def _factor(flat: Columns, args: Task) -> Float[Array, "columns+1 columns+1"]:
     problem, begun, scale, size = args
-    # optimistix promotes strictly; with the usual promotion what was traced before is found again
+    # optimistix promotes dtypes strictly; under standard promotion earlier traces are reused
     with jax.numpy_dtype_promotion("standard"):
         evaluation = evaluate(problem, _unscaled(problem, flat, begun, scale))
         matrix = normal_matrix(evaluation, problem.tape, problem.fitted_runs)
     stretch = jnp.append(scale, 1.0)
     matrix = matrix * stretch[:, None] * stretch / size
-    # a failed simulation must look bad, not equal to nothing
+    # a failed simulation must have a large sum of squares: NaN cannot be compared
     bad = ~jnp.all(jnp.isfinite(matrix))
     matrix = jnp.where(bad, jnp.zeros_like(matrix).at[-1, -1].set(1e12), matrix)
     values, vectors = jnp.linalg.eigh(matrix)
@@ -66,7 +67,7 @@ def _factor(flat: Columns, args: Task) -> Float[Array, "columns+1 columns+1"]:
 
 
 def _unscaled(problem: Problem, flat: Columns, begun: Columns, scale: Columns) -> Unknowns:
-    """Unknowns of which those without a scale stay where they began: rounding errors would carry them away."""
+    """The unknowns in their units; those without a scale stay at their start, from which rounding would move them."""
     return unflatten(problem, jnp.where(scale > 0, flat * scale, begun))
 
 
@@ -94,13 +95,15 @@ def _levenberg_marquardt(
 def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-3) -> Optimum:
     """Levenberg-Marquardt from a start, within the bounds.
 
-    optimistix has no bounds, so they are an active set: a coordinate that ends beyond its bound is held there
-    and the others are refined again.
+    optimistix has no bounds, so an active set is used: a coordinate that ends beyond its bound is held there and the
+    others are refined again.
+
+    **Arguments**: `tolerance`, relative and absolute, of the solver.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
     matrix = np.asarray(normal_matrix(evaluate(problem, start), problem.tape, problem.fitted_runs))
     size = max(matrix[-1, -1], 1e-30)
-    # each run's own unknowns are measured in what changes the residual as much as e-fold in a parameter might
+    # parameters are scaled to factors of e, a run's own unknowns to changes that equal the norm of the residuals
     lengths = np.sqrt(np.diag(matrix)[:-1] / size)
     scale = np.where(lengths > 0, 1 / np.where(lengths > 0, lengths, 1.0), 0.0)
     scale[: len(low)] = 1.0

@@ -1,4 +1,4 @@
-"""What a fit tells of every parameter and of every run."""
+"""Results of an identification: estimates, intervals and the fit of every run."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from .solve import SAME, Solved
 from .uncertainty import FLAT, Information, information_of
 
 TIE_ITERATIONS = 3
-# What a fit leaves is told of if it is so many times the white noise
+# Residuals this many times their white noise are reported
 MISSED = 2.0
-# Of what drives a motor
+# Units of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
-# Over what a speed may be a mean
+# Spans over which a speed may be averaged
 MEANS = {OVER_LAST: "the last sample", OVER_BOTH: "the last and the next sample"}
-# A parameter is unseen alone if so much of it is unseen at all
+# A parameter is unseen by itself if at least this share of it lies in unseen directions
 ALONE = 0.99
-# ... and large enough to show if it changes the outputs by this share of what the strongest one does
+# A parameter is visible if it changes the outputs by this share of what the most sensitive one does
 TO_SHOW = 0.3
 
 
 def results_of(given: Prepared, solved: Solved) -> Identification:
-    """What a fit tells of every parameter and of every run."""
+    """The result of a fit: estimates with uncertainty and status, and the fit of every run."""
     problem, training = given.problem, given.training
     polished = _released_from_bounds(problem, solved.fit)
     parameters = problem.parameters
@@ -79,14 +79,14 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
 def _intervals(
     problem: Problem, best: Optimum, info: Information
 ) -> dict[int, tuple[float, float]]:
-    """The 95 % intervals of the coordinates that have one, as many at a time as there are cores."""
+    """The 95 % intervals of the identified coordinates, in parallel on all cores."""
     coordinates = np.asarray(best.unknowns.coordinates)
-    # teeth that meet at another moment change all that follows: next to the fit squares leap, and no profile is smooth
+    # teeth that meet at another moment change all that follows: the sum of squares jumps, and no profile is smooth
     leaps = problem.parameters(best.unknowns.coordinates).toothed is not None
 
     def interval(k: int) -> tuple[float, float]:
         spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.interval_factor[k])
-        # no refit follows an unseen direction as far as the truth may lie along it
+        # the refits of a profile would not reach as far along an unseen direction as the truth may lie
         hidden = info.unseen_variance[k] > info.covariance[k, k] / 2
         sure = not problem.parameters.logarithmic[k] or spread < QUADRATIC
         if sure or hidden or leaps:
@@ -98,7 +98,8 @@ def _intervals(
 
 
 def _released_from_bounds(problem: Problem, polished: Fit) -> Fit:
-    """The fit with no coordinate held at its bound that lies there by chance, along an unseen direction of several."""
+    """The fit with those coordinates released from their bound that an unseen direction of several parameters leaves
+    arbitrary."""
 
     def released(held: Sequence[int]) -> Fit:
         return polished._replace(optimum=polished.optimum._replace(at_bound=tuple(held)))
@@ -110,15 +111,16 @@ def _released_from_bounds(problem: Problem, polished: Fit) -> Fit:
 
 
 def _invisible_alone(parameters: Parameters, info: Information) -> list[int]:
-    """Positive parameters that alone change nothing, as where one is next to nothing."""
+    """Positive parameters that change nothing by themselves, because they are nearly zero for example."""
     return [int(k) for k in np.flatnonzero(info.unseen_share > ALONE) if parameters.logarithmic[k]]
 
 
 def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
-    """A fit as good with a parameter as large as to show, if there is one: only there it shows what it trades with.
+    """An equally good fit in which parameter `k` is large enough to be visible, None if there is no such fit. Only
+    there do the derivatives show which parameters it trades off against.
 
-    Where voltage and speed alone are measured, friction may be nothing, and then Kb is what turns a volt into speed;
-    or friction takes its share of the volt, and Kb is less.
+    Where only voltage and speed are measured, friction may be zero and Kb alone decides the speed per volt, or friction
+    takes part of the voltage and Kb is smaller.
     """
     jacobian = np.asarray(polished.evaluation.jacobian)[problem.fitted_blocks]
     lengths = np.sqrt(np.square(jacobian[..., : len(problem.free)]).sum((0, 1, 2)))
@@ -130,16 +132,16 @@ def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
     unknowns = polished.unknowns._replace(coordinates=jnp.asarray(coordinates))
     held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
     lifted = polish(held, polished.optimum._replace(unknowns=unknowns))
-    # no fit at all, if it ended where nothing can be simulated
+    # false where the simulation failed: its fitness is infinite
     as_good = lifted.fitness <= polished.fitness * (1 + SAME)
     return polish(problem, lifted.optimum._replace(at_bound=()), steps=0) if as_good else None
 
 
 def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit:
-    """Along an unseen direction in which Kt may be anything, choose Kt = Kb, equals in SI.
+    """The fit moved along an unseen direction in which Kt is arbitrary, to Kt = Kb, which are equal in SI.
 
-    The direction is straight only nearby, so whatever else is free is refined again; a fit that is worse
-    then is no choice.
+    The direction is straight only locally, so all other free parameters are refined again; a fit that is worse then is
+    rejected.
     """
     names, best = problem.parameters.names, polished.optimum
     if "Kt" not in names or "Kb" not in names:
@@ -174,7 +176,7 @@ def _estimates(
     given: Prepared,
     intervals: Mapping[int, tuple[float, float]],
 ) -> dict[str, Estimate]:
-    """What to say of each parameter, by the 95 % intervals of the coordinates that have one."""
+    """The estimate of each parameter, from the 95 % `intervals` of the identified coordinates."""
     coordinates = np.asarray(best.unknowns.coordinates)
     ties = dict(parameters.ties)
     names = [*PARAMETERS, *(n for n in parameters.names if n not in PARAMETERS)]
@@ -219,7 +221,7 @@ def _fits(
     seen: np.ndarray,
     own: RunUnknowns,
 ) -> dict[str, RunFit]:
-    # as it was fitted, less what its sensor put into it
+    # the speed as it was fitted: corrected for what the sensor added, without samples that do not count
     fitted = np.where(np.asarray(tape.weight) > 0, tape.measured, np.nan)[:, 1]
     fits = {}
     for index, (run, role) in enumerate(zip(even, roles, strict=True)):
@@ -261,14 +263,14 @@ def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | 
 
 
 def _measured_and_left(fit: Mapping[str, RunFit], name: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """An output as measured, and what the fit leaves of it, in every run that has it."""
+    """An output as measured and its residuals, in every training run that has it."""
     runs = [f for f in fit.values() if f.role == "train"]
     pairs = [(getattr(f, name), getattr(f, f"{name}_simulated")) for f in runs]
     return [(m, m - s) for m, s in pairs if m is not None and s is not None]
 
 
 def _missed(fit: Mapping[str, RunFit]) -> dict[str, float]:
-    """The outputs of which far more is left than the noise of their runs: how many times as much."""
+    """RMS of the residuals over the white noise of the runs, for the outputs for which it is above `MISSED`."""
     times = {}
     for name in ("current", "speed"):
         scaled = [

@@ -1,4 +1,4 @@
-"""How far the rotor turned in each sample, for torques that depend on its angle."""
+"""The angle that the rotor turns in each sample, for torques that depend on it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ..simulate import free_run
 from .polish import Fit
 from .problem import Problem
 
-# Neighbouring frequencies over which the power of a misfit is averaged
+# Neighbouring frequencies over which the power of the residuals is averaged
 NEIGHBOURS = 33
 # Median of the square of a normal variable, over its variance
 MEDIAN = 0.4549
 
 
 def of_rotor(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
-    """Current and speed of the rotor itself, A and rad/s, where something else of them is reported: a free run."""
+    """Simulated current and speed of the rotor itself, A and rad/s, without sensor effects and averaging."""
     effects, tape = problem.parameters.effects, problem.tape
     if tape.averaging is None and all(effect.equation != "sensor" for effect in effects):
         return fit.evaluation.seen
@@ -32,11 +32,11 @@ def of_rotor(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
 
 
 def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
-    """The problem with its rotor turned as well as recordings and simulation together tell.
+    """The problem with the rotor angle estimated from recordings and simulation together.
 
-    The angle is the integral of the speed. That of the measured one strays by the sensor's noise, that of the
-    simulated one by whatever torque disturbs the motor: the speed is the simulated one, of the rotor itself, and that
-    part of the misfit that is motion, before a sensor made it late.
+    The angle is the integral of the speed. Integrating the measured speed accumulates the sensor's noise, integrating
+    the simulated one the effect of torque disturbances. The speed is therefore the simulated one of the rotor itself,
+    plus the part of the residual that is motion, with the delay of the sensor undone.
     """
     motor = problem.parameters(fit.coordinates)
     tape, seen = problem.tape, np.asarray(fit.evaluation.seen)
@@ -66,17 +66,17 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
 
 
 def motion(error: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """The part of measured less simulated speed that is motion and no noise of the sensor.
+    """The part of measured minus simulated speed that is motion instead of sensor noise.
 
-    By Wiener's smoother: every frequency counts with the share of its power that is above the white noise,
-    which the upper half of the spectrum shows.
+    A Wiener smoother: every frequency is weighted by the share of its power that exceeds the white noise, whose level
+    is taken from the upper half of the spectrum.
 
     **Source**: Wiener, "Extrapolation, Interpolation, and Smoothing of Stationary Time Series" (1949).
     """
     spectrum = np.asarray(fft.dct(error, norm="ortho"))
     power = spectrum**2
     noise = np.median(power[len(power) // 2 :]) / MEDIAN
-    # what the average over so few may be by chance alone is no motion
+    # two standard deviations of the average of so few powers: fluctuations of the noise are no motion
     noise *= 1 + 2 * np.sqrt(2 / NEIGHBOURS)
     around = ndimage.uniform_filter1d(power, NEIGHBOURS, mode="reflect")
     share = np.clip(1 - noise / np.maximum(around, 1e-300), 0.0, 1.0)

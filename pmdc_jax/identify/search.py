@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 
 class Method(NamedTuple):
-    """A search: where evosax keeps it, and the population and generations it is good at."""
+    """A search: its evosax algorithm, and the default population and number of generations."""
 
     algorithm: Callable[[], type]
     population: int
     generations: int
-    distribution: bool = False  # evolves a distribution from a mean, not a population
+    distribution: bool = False  # evolves a distribution that starts from a mean, not a population
 
 
 def _binary_ga() -> type:
@@ -55,7 +55,7 @@ METHODS: Mapping[str, Method] = {
 
 # A distribution starts from the best of this many candidates scattered over the bounds.
 SCATTERED = 256
-# ... with this standard deviation, in the unit cube: the best of so many is not far off.
+# ... with this standard deviation in the unit cube: the best of that many is not far from the optimum.
 SPREAD = 0.15
 
 # The search may stop once the best tenth of the population agree this well, in natural logarithms.
@@ -63,7 +63,7 @@ AGREED = 0.1
 
 
 class Found(NamedTuple):
-    """All that the search leaves behind."""
+    """The result of a search."""
 
     candidates: np.ndarray  # (kept, parameters) coordinates, best first
     fitness: np.ndarray  # (kept,)
@@ -85,13 +85,15 @@ def search(
 ) -> Found:
     """Search the bounds of `parameters` for motors that reproduce the tape.
 
-    The fitness is the paper's equation (10), F1 + a F2, mean square speed error plus `a` times mean square
-    current error, over the variance of the noise of speed: `a` is the ratio of the two variances, so that a
-    perfect model has 2 (or 1 with a single output). Simulations that fail count as infinitely bad.
+    The fitness is the paper's equation (10), F1 + a F2 (mean square speed error plus a times mean square current
+    error), divided by the noise variance of the speed. With a the ratio of the noise variances of speed and current, a
+    perfect model has fitness 2, or 1 with a single output. Failed simulations count as infinitely bad.
 
     **Arguments**: `noise`, standard deviations of current (A) and speed (rad/s); `method`, a key of `METHODS`;
-    `population` and `generations`, by default the method's own; `progress`, called every generation.
-    Interrupted from the keyboard, the search ends with what it has.
+    `population` and `generations`, by default the method's own; `progress`, called in every generation.
+    An interrupt from the keyboard ends the search with the candidates found so far.
+
+    **Raises**: `InputError` on an unknown method.
     """
     if method not in METHODS:
         raise InputError(
@@ -132,15 +134,15 @@ Value = Array | np.ndarray
 
 
 class Kind(NamedTuple):
-    """Of a search, what its programs are compiled for."""
+    """What the programs of a search are compiled for."""
 
     method: str
     population: int
     dimensions: int
 
 
-# Two programs, for step by step evosax compiles dozens. They hand on the state of evosax's algorithm as a tuple: where
-# the programs were kept, evosax need not even be imported.
+# Two compiled programs, because evosax called step by step compiles dozens. They pass the state of its algorithm on as
+# a tuple, so that with cached programs evosax need not even be imported.
 
 Leaves = tuple[Array, ...]  # of evosax's state
 Asked = tuple[Float[Array, "population dimensions"], Leaves]
@@ -148,7 +150,7 @@ Asked = tuple[Float[Array, "population dimensions"], Leaves]
 
 @quickly_compiled
 def _begin(kind: Kind, seed: Value, *start: Value) -> Asked:
-    """The first points of the unit cube to try, (population, dimensions), and the state to go on from."""
+    """The first points of the unit cube to evaluate, (population, dimensions), and the state of the algorithm."""
     algorithm, settings = _algorithm(kind)
     return _asked(kind, seed, 1, algorithm.init(jax.random.key(seed), *start, settings))
 
@@ -157,7 +159,7 @@ def _begin(kind: Kind, seed: Value, *start: Value) -> Asked:
 def _go_on(
     kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Value, state: Leaves
 ) -> Asked:
-    """The next points to try after those of the `cube` turned out so fit, and the state to go on from."""
+    """The next points to evaluate, given the fitness of those of the `cube`, and the state of the algorithm."""
     algorithm, settings = _algorithm(kind)
     start = (cube[0],) if METHODS[kind.method].distribution else (cube, fitness)
     like = algorithm.init(jax.random.key(0), *start, settings)
@@ -180,14 +182,14 @@ def _keys(seed: Value, generation: Value | int) -> Array:
 def _algorithm(kind: Kind) -> tuple[EvolutionaryAlgorithm, Params]:
     """evosax's algorithm and its settings."""
     method = METHODS[kind.method]
-    with jax.ensure_compile_time_eval():  # it is kept, and asked for while a program is traced
+    with jax.ensure_compile_time_eval():  # called within a trace, it must not cache tracers
         algorithm = method.algorithm()(kind.population, jnp.zeros(kind.dimensions))
         default = algorithm.default_params
     return algorithm, default.replace(std_init=SPREAD) if method.distribution else default
 
 
 def _strongly_typed(leaf: Array) -> Array:
-    """With a type that is not weak, as it is after a step: otherwise the first step would be compiled apart."""
+    """The leaf with a strong type, as after a step: with a weak one the first step would be compiled separately."""
     return jax.lax.convert_element_type(leaf, leaf.dtype)
 
 
@@ -196,12 +198,12 @@ class _Fitness:
 
     def __init__(self, parameters: Parameters, tape: Tape, noise: np.ndarray) -> None:
         self.parameters, self.noise = parameters, noise
-        # on the device once, not at every generation
+        # transferred to the device once instead of in every generation
         self.tape: Tape = jax.tree.map(jnp.asarray, tape)
         self.samples = np.maximum(np.asarray(tape.weight).sum((0, 2)), 1.0)
 
     def scattered(self, coordinates: np.ndarray, size: int) -> np.ndarray:
-        """Many candidates in populations of the usual size, for which the simulation is compiled already."""
+        """The fitness of many candidates, in populations of about `size`, for which the simulation is compiled."""
         parts = np.array_split(coordinates, max(1, len(coordinates) // size))
         return np.concatenate([self(part) for part in parts])
 

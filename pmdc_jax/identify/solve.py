@@ -36,11 +36,11 @@ from .search import search as global_search
 STARTS = 4
 # Two refinements found the same optimum if their fitness agrees to this share.
 SAME = 1e-4
-# A fit worse than this many times the noise asks for another search, up to so many.
+# A mean square of the residuals above this many noise variances asks for another search, up to this many in all.
 POOR = 1.5
 SEARCHES = 5
 ANGLE_ITERATIONS = 3
-# Starts nearer to each other than this, in natural logarithms, are one.
+# Starts that differ by less than this in all natural logarithms count as one.
 DISTINCT = 0.3
 
 
@@ -57,9 +57,9 @@ class Solved(NamedTuple):
 def solve(
     given: Prepared, search: str, seed: int, progress: ReportProgress | None = None
 ) -> tuple[Prepared, Solved]:
-    """The best fit of a search, to runs less what their sensors put into them that is no motion of the motor.
+    """The best fit of a search, to runs corrected for artefacts of their sensors and for the timing of their inputs.
 
-    **Returns**: the problem as `searched` leaves it, and then whatever takes out such a thing, and the fit.
+    **Returns**: the problem as `searched` returns it, corrected, and the fit to it.
     """
     recorded = given = clearly_averaged(given)
     given, solved = _corrected(*searched(given, search, seed, progress))
@@ -75,7 +75,7 @@ def solve(
     return min(found, key=lambda ended: negative_log_likelihood_within(ended[0], ended[1].fit))
 
 
-# Of every set of runs, in this order: what is uneven hides all else, and a mean is told by a noise that is the sensor's
+# Applied in this order: uneven sampling hides everything else, and a mean is recognised by the sensor's own noise
 CORRECTIONS: tuple[Callable[[Prepared, Fit], tuple[Prepared, Fit]], ...] = (
     on_clock,
     without_input_noise,
@@ -84,7 +84,7 @@ CORRECTIONS: tuple[Callable[[Prepared, Fit], tuple[Prepared, Fit]], ...] = (
 
 
 def _corrected(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
-    """The runs less what their sensors put into them, and the fit to them."""
+    """The runs corrected for artefacts of their sensors, and the fit to them."""
     fit = with_holdout_unknowns(given.problem, solved.fit)
     for correct in CORRECTIONS:
         given, fit = correct(given, fit)
@@ -98,9 +98,10 @@ def searched(
     progress: ReportProgress | None = None,
     searches: int = SEARCHES,
 ) -> tuple[Prepared, Solved]:
-    """Search the bounds, refine the best candidates; again, by another seed, while the fit is poor: `searches` in all.
+    """Search the bounds and refine the best candidates; repeat with other seeds while the fit is poor or no two
+    refinements agree, up to `searches` searches in all.
 
-    **Returns**: the problem, its rotor turned as the fit says where a torque depends on the angle, and the fit.
+    **Returns**: the problem, with the rotor angle updated from the fit where a torque depends on it, and the fit.
     """
     began = time.perf_counter()
     report = progress or silent
@@ -112,7 +113,7 @@ def searched(
         return global_search(sought, searching, noise, search, seed, progress=progress)
 
     middle = (problem.parameters.lower + problem.parameters.upper) / 2
-    # a refinement that gives up at once: it is compiled on another core while the search runs
+    # a refinement that stops at once, so that it is compiled on another core while the search runs
     compiled = beside(refine, problem, _start(problem.tape, middle), tolerance=1e3)
     found = look(seed)
     searched = time.perf_counter()
@@ -132,7 +133,7 @@ def searched(
 
 
 def _where_effects_show(given: Prepared) -> Parameters:
-    """The parameters within narrower bounds: a search need not cross where nothing shows."""
+    """The parameters within narrower bounds: the search can skip values at which an effect does not show."""
     effects = given.problem.parameters.effects
     return given.parameters(effects, effect_bounds(effects, given.training))
 
@@ -140,7 +141,7 @@ def _where_effects_show(given: Prepared) -> Parameters:
 def polish_with_angle(
     given: Prepared, end: Optimum, known: Evaluation | None = None
 ) -> tuple[Prepared, Fit]:
-    """Polish; again, as long as it helps, where a torque depends on how the better motor turns."""
+    """Polish; where a torque depends on the rotor angle, update the angle from the fit and repeat while that helps."""
     polished = polish(given.problem, end, known=known)
     for _ in range(ANGLE_ITERATIONS if given.problem.angular else 0):
         again = given._replace(problem=with_rotor_angle(given.problem, polished))
@@ -156,9 +157,9 @@ def _start(tape: Tape, coordinates: jax.Array | np.ndarray) -> Unknowns:
 
 
 def _distinct(found: Found, parameters: Parameters) -> list[np.ndarray]:
-    """The best few candidates that are not nearly the same, and the best once more with a middling L.
+    """The best few clearly different candidates, preceded by the best one with L in the middle of its range.
 
-    Where L is too small to matter the misfit is flat, and nothing leads back from there.
+    Where L is too small to matter the sum of squares is flat in it, and no gradient leads back.
     """
     kept: list[np.ndarray] = []
     if "L" in parameters.names:
@@ -174,7 +175,7 @@ def _distinct(found: Found, parameters: Parameters) -> list[np.ndarray]:
 
 
 def _refine_all(problem: Problem, found: Found) -> list[Optimum]:
-    """Refine the best distinct candidates of a search, one a core at a time, until they agree; the best first."""
+    """Refine the best distinct candidates of a search, one on each core at a time, until they agree; the best first."""
     starts = [_start(problem.tape, candidate) for candidate in _distinct(found, problem.parameters)]
 
     def agreed(ends: list[Optimum]) -> bool:
@@ -188,9 +189,9 @@ def _fitness(end: Optimum) -> float:
 
 
 def _agreed(ends: Sequence[Optimum], outputs: int) -> bool:
-    """Whether several starts ended in the best optimum, and it is as good as the noise or was found often.
-
-    A misfit may be the model's, or an optimum of the search's own making: only another search can tell.
+    """Whether the best optimum was found often enough: twice if its residuals are about as small as the noise, else by
+    more starts than one search has. Larger residuals may be due to the model or to a local optimum: only another search
+    can tell.
     """
     needed = 2 if ends[0].fitness < POOR * outputs else STARTS + 1
     return _times_found(ends) >= needed

@@ -1,4 +1,4 @@
-"""How sure an estimate is, when residuals are correlated, and which directions the data cannot see."""
+"""Covariance of an estimate whose residuals are correlated, and the directions that the data do not determine."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from .polish import Fit
 from .problem import Problem
 
 REACH = NormalDist().inv_cdf(0.975)  # of a 95 % interval, in standard errors
-# A direction known no better than this, as standard error of a logarithm, counts as unseen.
+# A direction with at least this standard error, of a logarithm, counts as unseen.
 FLAT = 0.5
-# Stretches into which a run is summed for its long-run variance. Measured on white noise and three slow ones, each
-# in 60 x 6 runs of 5,000 samples: 2,000 and 500 miss slow noise (standard errors down to a fifth), 50 scatters.
+# Stretches into which a run is summed for its long-run variance. Measured on white and on three kinds of slow noise,
+# 60 x 6 runs of 5,000 samples each: 2,000 and 500 miss slow noise (standard errors down to a fifth), 50 scatters.
 STRETCHES = 100
-# Parts of a run that are left out one at a time: longer than any memory that a filter of the noise left in them
+# Parts of a run that are left out one at a time: longer than any correlation that a noise filter leaves
 PARTS = 10
-# ... and the share of all that is known of a direction that one part may have to itself, to be left out at all
+# Largest share of the information on a direction that one part is taken to hold: without it little would be left
 MOST_OF_ALL = 0.9
-# Chance that white noise makes the parts disagree so much that intervals follow them
+# Probability that white noise alone makes the parts disagree so much that the intervals follow them
 BY_CHANCE = 0.05
-# How far along an unseen direction the truth may lie, as standard deviation of a logarithm: a factor of twenty.
+# Standard deviation of a logarithm along an unseen direction: a factor of twenty
 ANYWHERE = 3.0
 
 
@@ -38,8 +38,8 @@ class Information(NamedTuple):
     interval_factor: Float[np.ndarray, " parameters"]  # of a 95 % interval, in standard errors
     unseen_variance: Float[
         np.ndarray, " parameters"
-    ]  # of the variance, what unseen directions leave open
-    unseen: tuple[np.ndarray, ...]  # unit vectors, logarithms of parameters
+    ]  # part of the variance that comes from the unseen directions
+    unseen: tuple[np.ndarray, ...]  # unit vectors in the coordinates
 
     @property
     def unseen_share(self) -> Float[np.ndarray, " parameters"]:
@@ -57,7 +57,7 @@ class Part(NamedTuple):
 
 
 def information_of(problem: Problem, polished: Fit) -> Information:
-    """What the runs that count tell about the coordinates that a fit left free; see `information`."""
+    """What the training runs tell about the coordinates that a fit does not hold at a bound; see `information`."""
     found, held = polished.evaluation, polished.at_bound
     free = np.array([k not in held for k in range(len(problem.parameters.names))])
     runs = int(np.sum(problem.fitted_runs))
@@ -71,19 +71,20 @@ def information(
     free: Bool[np.ndarray, " parameters"],
     runs: int,
 ) -> Information:
-    """Covariance of the estimated coordinates that stays right when residuals are correlated.
+    """Covariance of the estimated coordinates that stays valid when the residuals are correlated.
 
-    With H = sum J'J, the estimate's error is H^-1 sum_k J_k' r_k. Each run's own unknowns are projected out; then
-    the variance of the sum is the long-run variance of its terms, whatever their correlation in time. It is at least
-    that for white residuals, and what comes of leaving out one part of a run after another where that is clearly more:
-    a few moments may decide, such as those at which a rotor breaks loose, and a fit goes through the noise of those.
+    With H = sum J'J, the error of the estimate is H^-1 sum_k J_k' r_k. Each run's own unknowns are projected out; the
+    variance of the sum is then the long-run variance of its terms, whatever their correlation in time. The result is
+    at least the variance for white residuals, and at least the jackknife variance (parts of the runs left out one at a
+    time) where that is clearly larger: a few moments may decide, such as those at which a rotor breaks loose, and the
+    fit then follows the noise of those.
 
     **Arguments**: `residuals` (blocks, 2, samples) and `jacobian` (blocks, 2, samples, columns), over the noise;
-    `run`, the run of each block; `free`, which coordinates were estimated; `runs`, how many runs count, from the
-    first on.
+    `run`, the run of each block; `free`, which coordinates were estimated; `runs`, the number of training runs, which
+    come first.
 
-    **Source**: White, Econometrica 48 (1980); Andrews, Monahan, Econometrica 60 (1992), doi:10.2307/2951574; parts
-    left out: MacKinnon, Nielsen, Webb, Journal of Econometrics 232 (2023), doi:10.1016/j.jeconom.2022.04.001.
+    **Source**: White, Econometrica 48 (1980); Andrews, Monahan, Econometrica 60 (1992), doi:10.2307/2951574; jackknife:
+    MacKinnon, Nielsen, Webb, Journal of Econometrics 232 (2023), doi:10.1016/j.jeconom.2022.04.001.
     """
     residuals, jacobian, run = (np.asarray(x) for x in (residuals, jacobian, run))
     count = jacobian.shape[-1] - LOCAL
@@ -94,7 +95,7 @@ def information(
         r = residuals[run == index]
         own = J[..., count:].reshape(-1, LOCAL)
         across = J[..., :count].reshape(-1, count)
-        # the run's own unknowns take their part away
+        # project the run's own unknowns out
         taken = np.linalg.pinv(own.T @ own, hermitian=True) @ (own.T @ across)
         across = (across - own @ taken).reshape(*J.shape[:-1], count)
         # samples in order, both outputs of an instant together
@@ -124,8 +125,8 @@ def _ratio_or_one(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _by_parts(
     parts: Sequence[Part], root: Float[np.ndarray, "parameters seen"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The variances by leaving out one part after another, zero where white noise may have made them so large; and the
-    reach of a 95 % interval, longer where few parts decide."""
+    """Jackknife variances, zero where white noise may explain their size; and the reach of a 95 % interval in standard
+    errors, from Student's t where these variances count: longer where few parts decide."""
     moved, shares = [], []
     for part in parts:
         known, axes = np.linalg.eigh(root.T @ part.hessian @ root)
@@ -148,25 +149,25 @@ def _split(
     Float[np.ndarray, "parameters seen"],
     Float[np.ndarray, "parameters parameters"],
 ]:
-    """Unseen directions, a root of the inverse on the others, and the variance that the unseen ones leave in all."""
+    """The unseen directions; a root R of the inverse on the others, R R'; and the variance due to the unseen ones."""
     index = np.flatnonzero(free)
     values, vectors = np.linalg.eigh(hessian[np.ix_(index, index)])
     seen = values > max(1 / FLAT**2, 1e-13 * values.max(initial=0.0))
     full = np.zeros((len(hessian), len(index)))
     full[index] = vectors
     root = full[:, seen] / np.sqrt(values[seen])
-    # a parameter with only a small part in an unseen direction is still less sure by that part
+    # even a small component along an unseen direction adds to the variance of a parameter
     open_ended = np.minimum(1 / np.maximum(values[~seen], 1e-300), ANYWHERE**2)
     blind = (full[:, ~seen] * open_ended) @ full[:, ~seen].T
     return tuple(full[:, k] for k in np.flatnonzero(~seen)), root, blind
 
 
 def long_run_variance(terms: Float[np.ndarray, "samples n"]) -> Float[np.ndarray, "n n"]:
-    """Variance of the sum of correlated terms with mean zero.
+    """Covariance matrix of the sum of correlated terms with mean zero.
 
-    Prewhitened by one autoregression each, then a quadratic-spectral kernel with the automatic bandwidth of
-    Andrews (1991); on sums over stretches, which keep the variance of the whole sum, while the slow part that
-    decides it comes out of the white noise that hides it from sample to sample.
+    Each column is prewhitened by a first-order autoregression; then a quadratic-spectral kernel with the automatic
+    bandwidth of Andrews (1991) is applied. The terms are first summed over stretches: that keeps the variance of the
+    whole sum, and the slow part that decides it stands out from the white noise that hides it from sample to sample.
     """
     stretch = max(1, len(terms) // STRETCHES)
     whole = len(terms) // stretch * stretch

@@ -1,7 +1,7 @@
-"""Residuals made white before they are squared: generalised least squares.
+"""Filters that whiten residuals before they are squared: generalised least squares.
 
-Where a torque fluctuates the residuals of a free run are correlated, and plain least squares lets their slow part,
-most of which is noise, outvote the rest.
+Where a torque fluctuates, the residuals of a free run are correlated, and plain least squares gives too much weight to
+their slow part, which is mostly noise.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-# Samples that are filtered by one product of matrices, and the longest memory of a filter
+# Samples that are filtered by one matrix product, and the longest order of a filter
 CHUNK = 32
 
 
 class Whitening(eqx.Module):
-    """A filter for every run, r'(t) = S (r(t) - sum_k A_k r(t - k)), that leaves unit variance and no correlation.
+    """A filter for each run, r'(t) = S (r(t) - sum_k A_k r(t - k)), that leaves unit variance and no correlation.
 
-    Before a run begins, or was measured, there is no residual: its initial state is fitted, so nothing has added up by
-    then. Without these first samples nothing would tell of that state.
+    Residuals before the start of a run, or before its first measurement, are taken as zero: the initial state is
+    fitted, so none has built up by then. Without the first samples that state would not be determined.
 
     **Source**: Aitken, Proceedings of the Royal Society of Edinburgh 55 (1936); Ljung, "System Identification",
     2nd edition, section 7.4.
     """
 
-    bands: Float[Array, "runs white seen"]  # of a chunk's white rows, by the chunk before and by it
-    # one where all that the filter looks back on in the run was measured
+    bands: Float[Array, "runs white seen"]  # from a chunk and the one before to the whitened chunk
+    # 1 where all samples that the filter takes from the run were measured, else 0
     usable: Float[Array, "blocks 2 samples"]
 
     @classmethod
@@ -39,8 +39,8 @@ class Whitening(eqx.Module):
         weight: Float[Array | np.ndarray, "blocks 2 samples"],
         run: Int[Array | np.ndarray, " blocks"],
     ) -> Whitening:
-        """By the coefficients A and the scale S of every run; `weight` is zero where nothing was measured, `run` the
-        run of each block."""
+        """From the coefficients A and the scale S of each run; `weight` is zero where nothing was measured, `run` is
+        the run of each block."""
         longest = [np.append(A, np.zeros((CHUNK - len(A), 2, 2)), axis=0) for A in filters]
         bands = np.stack([band(A, S) for A, S in zip(longest, scales, strict=True)])
         known = np.moveaxis(np.asarray(weight) > 0, 1, 2)
@@ -59,7 +59,7 @@ class Whitening(eqx.Module):
         signal: Float[Array, "blocks 2 samples columns"],
         run: Int[Array | np.ndarray, " blocks"],
     ) -> Float[Array, "blocks 2 samples columns"]:
-        """Columns such as residuals, A and rad/s, made white."""
+        """Whiten columns such as residuals, in A and rad/s."""
         blocks, outputs, samples, columns = signal.shape
         in_time = jnp.moveaxis(signal, 1, 2).reshape(-1, CHUNK * outputs, columns)
         chunks = samples // CHUNK
@@ -75,7 +75,7 @@ class Whitening(eqx.Module):
 def band(
     A: Float[np.ndarray, "order outputs outputs"], S: Float[np.ndarray, "outputs outputs"]
 ) -> Float[np.ndarray, "white seen"]:
-    """The matrix that filters a chunk: from the samples that it looks back on, and its own, to its white ones."""
+    """The matrix that filters a chunk: from its samples and the `order` before them to the whitened ones."""
     order, outputs = A.shape[:2]
     matrix = np.zeros((CHUNK, outputs, order + CHUNK, outputs))
     here = np.arange(CHUNK)
@@ -85,6 +85,6 @@ def band(
 
 
 def remembered(known: Bool[np.ndarray, " samples"], order: int) -> Bool[np.ndarray, " samples"]:
-    """Samples that were measured, as were the `order` before them."""
+    """Which samples were measured, together with the `order` samples before them."""
     lost = np.cumsum(np.append(0, ~known))
     return np.append(np.zeros(order, bool), lost[order + 1 :] == lost[: len(known) - order])

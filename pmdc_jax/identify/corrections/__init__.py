@@ -1,5 +1,5 @@
-"""What sensors and recorders put into the records that the motor never did: found by the fit, and taken out.
+"""Corrections for artefacts of sensors and recorders, which are found with the help of a fit.
 
-A correction takes the prepared runs and a fit to them, and returns the runs without what it is about and the fit to
-those, or both as they are where the runs are no likelier so.
+A correction takes the prepared runs and a fit to them, and returns the corrected runs and the fit to those, or both
+unchanged where the correction does not make the runs more likely.
 """

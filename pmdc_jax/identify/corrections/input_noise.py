@@ -1,9 +1,9 @@
-"""Noise in the record of what drives the motor: where the motor did not feel it, it is taken out.
+"""Measurement noise in the record of what drives the motor is removed where the motor did not feel it.
 
-A simulation takes the recorded voltage for true. The noise of its sensor then moves the simulated motor and not the
-real one: the misfit looks like a missing effect, and the parameters make up for it (errors in variables). Whether a
-motor felt the rough part of a voltage, as that of a controller which answers to a noisy speed, it says itself: its
-response to that part is in its records or it is not.
+A simulation takes the recorded voltage as exact. The noise of its sensor then moves the simulated motor but not the
+real one: the residuals look like a missing effect, and the parameters are biased (errors in variables). The rough part
+of a voltage can also be real, as from a controller that responds to a noisy speed. The outputs tell: they contain the
+response to the rough part, or they do not.
 """
 
 from __future__ import annotations
@@ -25,26 +25,27 @@ from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem
 
-# Noise of a smaller share of the largest value is rounding
+# Noise below this share of the largest value is rounding
 ROUNDING = 1e-7
-# Half widths of the windows that are smoothed over, samples
+# Half widths of the smoothing windows, samples
 WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40)
-# Windows behind, around and ahead of a sample, each with the order of the polynomial that is fitted in it
+# Windows behind (-1), around (0) and ahead of (1) a sample, each with the order of the polynomial fitted in it
 WINDOWS = ((-1, 0), (0, 0), (1, 0), (-1, 1), (0, 2), (1, 1))
-# A wider window is no longer smooth if it departs from a narrower one by more standard errors than so many of each.
-# Of motors' voltages a larger number leaves less noise, but rounds their bends, which looks like a missing effect.
+# Half width, in standard errors, of the confidence intervals of the estimates by wider and wider windows, which must
+# intersect. For voltages of motors a larger value leaves less noise, but rounds corners: like a missing effect.
 DEPARTURE = 1.25
-# Rough parts of which the motor felt less than this share, so many standard errors below all, are noise
+# A rough part is noise if the motor felt less than this share of it, and so many standard errors less than all of it
 FELT, CLEAR = 0.5, 5.0
-# ... unless without them a run is missed by so many times more, in squares: a filter then took for noise what they did
+# ... unless its removal raises the squared residuals of the run by this factor: the whitening filter then mistook its
+# effect for noise
 MISSED = 1.1
 
 
 def without_input_noise(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
-    """The runs with what drives them smoothed where the motor did not feel its rough part, and the fit to them.
+    """The runs with their drives smoothed where the motor did not feel the rough part, and the fit to them.
 
-    **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if nothing was found, or makes
-    the runs less likely: where most of a misfit is another one's, its regression on a rough part may mislead.
+    **Arguments**: `fit`, to the runs as they are. **Returns**: both unchanged if nothing was found, or if smoothing
+    makes the runs less likely: where most of the residuals have another cause, their regression may mislead.
     """
     drives = [np.asarray(getattr(run.recorded, run.drive)) for run in given.runs]
     rough = [drive - smoothed(drive) for drive in drives]
@@ -66,7 +67,7 @@ def without_input_noise(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 
 
 def _driven(given: Prepared, drives: list[np.ndarray]) -> Problem:
-    """The problem with the runs driven so."""
+    """The problem with these drives of the runs."""
     runs = [
         uniform(attrs.evolve(run.recorded, **{run.drive: drive}))
         for run, drive in zip(given.runs, drives, strict=True)
@@ -78,10 +79,10 @@ def _driven(given: Prepared, drives: list[np.ndarray]) -> Problem:
 
 
 def _felt(given: Prepared, rough: Fit, smooth: Fit) -> list[float]:
-    """Of every run the share of the rough part that the motor felt, one unless it is clearly less than half.
+    """The share of the rough part that the motor felt, for each run; 1 unless it is clearly less than half.
 
-    By regression of what the whole drive leaves on the response to its rough part, both made white by what the smooth
-    drive leaves.
+    By regression of the residuals with the whole drive on the response to its rough part, both filtered by the whitener
+    of the residuals with the smooth drive.
     """
     shares, tape = [], given.problem.tape
     left, left_smooth = (
@@ -105,16 +106,16 @@ def _felt(given: Prepared, rough: Fit, smooth: Fit) -> list[float]:
 
 
 def smoothed(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """A signal less its white noise, with its steps and bends as they are.
+    """A signal without its white noise, but with its steps and corners preserved.
 
-    Every sample is estimated by the widest window on either side of it, and around it, in which the signal is as
-    smooth as its noise allows: the estimates by all narrower windows have a value within their errors in common.
-    These are weighed by their variances.
+    Each sample is estimated from the widest window behind, around and ahead of it in which the signal is smooth: the
+    confidence intervals of the estimates from this and all narrower windows intersect. The estimates are averaged with
+    the inverse of their variances as weights.
 
     **Source**: Goldenshluger & Nemirovski, Mathematical Methods of Statistics 6 (1997) 135 (intersection of
     confidence intervals); Katkovnik, IEEE Transactions on Signal Processing 47 (1999) 2567.
     """
-    noise = noise_by_differences(4, signal)  # most of a signal is smooth
+    noise = noise_by_differences(4, signal)  # by a median, since most of a signal is smooth
     if not noise > ROUNDING * np.max(np.abs(signal)):
         return signal
     estimates, errors = zip(*(_widest(signal, noise, *window) for window in WINDOWS), strict=True)
@@ -124,7 +125,7 @@ def smoothed(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " sampl
 def _widest(
     signal: np.ndarray, noise: float, side: int, order: int
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
-    """The estimate of every sample by the widest window on a side of it that is smooth, and its standard error."""
+    """The estimate of each sample from the widest smooth window on one side of it, and its standard error."""
     best, error = signal.copy(), np.full(len(signal), noise)
     low, high = signal - DEPARTURE * noise, signal + DEPARTURE * noise
     smooth = np.ones(len(signal), bool)

@@ -1,10 +1,9 @@
-"""When what drives the motor acts: from its sample to the next, as recordings are taken, or otherwise.
+"""When a recorded voltage acts: held from its sample to the next, which is the default, or otherwise.
 
-An amplifier that follows a signal, and most simulations that others make (`lsim`, interpolated tables), go through the
-recorded voltages on straight lines; a loop that applies a voltage, waits and then records everything writes it a
-sample late; a command that a controller computes often acts a sample after it was recorded. Taken for held at once,
-such a voltage is up to a sample late or early, for which the inductance makes up, and then the resistance and the
-friction.
+An amplifier that follows a signal, and most simulation tools (`lsim`, interpolated tables), connect the recorded
+voltages by straight lines; a loop that applies a voltage, waits and then records everything writes it a sample late; a
+command computed by a controller often acts a sample after it was recorded. Treated as held from its sample on, such a
+voltage is up to a sample late or early, and the inductance, then the resistance and the friction, compensate for it.
 """
 
 from __future__ import annotations
@@ -27,17 +26,17 @@ from ..problem import normal_matrix
 from .speed_averaging import as_sampled, seems_averaged, with_averaging, without_ends
 from .uneven_sampling import on_clock
 
-# Another timing is not even asked where the misfit shows less than this share of half a sample
+# No other timing is tried where the residuals show a shift of less than this share of half a sample
 SHOWS = 0.3
 
 
 class Timing(NamedTuple):
-    """When the voltages of a recording act, otherwise than held from their sample to the next."""
+    """When the voltages of a recording act, if they are not held from their sample to the next."""
 
     what: str
     ahead: int  # by how many samples they were recorded late
-    straight: bool  # from sample to sample, instead of held
-    load: bool = False  # whether the recorded loads act likewise
+    straight: bool  # linear from sample to sample instead of held
+    load: bool = False  # whether the recorded loads have the same timing
 
 
 OTHERWISE = (
@@ -48,14 +47,14 @@ OTHERWISE = (
 
 
 def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
-    """How the voltages of the runs may act: each way that is clearly likelier than the one that they are taken for.
+    """The timings of the voltages that are clearly likelier than the assumed one.
 
-    **Arguments**: `given`, the runs less what their sensors put into them; `fit`, to these.
+    **Arguments**: `given`, the runs with the effects of their sensors corrected; `fit`, to these.
     """
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
         return []  # without a current, or without a speed, only a delay would show
     early = _early(given, fit)
-    # a speed that is a mean over the last sample comes half a sample late, too, and may hide it
+    # a speed that is a mean over the last sample is half a sample late, too, and may hide the shift
     hidden = given.averaging is None and seems_averaged(given)
     if abs(early) < SHOWS and not hidden:
         return []
@@ -64,7 +63,7 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
     def unlikely_with(timing: Timing) -> float:
         other = as_sampled(with_timing(given, timing))
         nearer = polish(other.problem, fit.optimum)
-        # what is a mean over the last sample, and what is late, only a fit in time can tell
+        # only a fit with the right timing can tell a mean over the last sample from a delay
         return negative_log_likelihood_within(*with_averaging(*on_clock(other, nearer)))
 
     enough = negative_log_likelihood_within(given, fit) - LIKELIER
@@ -76,16 +75,16 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
 
 
 def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:
-    """How unlikely a fit makes the runs, but for their ends: nobody can foretell a beginning where a voltage acts
-    later."""
+    """Negative log-likelihood of the runs without their first and last samples: where a voltage acts later, the
+    beginning of a run cannot be predicted."""
     return negative_log_likelihood(without_ends(given), fit)
 
 
 def _early(given: Prepared, fit: Fit) -> float:
-    """By how many halves of a sample the voltages seem to act before they are taken to: by regression of the misfit on
-    what half a sample does, less what the parameters could do of it.
+    """How much earlier than assumed the voltages seem to act, in half samples: regression of the residuals on the
+    change that half a sample makes in the outputs, less the part that the parameters could explain.
 
-    Straight ones are held at their means for this, which needs no code but what is compiled.
+    Half a sample earlier is a held mean of the voltages at a sample and the next, which reuses compiled programs.
     """
     means = with_timing(given, OTHERWISE[0]).problem
     means = replace(means, tape=replace(means.tape, rise=None))
@@ -102,7 +101,7 @@ def _early(given: Prepared, fit: Fit) -> float:
 
 
 def with_timing(given: Prepared, timing: Timing) -> Prepared:
-    """The runs with voltages that act so."""
+    """The runs with voltages of this timing."""
     tape = given.problem.tape
     runs = [uniform(_acting(run, k, tape, timing)) for k, run in enumerate(given.runs)]
     driven = Tape.from_recordings(runs, straight=timing.straight)
@@ -110,14 +109,14 @@ def with_timing(given: Prepared, timing: Timing) -> Prepared:
     tape = replace(tape, value=value, load=load, rise=rise)
     problem = replace(given.problem, tape=tape)
     acting = given._replace(runs=runs, problem=problem, timing=timing)
-    # how each is at its second sample is then its own
+    # what acts during the first sample was not recorded: without outputs there, the initial state makes up for it
     return without_ends(acting) if timing.ahead < 0 else acting
 
 
 def _acting(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
-    """The record of a run with the voltages, and perhaps the loads, of those samples at which they act.
+    """The record of a run with its voltages, and its loads if the timing says so, moved to the samples where they act.
 
-    Those of an even clock as the tape has them, for noise may have been taken out there.
+    Voltages of an even clock are taken from the tape, where their noise may have been removed.
     """
     if run.drive != "voltage":
         return run.recorded
@@ -128,6 +127,6 @@ def _acting(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
     run = attrs.evolve(run, voltage=np.asarray(voltage)[rows])
     if not timing.load or run.load is None:
         return run
-    # a straight load is held at its means: it is slow enough
+    # a load varies slowly enough to be held at its means instead of going straight
     ahead = np.minimum(rows + 1, last) if timing.straight else rows
     return attrs.evolve(run, load=(run.load[rows] + run.load[ahead]) / 2)

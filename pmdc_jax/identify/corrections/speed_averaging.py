@@ -1,8 +1,8 @@
-"""A speed that is a difference of angles, and so a mean over one sample or two: taken for what it is.
+"""A speed computed by differencing an angle is a mean over one or two samples: it is detected and simulated as such.
 
-Where the motor speeds up or slows down within some samples such a mean is late, or rounds its motion as a soft shaft
-might. The noise of the angles shows which one it is, and in case of doubt the fits to the one and to the other. The
-simulation then reports the same mean.
+Where the speed changes within a few samples, such a mean lags, or smooths the motion as a compliant shaft might. The
+noise of the angle shows which mean it is; in case of doubt the fits to both decide. The simulation then reports the
+same mean.
 """
 
 from __future__ import annotations
@@ -22,43 +22,44 @@ from ..noise import quantum
 from ..polish import Fit, polish
 from ..prepare import Prepared
 
-# An encoder has fewer lines, and a whole number of them
+# Most lines of an encoder, and by how much a computed number of lines may differ from a whole one
 LINES, WHOLE = 2e4, 0.02
-# Power in counts squared, between that of a speed that was rounded to counts, 1/12, and that of such a mean, 1/3
+# Noise power in counts squared next to the Nyquist frequency: 1/12 for a speed rounded to counts, 1/3 for a mean over
+# the last sample
 COUNTED = 1 / 6
-# ... and the same of the mean over all high frequencies, between 1/12 and 1/4
+# The same averaged over all high frequencies: 1/12 and 1/4
 COUNTED_IN_ALL = 1 / 7
-# ... known of a run of so many samples
+# Shortest run, in samples, of which these powers are estimated
 ENOUGH = 200
-# Shares of the highest frequency about half of it, near it, and next to it; and all that are high
+# Frequency bands as shares of the Nyquist frequency: around half of it, near it, next to it, and all that are high
 BANDS = ((0.4, 0.6), (0.9, 0.95), (0.98, 1.0), (0.4, 1.0))
-# By how much smaller an inductance is tried, in natural logarithms
+# How much smaller an inductance is tried, in natural logarithms
 SMALLER = 3.0
-# Current and speed among the outputs, and the latter alone
+# Which outputs: current and speed, or speed alone
 BOTH, SPEED = slice(None), slice(1, None)
-# A mean over two samples has no more than this share of the power near the highest frequency next to it: in theory 1/40
+# Power next to the Nyquist frequency over that near it, at most, for a mean over two samples: in theory 1/40
 NONE = 1 / 8
 
 
 def seems_averaged(given: Prepared) -> bool:
-    """Whether the speeds are counts of an encoder whose noise is that of means."""
+    """Whether the speeds are encoder counts with the noise of a mean."""
     mean, _, counted = _mean_by_noise(given)
     return counted and mean is not None
 
 
 def clearly_averaged(given: Prepared) -> Prepared:
-    """The runs with their speeds taken for means over the last sample where the noise leaves no doubt that they are."""
+    """The runs with their speeds treated as means over the last sample where the noise leaves no doubt of it."""
     mean, enough, _ = _mean_by_noise(given)
     sure = mean is not None and np.isneginf(enough)
     return _averaged(without_ends(given, SPEED), mean) if sure else given
 
 
 def with_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
-    """The runs with their speeds taken for means where that is what was recorded, and the fit to them.
+    """The runs with their speeds treated as means, where that is what was recorded, and the fit to them.
 
-    A speed that comes later than a mean would is late for another reason.
+    A speed that lags more than a mean would is late for another reason.
 
-    **Arguments**: `fit`, that to the runs as they are. **Returns**: both as they are if no mean was found.
+    **Arguments**: `fit`, to the runs as they are. **Returns**: both unchanged if no mean was found.
     """
     if given.averaging:
         return given, fit
@@ -71,7 +72,8 @@ def with_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     if not negative_log_likelihood(inner, fit) - left > enough:
         return given, fit
     if not counted:
-        # a mean over two samples is in time as it is, and has another noise than what is but late
+        # a mean over the last and the next sample has no lag: a speed that fits better a sample earlier, or as a mean
+        # over the last sample, is merely late
         last = negative_log_likelihood(*_fitted(_averaged(inner, OVER_LAST), fit))
         if last < left or _fitted(_sooner(inner), fit)[1].fitness < fit.fitness:
             return given, fit
@@ -79,13 +81,13 @@ def with_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 
 
 def as_sampled(given: Prepared) -> Prepared:
-    """The runs with the speeds that were recorded as such taken for those of the moment."""
+    """The runs with their recorded speeds treated as instantaneous again."""
     return _averaged(given, None) if given.averaging else given
 
 
 def without_ends(given: Prepared, outputs: slice = BOTH) -> Prepared:
-    """The runs less what was measured of some outputs at their first and last samples, where a mean or a voltage that
-    acts at another time may be of what nobody recorded."""
+    """The runs without the first and the last sample of some outputs: there a mean, or a voltage that acts at another
+    time, depends on what was not recorded."""
     tape = given.problem.tape
     weight = np.array(tape.weight)
     for k, run in enumerate(given.runs):
@@ -97,7 +99,7 @@ def without_ends(given: Prepared, outputs: slice = BOTH) -> Prepared:
 
 
 def _averaged(given: Prepared, averaging: Averaging | None) -> Prepared:
-    """The runs with their speeds taken for such means, or for those of the moment."""
+    """The runs with their recorded speeds treated as such means, or as instantaneous for None."""
     runs = [
         attrs.evolve(run, averaging=averaging) if run.speed is not None and not ours else run
         for run, ours in zip(given.runs, given.differentiated, strict=True)
@@ -108,7 +110,7 @@ def _averaged(given: Prepared, averaging: Averaging | None) -> Prepared:
 
 
 def _sooner(given: Prepared) -> Prepared:
-    """The runs with their speeds a sample sooner."""
+    """The runs with their speeds shifted to one sample earlier."""
     runs = [
         run if run.speed is None else attrs.evolve(run, speed=np.append(run.speed[1:], np.nan))
         for run in given.runs
@@ -119,8 +121,8 @@ def _sooner(given: Prepared) -> Prepared:
 
 
 def _fitted(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
-    """The runs, and the fit to them from another one on, or with a small inductance: a large one may have made up for
-    half a sample."""
+    """The runs, and the fit to them that starts from `fit`, or from there with a smaller inductance: a large one may
+    have compensated half a sample of delay."""
     parameters, unknowns = given.problem.parameters, fit.unknowns
     starts = [fit.optimum]
     if "L" in parameters.names and given.averaging == OVER_LAST:
@@ -133,11 +135,11 @@ def _fitted(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 
 
 def _mean_by_noise(given: Prepared) -> tuple[Averaging | None, float, bool]:
-    """Of what the speeds are the mean by their noise, if of anything; how much likelier that must make them, as
-    `counted_over` has it; and whether they are counts.
+    """The mean that the noise of the speeds suggests, None if none; the gain in log-likelihood that it must bring, as
+    in `counted_over`; and whether the speeds are counts.
 
-    A mean over the last sample is told from a delay only if the speed is counted, and from an inductance only beside
-    a current.
+    A mean over the last sample can be told from a delay only if the speed is counted, and from an inductance only if
+    the current was measured.
     """
     speeds = _speeds(given)
     counts = _in_counts(speeds)
@@ -148,13 +150,13 @@ def _mean_by_noise(given: Prepared) -> tuple[Averaging | None, float, bool]:
 
 
 def counted_over(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
-    """Of what speeds are the mean that are multiples of a count a sample, if of anything; and how much likelier that
-    must make them, by the logarithm; if less than nothing, no less likely by more.
+    """The mean that speeds in counts per sample are, None if none, and the gain in log-likelihood that it must bring;
+    if negative, the loss that is accepted.
 
-    Angles that are rounded to counts have a white noise of 1/12 count squared. Of differences over one sample it is
-    four times as strong at the highest frequency, and twice at half of that; of differences over two samples, counted
-    by halves, it is none at all, and four times. While a rotor turns steadily the noise is no noise but a beat, which
-    may be anywhere: then it is as strong in all, and the fit must tell.
+    Angles rounded to counts have white noise of 1/12 count squared. In differences over one sample its power is four
+    times that at the Nyquist frequency and twice that at half of it; in differences over two samples, in half counts,
+    zero and four times. While the rotor turns steadily the rounding error is not noise but a beat at some frequency:
+    only its total power is known then, and the fit must decide.
     """
     middle, high, highest, in_all = _powers(counts)
     if highest > COUNTED:
@@ -166,16 +168,16 @@ def counted_over(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]
 
 
 def differenced_over(speeds: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
-    """The same of other speeds: nothing of differences over two samples is at the highest frequency, but of any other
-    signal with noise or steps there is as much as near it."""
+    """The same for speeds that are no counts: differences over two samples have no power at the Nyquist frequency, any
+    other signal with noise or steps has as much there as near it."""
     _, high, highest, _ = _powers(speeds) if speeds else (0.0, 0.0, 0.0, 0.0)
     return OVER_BOTH if highest < NONE * high else None, LIKELIER
 
 
 def _powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
-    """The power of some signals within each of the `BANDS`, if it were the same at all frequencies.
+    """Mean power of the signals in each of the `BANDS`, scaled as the variance of white noise with that power.
 
-    By second differences: what is slow is so much stronger that it would leak.
+    Computed from second differences, since the much stronger low frequencies would leak into the high ones.
     """
     powers = []
     for signal in signals:
@@ -189,7 +191,7 @@ def _powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
 
 
 def _speeds(given: Prepared) -> list[tuple[np.ndarray, float]]:
-    """The speeds of all runs that are long enough to show their noise, rad/s, and the time between samples, s."""
+    """The recorded speeds, rad/s, of all training runs long enough to show their noise, and their sample times, s."""
     recorded = [
         (run.speed, np.diff(run.time))
         for run, ours in zip(given.training, given.differentiated, strict=False)
@@ -200,16 +202,16 @@ def _speeds(given: Prepared) -> list[tuple[np.ndarray, float]]:
 
 
 def _in_counts(speeds: Sequence[tuple[np.ndarray, float]]) -> list[np.ndarray]:
-    """The speeds in counts a sample, of an encoder with as many lines; none, if they are no such counts."""
+    """The speeds in counts per sample of an encoder with a whole number of lines; empty if they are no such counts."""
     counts = []
     for speed, sample_time in speeds:
-        # from sample to sample a speed may leap by many counts, its values lie closer
+        # a speed may jump by many counts from sample to sample, but its sorted values lie closer together
         step = quantum(np.diff(speed)) or quantum(np.diff(np.unique(speed)))
         lines = 2 * np.pi / step / sample_time if step else np.inf
         if lines > LINES:
             return []
         in_counts = speed / step
-        # by as much of it as a count may be wrong, where speeds were written with few digits
+        # the tolerance grows with the error of a count where speeds were written with few digits
         rounded = np.quantile(np.abs(in_counts - np.round(in_counts)), 0.95)
         whole = WHOLE + lines * rounded / np.max(np.abs(in_counts))
         if abs(lines - round(lines)) > whole:

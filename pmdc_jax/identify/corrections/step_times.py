@@ -1,8 +1,8 @@
-"""Steps of a voltage that come between two samples, as of a switch that no clock ties to the recorder.
+"""Voltage steps between two samples, as from a switch that is not synchronised with the recorder.
 
-The record shows the new voltage at the next sample only, and the current is then further on than it could be. When
-each step came is sought with the motor; of a step that is hardly felt nothing is lost, of the others its time is one
-more unknown, and what it does to the outputs tells nothing of the parameters.
+The record shows the new voltage only at the next sample, when the current has already responded to it. The time of each
+step is fitted together with the motor, as a nuisance parameter: the part of the outputs that depends on it then carries
+no information on the motor, which costs nothing for a step that is hardly felt.
 """
 
 from __future__ import annotations
@@ -23,35 +23,38 @@ from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem
 
-# A step is so many times what the voltage does from sample to sample around it, and this share of its range
+# A step is this many times the change of the voltage in the samples beside it, and this share of the voltage's range
 STANDS_OUT, LARGE = 10.0, 0.05
-# Fewer steps tell nothing of whether all come alike; more a run than one in so many samples are no switch's
+# With fewer steps in all it cannot be told whether they share one delay; a run with more than one step in this many
+# samples is not switched
 FEWEST, SAMPLES = 4, 20
-# What steps do to the outputs takes at most so many numbers
+# Most numbers in the array of step responses
 NUMBERS = 2e7
-# Steps without a clock come anywhere in a sample: their shares of it spread so much, and hardly leave it
+# Steps without a clock come anywhere within a sample: SPREAD is the least standard deviation of their places in it;
+# OUTSIDE is how far outside it an estimate may lie, in samples, and also the share of estimates that may lie farther
 SPREAD, OUTSIDE = 0.15, 0.2
-# Each of them must make the runs so much likelier
+# Gain in log-likelihood that each step must bring
 EACH = 5.0
 PASSES = 5
-# Squares by which a step shows, as a share of those of the one that shows most, below which it does not
+# A combination of steps with less than this share of the largest eigenvalue of the normal matrix is not felt
 HARDLY = 1e-8
 
 
 class Steps(NamedTuple):
-    """The steps of a run."""
+    """The voltage steps of a run."""
 
     at: Int[np.ndarray, " steps"]  # the first samples after them
     height: Float[np.ndarray, " steps"]  # V
-    share: Float[np.ndarray, " steps"]  # of the sample before, for how long they had come
+    # of the interval before that sample, for how long the new voltage already acts
+    share: Float[np.ndarray, " steps"]
 
 
 def with_step_times(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
-    """The runs with the steps of their voltages where the motor felt them, and the fit to them; both as they are if
-    these steps come with the samples, or all as late."""
+    """The runs with the steps of their voltages at the times when the motor felt them, and the fit to them; both
+    unchanged if the steps coincide with samples or all have the same delay."""
     problem = given.problem
     steps = [steps_of(run) for run in given.runs]
-    if given.straight:  # what goes straight rises in the middle
+    if given.straight:  # a straight rise between two samples is a step in their middle
         steps = [s._replace(share=s.share + 0.5) for s in steps]
     count, most = sum(len(s.at) for s in steps), max(len(s.at) for s in steps)
     too_many = 2 * problem.tape.value.size * most > NUMBERS
@@ -72,7 +75,7 @@ def with_step_times(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 
 
 def steps_of(run: Recording) -> Steps:
-    """The steps of the voltage of a run that stand out, as if they came with the samples."""
+    """The voltage steps of a run that stand out, placed at samples."""
     at, height = np.zeros(0, int), np.zeros(0)
     if run.drive == "voltage" and run.voltage is not None and run.uneven is None and len(run) > 3:
         rise = np.diff(run.voltage)
@@ -87,14 +90,14 @@ def steps_of(run: Recording) -> Steps:
 
 
 def _come_anywhere(steps: Sequence[Steps]) -> bool:
-    """Whether steps come at all times within a sample, and neither all alike nor before or after it."""
+    """Whether the steps are spread over a sample interval, instead of all at the same place in it or outside."""
     share = np.concatenate([s.share for s in steps])
     inside = (share > -OUTSIDE) & (share < 1 + OUTSIDE)
     return bool(np.mean(inside) > 1 - OUTSIDE and np.std(np.clip(share, 0, 1)) > SPREAD)
 
 
 def _moved(problem: Problem, fit: Fit, steps: Sequence[Steps]) -> tuple[list[Steps], float]:
-    """The steps at the times that make the misfit of a fit least, and by how much that is likelier in white noise."""
+    """The steps at the times that minimise the residuals of a fit, and the gain in log-likelihood for white noise."""
     tape = problem.tape
     scale = np.asarray(tape.weight) / fit.noise[:, None]
     left = (np.asarray(tape.measured) - np.asarray(fit.evaluation.seen)) * scale
@@ -112,7 +115,7 @@ def _moved(problem: Problem, fit: Fit, steps: Sequence[Steps]) -> tuple[list[Ste
 
 
 def _placed(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
-    """The runs with steps at their times, and these as unknowns."""
+    """The runs with the steps at their times, which become nuisance parameters of the problem."""
     problem, tape = given.problem, given.problem.tape
     value = np.array(tape.value)
     rise = np.zeros_like(value) if tape.rise is None else np.array(tape.rise)
@@ -126,7 +129,7 @@ def _placed(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
         before = given.runs[run].voltage
         assert before is not None or not len(s.at), "only voltages step"
         if before is not None:
-            # a straight line with the mean and the first moment of the step
+            # a straight line with the same mean and first moment as the step
             value[mine[block], sample] = before[s.at - 1] + share * s.height
             rise[mine[block], sample] = 6 * share * (1 - share) * s.height
     tape = replace(tape, value=jnp.asarray(value), rise=jnp.asarray(rise))
@@ -137,8 +140,8 @@ def _placed(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
 def _responses(
     problem: Problem, fit: Fit, run: int, steps: Steps
 ) -> Float[np.ndarray, "blocks 2 samples steps"]:
-    """What the outputs of a run gain, in A and rad/s, as each of its steps comes a sample earlier: as fast as at the
-    time where it is."""
+    """Derivatives of the outputs of a run, A and rad/s, by how much earlier each of its steps comes, in samples; of the
+    linear motor, at the present time of the step."""
     tape, step = problem.tape, problem.tape.sample_time_of(run)
     motor = problem.parameters(fit.coordinates)
     A, B = map(np.asarray, motor.state_space(tape.drive_of(run)))
@@ -154,7 +157,7 @@ def _responses(
 
 
 def _powers(A: Float[np.ndarray, "2 2"], count: int) -> Float[np.ndarray, "count 2 2"]:
-    """The powers of a matrix from the zeroth on."""
+    """The powers of a matrix, starting at the zeroth."""
     powers = np.eye(2)[None]
     while len(powers) < count:
         powers = np.concatenate([powers, powers @ np.linalg.matrix_power(A, len(powers))])

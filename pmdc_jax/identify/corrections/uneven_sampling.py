@@ -1,7 +1,7 @@
-"""Samples of an uneven clock, as the time stamps of a computer or the steps of a simulation: each taken when it came.
+"""Unevenly sampled recordings, such as those with the time stamps of a computer or the steps of a variable-step solver.
 
-The solver's samples are even. To interpolate what was measured between its own would lose the peaks and colour the
-noise; each recorded sample is moved instead, by what the fitted motor does between it and the even sample next to it.
+The simulation has even samples. Interpolating the measurement at these would lose peaks and colour the noise; instead,
+each recorded sample is shifted by what the fitted motor does between its time and the nearest even sample.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from ..prepare import Prepared
 
 # Refits at most
 PASSES = 12
-# ... until samples move by so little that, taken together, they could move no estimate by more than the root of this in
-# standard errors
+# Refits end when the shifts of the samples change by less than this, sum of squares in noise variances: that could move
+# no estimate by more than its root, 0.1 standard errors
 AT_REST = 0.01
-# Steps that shrink at this rate at most are followed to their end
+# Steps of the parameters that shrink by less than this ratio are extrapolated to their limit
 SHRINKING = 0.9
 
 
 def on_clock(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
-    """The runs with every sample of an uneven clock moved to the even sample next to it, as the fitted motor moves, and
-    the fit to them; both as they are where all clocks are even."""
+    """The runs with every sample of an uneven clock shifted to the nearest even sample along the simulated motion, and
+    the fit to them; both unchanged where all clocks are even."""
     uneven = any(run.uneven is not None for run in given.runs)
     last = None
     for _ in range(PASSES if uneven else 0):
@@ -41,13 +41,14 @@ def on_clock(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
         rate = step @ last / (last @ last) if last is not None else 0.0
         last = step
         if 0 < rate < SHRINKING:
-            # where the current decays within a sample, what was moved by a wrong inductance asks for most of it again
+            # where the current settles within a sample, samples shifted with a wrong inductance reproduce most of its
+            # error, and plain iteration would converge slowly
             fit, last = _ahead(given, fit, rate / (1 - rate) * step), None
     return given, fit
 
 
 def _ahead(given: Prepared, fit: Fit, step: Float[np.ndarray, " parameters"]) -> Fit:
-    """The fit at parameters further on, within their bounds (Irons and Tuck, doi:10.1002/nme.1620010306)."""
+    """The fit evaluated a `step` further on, within the bounds (Irons and Tuck, doi:10.1002/nme.1620010306)."""
     parameters, unknowns = given.problem.parameters, fit.unknowns
     further = jnp.clip(unknowns.coordinates + step, parameters.lower, parameters.upper)
     optimum = fit.optimum._replace(unknowns=unknowns._replace(coordinates=further))
@@ -55,14 +56,14 @@ def _ahead(given: Prepared, fit: Fit, step: Float[np.ndarray, " parameters"]) ->
 
 
 def _squares_between(before: Prepared, after: Prepared, fit: Fit) -> float:
-    """By how much the samples that count were moved, in variances of the noise."""
+    """Sum of squared differences between the samples of the training runs, in noise variances."""
     one, other = before.problem.tape, after.problem.tape
     moved = (np.asarray(other.measured) - np.asarray(one.measured)) * np.asarray(other.weight)
     return float(np.square(moved / fit.noise[:, None])[after.problem.fitted_blocks].sum())
 
 
 def _moved(given: Prepared, fit: Fit) -> Prepared:
-    """The runs with their samples moved as this fit moves."""
+    """The runs with their samples shifted along the simulated motion of this fit."""
     tape, seen = given.problem.tape, fit.evaluation.seen
     motor = given.problem.parameters(fit.coordinates)
     runs = []
@@ -73,16 +74,16 @@ def _moved(given: Prepared, fit: Fit) -> Prepared:
             run = _next_to(run, now, then)
         runs.append(run)
     laid, begins = Tape.from_recordings(runs), np.asarray(tape.begins)
-    # a first sample is measured when the even clock begins, and counts if it did
+    # the first sample of a run is the first of the even clock: it counts if it did before
     laid.weight[begins, :, 0] = np.asarray(tape.weight)[begins, :, 0]
     moved = given._replace(runs=runs)
     return moved.with_tape(measured=jnp.asarray(laid.measured), weight=jnp.asarray(laid.weight))
 
 
 def _next_to(run: Recording, now: np.ndarray, then: np.ndarray) -> Recording:
-    """A run on an even clock with the outputs that were recorded next to each of its samples, and none inside gaps.
+    """A run on an even clock with the output recorded nearest to each of its samples, and NaN inside gaps.
 
-    **Arguments**: what is simulated `now`, at the even samples, and `then`, at those recorded.
+    **Arguments**: `now` and `then`, the simulated outputs at the even samples and at the recorded ones.
     """
     record = run.recorded
     nearest = np.rint(np.interp(run.time, record.time, np.arange(len(record)))).astype(int)
