@@ -27,7 +27,7 @@ SMALL_STEP = 0.05  # set point of the small step over that of the task
 
 @frozen
 class Robustness:
-    """Metrics over motors drawn from the uncertainty: 95th percentiles, None where more than 5 % never settle."""
+    """Metrics over the drawn motors: 95th percentiles, that of settling None where more than 5 % never settle."""
 
     samples: int
     Overshoot_p95: float
@@ -79,8 +79,8 @@ def judged(
 
 
 def _small_step_metrics(task: Task, motor: Motor, law: Law) -> StepMetrics:
-    """Metrics of a step to a twentieth of the set point, without load and noise. Gains that do not overshoot after
-    the voltage was at its limit may do so here."""
+    """Metrics of a step to a twentieth of the set point, without load and noise. Gains that do not overshoot a step
+    with the voltage at its limit may overshoot this one."""
     small = eqx.tree_at(
         lambda t: (t.setpoint, t.load, t.noise),
         task,

@@ -89,8 +89,8 @@ def _characteristic(matrix: Matrix) -> Float[Array, " n+1"]:
 
 @frozen
 class Margins:
-    """Margins of a loop, all None where it is unstable. None also means no limit: no higher gain makes the loop
-    unstable, or its gain never crosses 1, so that phase and delay margins do not exist."""
+    """Margins of a loop; all but `stable` are None where it is unstable. None also means no limit: no higher gain
+    makes the loop unstable, or its gain never crosses 1, so that phase and delay margins do not exist."""
 
     stable: bool
     gain_margin: float | None  # as a factor, > 1

@@ -175,7 +175,7 @@ def _check(name: str, value: float | None, wanted: str, is_right: Callable[[floa
 
 def _samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> int:
     """Samples in one part of the task, rounded up to 2^k or 1.5 2^k so that few shapes are compiled."""
-    # no loop is much faster than a quarter of the electrical time constant plus hold and delay
+    # no loop is much faster than its hold, its delay and a quarter of the electrical time constant together
     dead_time = float(motor.L / motor.R) / 4 + (1 + delay) * sample_time
     duration = max(PART_SETTLINGS * fastest, fastest + PART_DEAD_TIMES * dead_time)
     needed = max(LEAST_SAMPLES, math.ceil(duration / sample_time))
