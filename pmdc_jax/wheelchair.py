@@ -1,4 +1,4 @@
-"""The wheelchair-motor paper: what it prints, and the same done again."""
+"""The wheelchair-motor paper: its printed values and their reproduction."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ PRINTED = Motor(**{name: np.asarray(TABLE_1[name]) for name in PARAMETERS}, effe
 VOLTAGE = 24.0  # V
 SETPOINT = 481.0  # rad/s
 LOWER_SETPOINT = 240.5  # rad/s
-# V, what the printed settling of 0.08 s needs
+# V, enough for the printed settling time of 0.08 s
 SUFFICIENT_VOLTAGE = 25.0
 LOADS = np.linspace(0.0, 1.0, 9)  # N m
 NOISE = {"current": 0.1, "speed": 0.5}  # A, rad/s
-# time constant of the derivative's filter over Kd / Kp; the paper prints none, and a tenth is the textbook's
+# time constant of the derivative filter over Kd / Kp; the paper prints none, a tenth is the textbook value
 FILTER_RATIO = 0.1
 
 
 @frozen
 class PrintedRow:
-    """A row of Table 2, % and s, and the gains Kp V s/rad, Ki V/rad, Kd V s^2/rad; None where none are printed."""
+    """A row of Table 2: overshoot, %, settling time, s, and gains Kp, V s/rad, Ki, V/rad, Kd, V s^2/rad, if printed."""
 
     overshoot: float
     settling: float
@@ -50,7 +50,7 @@ TABLE_2: Mapping[str, PrintedRow] = {
 
 @frozen
 class AsPrinted:
-    """What the printed gains do on the printed motor, simulated: 0 to 481 to 240.5 rad/s without any limit."""
+    """Simulation of the printed gains on the printed motor, 0 to 481 to 240.5 rad/s, without any limit."""
 
     overshoot: float  # %
     settling: float  # s
@@ -61,17 +61,17 @@ class AsPrinted:
 
 @frozen
 class Recovered:
-    """Table 1 from the virtual load test, by one method."""
+    """Table 1 as identified from the virtual load test by one method."""
 
     method: str
     motor: Motor
     evaluations: int
     seconds: float
-    best: np.ndarray  # fitness after each generation
+    best: np.ndarray  # best fitness after each generation
 
     @property
     def errors(self) -> dict[str, float]:
-        """Of each parameter, %."""
+        """Relative error of each parameter, %."""
         return {
             name: 100 * (float(getattr(self.motor, name)) / getattr(PRINTED, name) - 1)
             for name in PARAMETERS
@@ -80,18 +80,18 @@ class Recovered:
 
 @frozen
 class Paper:
-    """All tables and figures."""
+    """Reproduced tables and figures."""
 
     recovered: tuple[Recovered, ...]
-    reach: float  # rad/s on 24 V
+    reach: float  # steady speed on 24 V, rad/s
     tunings: Mapping[str, Tuning]
-    fastest: Mapping[float, float]  # s by voltage
-    steps: Mapping[str, Response]  # 0 to 481 to 240.5, by controller
+    fastest: Mapping[float, float]  # fastest settling (s) by voltage limit (V)
+    steps: Mapping[str, Response]  # 0 to 481 to 240.5 rad/s, by controller
     as_printed: Mapping[str, AsPrinted]  # for the controllers whose gains are printed
 
 
 def reproduce(progress: ReportProgress | None = None) -> Paper:
-    """Everything that the paper does, once more."""
+    """Reproduce all tables and figures of the paper."""
     from .control.limit import fastest_settling
     from .control.requirements import reach
     from .control.tuning import tune
@@ -122,7 +122,7 @@ def reproduce(progress: ReportProgress | None = None) -> Paper:
 
 
 def load_test(seed: int = 0) -> Recording:
-    """The virtual load test: 24 V from rest, then the brake is tightened step by step; 1 ms, noisy sensors."""
+    """The virtual load test: 24 V from rest, then the load rises in steps to 1 N m; 1 ms samples, noisy sensors."""
     from .recording import Recording
     from .simulate import simulate
 
@@ -142,7 +142,7 @@ def load_test(seed: int = 0) -> Recording:
 
 
 def recovered_by_paper_ga(seed: int = 0) -> Recovered:
-    """The binary genetic algorithm alone: 20 chromosomes of 60 bits, 80 generations."""
+    """Identify by the paper's binary genetic algorithm alone: 20 chromosomes of 60 bits, 80 generations."""
     from .identify.bounds import search_bounds
     from .identify.parameters import Parameters
     from .identify.search import search
@@ -161,7 +161,7 @@ def recovered_by_paper_ga(seed: int = 0) -> Recovered:
 
 
 def recovered_by_identify(seed: int = 0) -> Recovered:
-    """`identify`: evolution strategy, then least squares."""
+    """Identify by `identify`: evolution strategy, then least squares."""
     from .identify import identify
 
     run = load_test()
@@ -175,7 +175,7 @@ def recovered_by_identify(seed: int = 0) -> Recovered:
 
 
 def load_errors(motor: Motor) -> tuple[np.ndarray, np.ndarray]:
-    """Figs 5 and 6: error of the steady speed and current on 24 V against the load torques, %."""
+    """Figs 5 and 6: error (%) of steady speed and current on 24 V at each load torque in `LOADS`."""
     (speed, current), (found_speed, found_current) = _steady_state(PRINTED), _steady_state(motor)
     return 100 * (found_speed / speed - 1), 100 * (found_current / current - 1)
 
@@ -187,7 +187,7 @@ def _steady_state(motor: Motor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def step_up_and_down(tuning: Tuning) -> Response:
-    """0 to 481 rad/s, and a fifth of a second later on to 240.5."""
+    """Simulated step from rest to 481 rad/s and, 200 samples later, to 240.5 rad/s."""
     from .control.loop import Course, Response, closed_loop_jit
 
     with jax.enable_x64(True):
@@ -199,7 +199,7 @@ def step_up_and_down(tuning: Tuning) -> Response:
 
 
 def simulated_as_printed(proportional: float, integral: float, derivative: float) -> AsPrinted:
-    """The ideal loop of equation (9) with PI or PID, the derivative of the error filtered; by `scipy.signal`."""
+    """Ideal loop of equation (9) with PI or PID, filtered derivative of the error; simulated by `scipy.signal`."""
     from scipy.signal import lsim
 
     from .control.metrics import step_metrics

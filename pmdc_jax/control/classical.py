@@ -1,4 +1,4 @@
-"""Rules from the textbooks: Ziegler-Nichols and pole placement."""
+"""Textbook design rules: Ziegler-Nichols and pole placement."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from .hardware import Hardware
 from .law import Law, SampledMotor
 from .margins import linear_loop, loop_gain
 
-RULED = ("pi", "pid")  # controllers that Ziegler and Nichols have a rule for
+RULED = ("pi", "pid")  # controllers with a Ziegler-Nichols rule
 
 Poles = Sequence[complex | float] | np.ndarray
 
 
 @double_precision
 def ultimate_gain(motor: Motor, hardware: Hardware | None) -> tuple[float, float]:
-    """Gain (V s/rad) of the proportional loop that just keeps oscillating, and the period of that (s).
+    """Ultimate gain (V s/rad) and period (s): those of the sustained oscillation under proportional control.
 
-    **Arguments**: `hardware`, whose sampling and delay make the oscillation possible; None is the ideal loop.
+    **Arguments**: `hardware`, whose sampling and delay make the oscillation possible; None means the ideal loop.
 
-    **Raises**: `InputError` for the ideal loop: a motor of two poles turns the phase by 180 degrees only at infinite
+    **Raises**: `InputError` for the ideal loop: the phase of a two-pole motor reaches -180 degrees only at infinite
     frequency, so no gain makes it oscillate.
     """
     if hardware is None:
@@ -44,19 +44,19 @@ def ultimate_gain(motor: Motor, hardware: Hardware | None) -> tuple[float, float
     angle = np.geomspace(1e-5, np.pi, 200_000)
     gain = loop_gain(loop, angle)
     phase = np.unwrap(np.angle(gain))
-    # a sampled loop that is never late crosses at half the sampling frequency at the latest
+    # without delay the phase may reach -180 degrees only at the Nyquist frequency, the last angle
     k = min(int(np.argmax(phase <= -np.pi)) or len(angle) - 1, len(angle) - 1)
     period = 2 * np.pi / angle[k] * float(hardware.sample_time)
     return float(1 / np.abs(gain[k])), period
 
 
 def ziegler_nichols(motor: Motor, hardware: Hardware | None, kind: str) -> PI | PID:
-    """PI or PID gains by the sustained-oscillation rule, on the sampled loop.
+    """PI or PID gains by the sustained-oscillation rule, for the sampled loop.
 
-    PI: Kp = 0.45 Ku, Ti = Tu / 1.2. PID: Kp = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8, filter Td / 10. The integral tracks
-    the limited voltage within Ti.
+    PI: Kp = 0.45 Ku, Ti = Tu / 1.2. PID: Kp = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8, filter Td / 10. The tracking
+    time of the anti-windup is Ti.
 
-    **Raises**: `InputError` where the loop never oscillates, and for state feedback, for which there is no rule.
+    **Raises**: `InputError` for the ideal loop, which never oscillates, and for state feedback, which has no rule.
 
     **Source**: Ziegler, Nichols, Transactions of the ASME 64 (1942).
     """
@@ -71,9 +71,9 @@ def ziegler_nichols(motor: Motor, hardware: Hardware | None, kind: str) -> PI | 
 
 
 def ackermann(A: np.ndarray, B: np.ndarray, poles: Poles) -> np.ndarray:
-    """The gain K that gives A - B K these eigenvalues: K = (0 ... 0 1) [B AB ...]^-1 p(A).
+    """Gain K that gives A - B K the eigenvalues `poles`: K = (0 ... 0 1) [B AB ...]^-1 p(A).
 
-    **Arguments**: `A` (n, n); `B` (n,); `poles`, n of them, complex ones in pairs.
+    **Arguments**: `A` (n, n); `B` (n,); `poles`, n of them, complex ones in conjugate pairs.
 
     **Source**: Ackermann, at - Automatisierungstechnik 20 (1972).
     """
@@ -89,10 +89,11 @@ def ackermann(A: np.ndarray, B: np.ndarray, poles: Poles) -> np.ndarray:
 def state_feedback(
     motor: Motor, poles: Poles, setpoint: float, sample_time: float | None = None
 ) -> StateFeedback | StateFeedbackIntegral:
-    """State feedback that puts the poles where they are wanted; a third pole asks for integral action.
+    """State feedback by pole placement; a third pole adds integral action.
 
-    **Arguments**: `poles`, rad/s, two or three, complex ones in pairs; `setpoint`, rad/s, held exactly without load;
-    `sample_time`, s, for which exp(pole sample_time) are the poles of the sampled loop; None for continuous time.
+    **Arguments**: `poles`, rad/s, two or three, complex ones in conjugate pairs; `setpoint`, rad/s, held exactly
+    without load; `sample_time`, s, with which the sampled loop has the poles exp(pole sample_time), None for
+    continuous time.
     """
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
     wanted = np.asarray(poles)
@@ -114,7 +115,7 @@ def state_feedback(
 
 
 def _state_space(motor: Motor, sample_time: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """A (2, 2) and B (2,) from voltage to current and speed, per second or per sample."""
+    """A (2, 2) and B (2,) of the states current and speed for the input voltage; continuous, or sampled."""
     if sample_time is None:
         A, B = (np.asarray(matrix) for matrix in motor.state_space())
         return A, B[:, 0]
@@ -126,7 +127,7 @@ def _state_space(motor: Motor, sample_time: float | None) -> tuple[np.ndarray, n
 def _with_error_integral(
     A: np.ndarray, B: np.ndarray, sample_time: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """With a third state, the integral of set point less speed."""
+    """A and B with a third state, the integral of set point minus speed."""
     step, kept = (1.0, 0.0) if sample_time is None else (sample_time, 1.0)
     A = np.block([[A, np.zeros((2, 1))], [np.array([[0.0, -step, kept]])]])
     return A, np.append(B, 0.0)

@@ -1,4 +1,4 @@
-"""The ideal closed loop in continuous time: no sampling, no delay, only the limits."""
+"""The ideal closed loop in continuous time, without sampling or delay, but with the limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .controllers import AbstractController, Memory, Number
 from .loop import Response
 from .steady import steady_state
 
-# The current limit is a current loop so many times faster than the winding.
+# The current limit is enforced by a current loop this many times faster than the winding, R / L.
 CURRENT_LOOP_GAIN = 50.0
 
 
@@ -29,13 +29,13 @@ def continuous_loop(
     initial: Number = 0.0,
     tolerance: float = 1e-9,
 ) -> Response:
-    """Simulate a motor under a controller in continuous time, from steady running at `initial`.
+    """Simulate a motor under a controller in continuous time, from steady state at `initial` without load.
 
-    Solved by Tsit5 with adaptive steps; differentiable in gains, motor and reference. For motors whose effects are
-    smooth; a delay of the speed sensor is left out.
+    Solved by Tsit5 with adaptive steps; differentiable in gains, motor and reference. Only for motors with smooth
+    effects; a delay of the speed sensor is ignored.
 
     **Arguments**: `times`, s, increasing from 0; `reference` and `initial`, rad/s; `voltage_limit`, V;
-    `current_limit`, A, None for none; `load`, N m, from the start; `tolerance`, relative, and absolute in A,
+    `current_limit`, A, None for no limit; `load`, N m, from the start; `tolerance`, relative, and absolute in A,
     rad/s and V.
     """
 
@@ -77,7 +77,7 @@ def _within_limits(
     voltage_limit: Number,
     current_limit: Number | None,
 ) -> Number:
-    """The voltage that the current loop leaves, within the voltage there is."""
+    """The voltage limited by the current loop, then by the voltage limit."""
     if current_limit is not None:
         holding = motor.R * state.current + motor.Kb * state.speed
         lowest, highest = (

@@ -1,4 +1,4 @@
-"""Sampled control laws as JSON files: gains, limits, and the model they rely on."""
+"""Sampled control laws as JSON files: gains, limits, and the motor model that they use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MEND = "Write it with pmdc tune --save"
 
 
 def gains_of(controller: AbstractController) -> dict[str, float]:
-    """The gains by name, SI."""
+    """Gains by name, in SI units."""
     return {one.name: float(getattr(controller, one.name)) for one in fields(controller)}
 
 
@@ -51,7 +51,7 @@ def save_controller(path: str | Path, law: Law) -> None:
 def load_controller(path: str | Path) -> Law:
     """Read a law written by `save_controller`.
 
-    **Raises**: `InputError` where the file is missing, is not JSON, or lacks or misspells something.
+    **Raises**: `InputError` where the file is missing or not JSON, or a value is missing or invalid.
     """
     where, content = str(path), read_object(path, FORMAT, MEND)
     if str(content.get("type")) not in CONTROLLERS:

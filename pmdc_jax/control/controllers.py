@@ -1,4 +1,4 @@
-"""Speed controllers: what voltage each asks for, and how its memory moves, in continuous time and sampled."""
+"""Speed controllers: the voltage command of each and the rates of its states, continuous and sampled."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Number = Scalars | float
 
 
 class Memory(NamedTuple):
-    """What a controller remembers: its integral in V, and the speed behind its derivative filter in rad/s."""
+    """States of a controller: its integral, V, and the output of its derivative filter, a speed in rad/s."""
 
     integral: Number
     filtered: Number
@@ -22,21 +22,21 @@ class Memory(NamedTuple):
 class AbstractController(eqx.Module):
     """A speed controller.
 
-    One definition serves both worlds: in continuous time d(memory)/dt = rates(..., step=0), sampled
-    memory += step * rates(..., step), where the derivative filter comes out as backward Euler. What else is said of a
-    controller, in reports, in the search for its gains and in C, is said here, too.
+    One definition serves both continuous time, d(memory)/dt = rates(..., step=0), and sampling,
+    memory += step * rates(..., step), which discretises the derivative filter by backward Euler. The class also holds
+    what reports, the search for gains and the export to C need to know about a controller.
     """
 
     name: ClassVar[str]
-    # in plain English, for reports
+    # name in reports
     label: ClassVar[str]
-    # of every gain
+    # unit of every gain
     units: ClassVar[dict[str, str]]
-    # what its gains are sought by, of `gains.RANGES`
+    # coordinates of the search for its gains, keys of `gains.RANGES`
     coordinates: ClassVar[tuple[str, ...]]
-    # `command` in C, for `export`: `slope` is the filtered derivative, `ahead` the speed to feed back with the current
+    # `command` in C, for `export`: `slope` is the filtered derivative, `ahead` the predicted speed, for state feedback
     c_command: ClassVar[str]
-    # the state it feeds back is then the estimate at the moment the voltage takes effect
+    # if true, `command` gets current and speed predicted for the moment when the voltage takes effect
     feeds_back_current: ClassVar[bool] = False
     integrates: ClassVar[bool] = True
     filters_derivative: ClassVar[bool] = False
@@ -44,7 +44,7 @@ class AbstractController(eqx.Module):
     def command(
         self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
     ) -> Number:
-        """Voltage asked for, V, before any limit.
+        """Commanded voltage, V, before any limit.
 
         **Arguments**: `reference` and `speed`, rad/s; `current`, A; `step`, the sample time in s, 0 in
         continuous time.
@@ -54,13 +54,13 @@ class AbstractController(eqx.Module):
     def rates(
         self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
     ) -> Memory:
-        """Rates of the memory, per second; `excess` is the voltage really applied less the one asked for."""
+        """Rates of the memory, per second; `excess`, V, is the applied minus the commanded voltage."""
         raise NotImplementedError
 
     def equilibrium(
         self, reference: Number, speed: Number, current: Number, voltage: Number, step: Number
     ) -> Memory:
-        """The memory in equilibrium: the command is `voltage` and stays there."""
+        """Memory in steady state: the filter holds `speed`, the integral, if any, makes the command `voltage`."""
         memory = Memory(jnp.zeros_like(jnp.asarray(speed, float)), speed)
         if not self.integrates:
             return memory
@@ -71,7 +71,7 @@ class AbstractController(eqx.Module):
 def _integral_rate(
     integral: Number, tracking_time: Number, error: Number, excess: Number, step: Number
 ) -> Number:
-    """The integral, pulled back in `tracking_time` while the voltage is limited.
+    """Rate of the integral, with back-calculation over `tracking_time` while the voltage is limited.
 
     **Source**: Astrom, Hagglund, "Advanced PID Control" (2006), section 3.5, back-calculation.
     """
@@ -84,7 +84,7 @@ class PI(AbstractController):
     u = Kp (b r - w) + I,  dI/dt = Ki (r - w) + (v - u) / Tt
 
     **Fields**: `proportional` Kp, V s/rad; `integral` Ki, V/rad; `setpoint_weight` b; `tracking_time` Tt, s,
-    in which the integral follows the limited voltage v; at least one sample.
+    time constant with which the integral tracks the limited voltage v; at least one sample is used.
     """
 
     name: ClassVar = "pi"
@@ -121,7 +121,7 @@ class PI(AbstractController):
 
 
 class PID(AbstractController):
-    """PID controller; the derivative is of the measured speed alone, through a first-order filter.
+    """PID controller; the derivative acts on the measured speed only, through a first-order filter.
 
     u = Kp (b r - w) + I - Kd (w - z) / Tf,  dz/dt = (w - z) / Tf,  dI/dt = Ki (r - w) + (v - u) / Tt
 

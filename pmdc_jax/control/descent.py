@@ -1,4 +1,4 @@
-"""Gradient tuning from many starts at once."""
+"""Gain tuning by gradient descent from many starts at once."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from .gains import GainSpace
 from .law import SampledMotor
 from .objective import CHOICE, DESCENT, Task, cost, exact_score, smooth_score
 
-SCREENED = 512  # gains drawn
-STARTS = 64  # the best of them, which are followed on the first motor alone
-FINALISTS = 16  # the best of those, which go on with all the motors
+SCREENED = 512  # random sets of gains
+STARTS = 64  # the best of them, start points of descents on the first motor alone
+FINALISTS = 16  # the best results of these, start points of descents on all motors
 ITERATIONS = 100  # of each descent
-RATE = 0.06  # first step in the logarithms of the gains; it falls to nothing
-FIRST_WIDTH = 0.5  # of the smooth metrics at the beginning, in bands
-LAST_WIDTH = 0.05  # from half of the iterations on
-OVERFLOWN = 1e6  # cost of gains with which the speed overflows
+RATE = 0.06  # initial learning rate, in the logarithms of the gains; decays to zero
+FIRST_WIDTH = 0.5  # initial width of the smooth metrics, in bands
+LAST_WIDTH = 0.05  # their width in the second half of the iterations
+OVERFLOWN = 1e6  # cost of gains with which the simulated speed overflows
 
 Coordinates = Float[Array, "starts gains"]
 Costs = Float[Array, " starts"]
-# Where the starts have got to, Adam's state, the best points they have seen, and what these cost
+# Current points, state of Adam, best point of each start so far, and costs of these
 Descent = tuple[Coordinates, Any, Coordinates, Costs]
 
 
@@ -39,12 +39,13 @@ def best_coordinates(
     seed: int = 0,
     starts: int = STARTS,
 ) -> np.ndarray:
-    """Coordinates of the best gains that any of the starts led to, (gains,).
+    """Coordinates of the best gains found from any start, (gains,).
 
-    Gains are drawn evenly over the logarithms of their ranges; the best of them are followed down the
-    gradient by Adam, each keeping the best point it has seen.
+    Gains are drawn log-uniformly over their ranges. From the best, Adam descends the smooth cost, and each start keeps
+    its best point. The exact cost selects among these.
 
-    **Arguments**: `motors`, with a leading axis; all count, the worst of them more.
+    **Arguments**: `motors`, with a leading axis, the nominal one first; the worst of them weigh more in the cost;
+    `starts`, number of descents.
     """
     lower, upper = space.bounds()
     rng = np.random.default_rng(seed)
@@ -80,7 +81,7 @@ def _smooth_costs(
 
 
 def _finite(costs: Costs) -> Costs:
-    """So that gains with which the speed overflows come last."""
+    """Replace NaN and infinity, so that gains with which the speed overflows rank last."""
     return jnp.nan_to_num(costs, nan=OVERFLOWN, posinf=OVERFLOWN)
 
 
@@ -105,7 +106,7 @@ def _rank(
 def _descend(
     task: Task, space: GainSpace, model: SampledMotor, motors: Motor, start: Coordinates
 ) -> tuple[Coordinates, Costs]:
-    """All starts at once: the sum of their costs has each one's own gradient."""
+    """Descend from all starts at once: the gradient of the summed costs holds that of each start's own cost."""
     lower, upper = (jnp.asarray(bound) for bound in space.bounds())
     schedule = optax.cosine_decay_schedule(RATE, ITERATIONS)
     optimiser = optax.adam(schedule, b1=0.8, b2=0.95)
@@ -118,7 +119,7 @@ def _descend(
         x, state, best, lowest = carry
         width = FIRST_WIDTH * (LAST_WIDTH / FIRST_WIDTH) ** jnp.minimum(2 * k / ITERATIONS, 1.0)
         (_, costs), gradient = jax.value_and_grad(total, has_aux=True)(x, width)
-        # while the metrics still sharpen, costs of different iterations cannot be compared
+        # costs of different iterations are comparable only once the width no longer changes
         better = (costs < lowest) | (2 * k <= ITERATIONS)
         best = jnp.where(better[:, None], x, best)
         lowest = jnp.where(better, costs, lowest)

@@ -1,4 +1,4 @@
-"""A sampled law as plain C99, in one header."""
+"""Export of a sampled law to C99, as one header."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ $body
 
 
 def export(law: Law, c: str | Path) -> None:
-    """Write a law as one C99 header, atomically: the same arithmetic, limits and anti-windup included.
+    """Write a law as one C99 header, atomically: the same arithmetic, with limits and anti-windup.
 
     **Arguments**: `law`, from `tune(...).law` or `load_controller`; `c`, the file to write.
     """
@@ -113,7 +113,7 @@ def _body(law: Law) -> list[str]:
 
 
 def _state_ahead(law: Law) -> list[str]:
-    """Current and speed when the voltage takes effect; `here` is the current now."""
+    """Statements that predict current and speed to when the voltage takes effect; `here` is the present current."""
     lines = []
     if not law.hardware.measures_current:
         lines += ["(void)current;", "current = state->current;"]
@@ -128,13 +128,13 @@ def _state_ahead(law: Law) -> list[str]:
 
 
 def _next_sample(row: str, voltage: str) -> str:
-    """Current (I) or speed (W) a sample later, by the law's model of the motor."""
+    """Expression for current (I) or speed (W) one sample later, by the law's model of the motor."""
     model = f"PMDC_MODEL_{row}"
     return f"{model}I * here + {model}W * speed + {model}V * {voltage}"
 
 
 def _command(law: Law) -> list[str]:
-    """The voltage asked for."""
+    """Statements that compute the commanded voltage."""
     lines = []
     if law.controller.filters_derivative:
         lines += [
@@ -145,7 +145,7 @@ def _command(law: Law) -> list[str]:
 
 
 def _within_limits(law: Law) -> list[str]:
-    """The voltage applied."""
+    """Statements that limit the voltage."""
     lines = ["pmdc_real applied = asked;"]
     if law.hardware.current_limit is not None:
         lines += [
@@ -158,7 +158,7 @@ def _within_limits(law: Law) -> list[str]:
 
 
 def _memory(law: Law) -> list[str]:
-    """What the controller remembers."""
+    """Statements that update the controller's memory."""
     lines = []
     if law.controller.integrates:
         lines += [
@@ -174,7 +174,7 @@ def _memory(law: Law) -> list[str]:
 
 
 def _estimated_current(law: Law) -> list[str]:
-    """The current at the next sample."""
+    """Statements that estimate the current at the next sample."""
     acting = "state->voltage" if law.hardware.delay else "applied"
-    # not every law looks ahead, and compilers warn of what is set and not used
+    # some laws do not use `ahead`, and compilers warn of a variable that is set but not used
     return [f"state->current = {_next_sample('I', acting)};", "(void)ahead;"]

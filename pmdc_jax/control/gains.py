@@ -1,4 +1,4 @@
-"""Between which values the gains of each controller are sought, scaled to motor, limits and sampling."""
+"""Search ranges for the gains of each controller, scaled to the motor, its limits and the sample time."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from ..motor import Motor
 from .controllers import CONTROLLERS, AbstractController, Number
 from .steady import steady_state
 
-# Each as (lower, upper), the first two of the voltage limit over the set point, times of the fastest settling time.
-# Wide: in an unhurried search over PI and PID on seven voltages the best lay inside by a factor of three and more.
+# (lower, upper): the stiffness in units of voltage limit over set point, times in units of the fastest settling time.
+# The ranges are wide: in a long search for PI and PID at seven voltages, the best gains lay inside them by a factor of
+# at least three.
 RANGES: Mapping[str, tuple[float, float]] = {
     "stiffness": (0.1, 300.0),  # Kp, K2
     "integral_time": (0.05, 100.0),  # Kp / Ki
-    "derivative_time": (0.003, 0.5),  # Kd / Kp, and K1 / K2 in the time it stands for
+    "derivative_time": (0.003, 0.5),  # Kd / Kp; for state feedback K1 J / (K2 Kt)
     "filter_time": (0.001, 0.1),
     "tracking_time": (0.001, 30.0),
-    "setpoint_weight": (0.2, 2.0),  # as it is
+    "setpoint_weight": (0.2, 2.0),  # dimensionless
 }
 
 
 class GainSpace(NamedTuple):
-    """The space in which a controller is tuned; coordinates are natural logarithms."""
+    """Search space for the gains of a controller; coordinates are natural logarithms."""
 
     kind: str
     stiffness: Number  # V s/rad, the unit of proportional gains
@@ -37,7 +38,7 @@ class GainSpace(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the coordinates."""
+        """Names of the coordinates."""
         return CONTROLLERS[self.kind].coordinates
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -52,7 +53,7 @@ class GainSpace(NamedTuple):
         times = {name: self.duration * at[name] for name in at if name.endswith("_time")}
         stiffness, gains = self.stiffness * at["stiffness"], {}
         if kind.feeds_back_current:
-            # K1 i is K2 times the speed that the current's torque gains in that time
+            # K1 i equals K2 times the change of speed that the torque Kt i produces in derivative_time
             current_gain = stiffness * times["derivative_time"] * self.motor.Kt / self.motor.J
             gains["reference_gain"] = reference_gain(
                 self.motor, self.setpoint, current_gain, stiffness
@@ -72,6 +73,6 @@ class GainSpace(NamedTuple):
 def reference_gain(
     motor: Motor, setpoint: Number, current_gain: Number, speed_gain: Number
 ) -> Number:
-    """Kr for which state feedback holds the set point exactly, without load."""
+    """Kr, V s/rad, with which state feedback holds the set point exactly, without load."""
     state, voltage = steady_state(motor, setpoint)
     return (voltage + current_gain * state.current) / setpoint + speed_gain

@@ -1,4 +1,4 @@
-"""What stands between a controller and its motor: sampling, delay, limits, sensors."""
+"""Hardware between a controller and its motor: sampling, delay, limits, sensors."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from .controllers import Number
 
 
 class Hardware(eqx.Module):
-    """Power stage, sensors and the processor's clock.
+    """Power stage, sensors and sampling of the loop.
 
-    **Fields**: `sample_time`, s; `voltage_limit`, V, either direction; `current_limit`, A, either direction, None
-    for none; `speed_step`, rad/s, the quantum of the measured speed, None for none; `delay`, whole samples from
-    measurement to voltage, 0 or 1; `measures_current`, without which the current is estimated.
+    **Fields**: `sample_time`, s; `voltage_limit`, V, in either direction; `current_limit`, A, in either
+    direction, None for none; `speed_step`, rad/s, quantum of the measured speed, None for none; `delay`, 0 or 1
+    samples from measurement to voltage; `measures_current`, if False the law estimates the current.
     """
 
     sample_time: Number

@@ -1,4 +1,4 @@
-"""What comes of a controller: its exact metrics on the nominal motor, and over the motors that might be."""
+"""Evaluation of a controller: exact metrics on the nominal motor and over motors drawn from its uncertainty."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from .margins import margins
 from .metrics import LoadMetrics, StepMetrics, load_metrics, step_metrics
 from .objective import SECOND_SETPOINT, Score, Task, exact_score
 
-REPORTED_SUBSTEPS = 10  # instants a sample in what is reported
-SMALL_STEP = 0.05  # set point of the small step, over that of the task
+REPORTED_SUBSTEPS = 10  # simulated instants per sample in reported responses
+SMALL_STEP = 0.05  # set point of the small step over that of the task
 
 
 @frozen
 class Robustness:
-    """The metrics over motors drawn from the uncertainty: 95th percentiles, None where more than 5 % never settle."""
+    """Metrics over the drawn motors: 95th percentiles, that of settling None where more than 5 % never settle."""
 
     samples: int
     Overshoot_p95: float
     SettlingTime_p95: float | None
-    overshoot: np.ndarray = field(repr=False)  # % of each motor
-    settling: np.ndarray = field(repr=False)  # s of each motor, infinite where it never settles
+    overshoot: np.ndarray = field(repr=False)  # of each motor, %
+    settling: np.ndarray = field(repr=False)  # of each motor, s; infinite where it never settles
 
 
 @frozen
 class JudgedController:
-    """One way of choosing the gains, and what comes of it. Metrics are None where something never happens."""
+    """A controller, named after how its gains were chosen, with its metrics; None where an event never happens."""
 
     name: str
     controller: AbstractController
     metrics: Mapping[str, float | None]
     load: Mapping[str, float | None]
     second_step: Mapping[str, float | None]  # of the step from the set point to half of it
-    small_step: Mapping[str, float | None]  # of a step so small that no limit binds
+    small_step: Mapping[str, float | None]  # of a step to 5 % of the set point
     robust: Robustness | None
     stable: bool
 
@@ -57,7 +57,7 @@ def judged(
     controller: AbstractController,
     validation_motors: Motor | None,
 ) -> JudgedController:
-    """A controller by its exact metrics; `validation_motors`, motors along a leading axis, give the percentiles."""
+    """A controller with its exact metrics; `validation_motors`, along a leading axis, give the percentiles."""
     controller = jax.tree.map(jnp.asarray, controller)
     law = Law.of(controller, task.hardware, motor)
     response = simulated(task, motor, law)
@@ -79,8 +79,8 @@ def judged(
 
 
 def _small_step_metrics(task: Task, motor: Motor, law: Law) -> StepMetrics:
-    """The set point's own step, twenty times smaller. Gains that never overshoot where the voltage is at its limit may
-    do so here."""
+    """Metrics of a step to a twentieth of the set point, without load and noise. Gains that do not overshoot a step
+    with the voltage at its limit may overshoot this one."""
     small = eqx.tree_at(
         lambda t: (t.setpoint, t.load, t.noise),
         task,
@@ -92,13 +92,13 @@ def _small_step_metrics(task: Task, motor: Motor, law: Law) -> StepMetrics:
 
 @compiled
 def simulated(task: Task, motor: Motor, law: Law) -> Response:
-    """The whole course, ten instants a sample."""
+    """Response over the whole course, ten instants per simulation step."""
     return closed_loop(motor, law, task.course(), REPORTED_SUBSTEPS * task.substeps)
 
 
 @compiled
 def speeds(task: Task, motors: Motor, law: Law) -> Float[Array | np.ndarray, "motors samples"]:
-    """Of every motor at every sample, rad/s."""
+    """Speed of every motor at every sample, rad/s."""
 
     def speed(motor: Motor) -> Float[Array | np.ndarray, " samples"]:
         return closed_loop(motor, law, task.course(), task.substeps).speed[:: task.substeps]
@@ -107,7 +107,7 @@ def speeds(task: Task, motors: Motor, law: Law) -> Float[Array | np.ndarray, "mo
 
 
 def _by_name(metrics: StepMetrics | LoadMetrics) -> dict[str, float | None]:
-    """Numbers by name, None for what never happens."""
+    """Metrics by name, None where the event never happens."""
     values = {name: float(value) for name, value in metrics._asdict().items()}
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
 

@@ -1,4 +1,4 @@
-"""The sampled control law: exactly what the processor computes, limits and anti-windup included."""
+"""The sampled control law, exactly as the processor computes it, with limits and anti-windup."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .hardware import Hardware
 
 
 class SampledMotor(NamedTuple):
-    """The linear motor over one sample, as the law knows it: i[k+1] = ii i[k] + iw w[k] + iv v[k], and w likewise."""
+    """The law's discrete model of the linear motor: i[k+1] = ii i[k] + iw w[k] + iv v[k], and w[k+1] likewise."""
 
     ii: Number
     iw: Number
@@ -26,7 +26,7 @@ class SampledMotor(NamedTuple):
 
     @classmethod
     def of(cls, motor: Motor, sample_time: Number) -> SampledMotor:
-        """The exact discretisation of the motor, whose effects the law does not know."""
+        """Exact discretisation, with held voltage and no load, of the motor without its effects."""
         whole, inputs, *_ = propagator(
             motor.with_effects(()), jnp.asarray(sample_time, float), Drive()
         )
@@ -41,8 +41,8 @@ class SampledMotor(NamedTuple):
 
 
 class LawState(NamedTuple):
-    """Kept from sample to sample: the controller's memory, the estimated current in A, and the voltage in V that
-    was decided last."""
+    """State of the law: the controller's memory, the estimated current (A), and the voltage computed at the previous
+    sample (V)."""
 
     memory: Memory
     current: Number
@@ -52,8 +52,8 @@ class LawState(NamedTuple):
 class Law(eqx.Module):
     """A controller on its hardware.
 
-    **Fields**: `controller`; `hardware`; `model`, the motor it is designed for, used for the current limit, for the
-    delay of state feedback, and for the current where it is not measured.
+    **Fields**: `controller`; `hardware`; `model`, the motor that the law is designed for, used to enforce the current
+    limit, to predict the fed-back state over the delay, and to estimate a current that is not measured.
     """
 
     controller: AbstractController
@@ -66,7 +66,7 @@ class Law(eqx.Module):
         return cls(controller, hardware, SampledMotor.of(motor, hardware.sample_time))
 
     def start(self, reference: Number, at: State, voltage: Number) -> LawState:
-        """The state of a law that has long held the motor where it is."""
+        """State of the law in steady state: motor state `at`, held by `voltage`, V, at `reference`, rad/s."""
         step = self.hardware.sample_time
         memory = self.controller.equilibrium(reference, at.speed, at.current, voltage, step)
         return LawState(memory, at.current, voltage)
@@ -74,14 +74,15 @@ class Law(eqx.Module):
     def step(
         self, state: LawState, reference: Number, speed: Number, current: Number
     ) -> tuple[LawState, Number]:
-        """One sample: measured speed (rad/s) and current (A; ignored where it is not measured) to voltage (V).
+        """Compute one sample: the next state and the voltage (V) from the measured speed (rad/s) and current (A).
 
-        The voltage is the one decided now; it takes effect after the hardware's delay.
+        The current is ignored where the hardware does not measure it. The voltage takes effect after the hardware's
+        delay.
         """
         hardware, model = self.hardware, self.model
         here = current if hardware.measures_current else state.current
         ahead = (here, speed)
-        if hardware.delay:  # until then the voltage decided last acts
+        if hardware.delay:  # meanwhile the previous voltage acts
             ahead = model.next(here, speed, state.voltage)
         seen = ahead[1] if self.controller.feeds_back_current else speed
         period = hardware.sample_time
@@ -89,14 +90,15 @@ class Law(eqx.Module):
         applied = self._limited(asked, *ahead)
         rates = self.controller.rates(state.memory, reference, speed, applied - asked, period)
         memory = Memory(*(m + period * r for m, r in zip(state.memory, rates, strict=True)))
-        # the winding's own equation, corrected by the measured speed at every sample and blind to the load: its
-        # error dies out with L / R, and no unknown torque biases it, as it would in a full-order observer
+        # The current is estimated from the winding's equation alone, with the measured speed at every sample. The load
+        # does not enter: the error decays with L / R, and an unknown torque causes no bias, as it would in a full-order
+        # observer.
         acting = state.voltage if hardware.delay else applied
         return LawState(memory, model.next(here, speed, acting)[0], applied), applied
 
     def _limited(self, voltage: Number, current: Number, speed: Number) -> Number:
-        """Within the voltage that keeps the current at the end of the sample within its limit, then within the
-        voltage there is."""
+        """The voltage limited so that the current at the end of the sample keeps its limit, then to the voltage
+        limit."""
         hardware, model = self.hardware, self.model
         if hardware.current_limit is not None:
             free = model.ii * current + model.iw * speed

@@ -1,4 +1,4 @@
-"""The fastest settling that voltage and current allow, whatever the controller."""
+"""The fastest settling within the voltage and current limits, for any controller."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from .controllers import Number
 from .metrics import BAND
 from .steady import steady_state
 
-INSTANTS = 20_000  # of a simulated dash
-DOUBLINGS = 12  # of its duration, before the band counts as out of reach
-DRIVE = Drive()  # by the voltage
+INSTANTS = 20_000  # of a simulated time-optimal step
+DOUBLINGS = 12  # of its duration, after which the band counts as out of reach
+DRIVE = Drive()  # the voltage is the input
 
-# Where the motor is, whether it is in full reverse, and whether its speed has turned there
+# State of the motor, whether the voltage is reversed, and whether the speed has turned since
 Dash = tuple[State, Bool[Array, ""], Bool[Array, ""]]
 
 
@@ -37,14 +37,14 @@ def fastest_settling(
 ) -> float | None:
     """The shortest time in which any controller can bring the speed into the 2 % band and keep it there, s.
 
-    Flat out towards the set point, by the limit of voltage or of current, whichever binds. If the current that is
-    then flowing would carry the speed out of the band at its far side, full reverse from the one moment at which
-    the speed just stays inside. Bang-bang with one switch is optimal for a motor of two states.
+    The motor is driven towards the set point at the voltage or current limit, whichever binds. If the current would
+    then carry the speed beyond the far edge of the band, the drive is fully reversed at the latest moment that keeps
+    the speed inside. Bang-bang control with one switch is time-optimal for a motor with two states.
 
     **Arguments**: `setpoint` and `initial`, rad/s; `voltage_limit`, V, and `current_limit`, A, in either
     direction; `load`, N m, present from the start.
 
-    **Returns**: the time, or None where the band is out of reach. Within 1e-4 of it.
+    **Returns**: the time, accurate to about 1e-4 of it, or None where the band is out of reach.
 
     **Source**: Pontryagin et al., "The Mathematical Theory of Optimal Processes" (1962), section 5.
     """
@@ -55,14 +55,14 @@ def fastest_settling(
     )
     for _ in range(DOUBLINGS):
         reached = float(_dash(motor, jnp.asarray(duration), jnp.asarray(INSTANTS), *bounds)[0])
-        if reached == reached:  # not NaN: once more, on instants as close as they can be
+        if reached == reached:  # not NaN: repeat with the finest instants
             return _with_one_switch(motor, 1.2 * reached, *bounds)
         duration *= 2
     return None
 
 
 def _with_one_switch(motor: Motor, duration: float, *bounds: Any) -> float:
-    """Settling time with the latest switch to full reverse that keeps the speed in the band."""
+    """Settling time (s) with the latest switch to full reverse that keeps the speed within the band."""
     settling, stays = _dash(motor, jnp.asarray(duration), jnp.asarray(INSTANTS), *bounds)
     early, late = 0, INSTANTS
     while not stays and late - early > 1:
@@ -88,9 +88,10 @@ def _dash(
     initial: Number,
     load: Number,
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Flat out until instant `switch` or into the band, then full reverse until the speed turns.
+    """Simulate full drive until instant `switch` or the band, then full reverse until the speed turns.
 
-    **Returns**: when the band is reached (NaN if it is not), and whether its far side is respected.
+    **Returns**: the time (s) at which the band is reached, NaN if never, and whether the speed stays within its far
+    edge.
     """
     step = duration / INSTANTS
     along = propagator(motor, jnp.asarray(step), DRIVE)
@@ -105,7 +106,7 @@ def _dash(
         voltage = jnp.where(braking, -ahead, ahead) * voltage_limit
         new = _next_state(motor, along, state, voltage, current_limit, load)
         turned = turned | (braking & (ahead * (new.speed - state.speed) <= 0))
-        # what comes after the turn does not count
+        # frozen once the speed has turned: what comes later is irrelevant
         state = jax.tree.map(lambda now, then: jnp.where(turned, now, then), state, new)
         return (state, braking, turned), state.speed
 
@@ -126,7 +127,7 @@ def _next_state(
     current_limit: Number | None,
     load: Float[Array, ""],
 ) -> State:
-    """The next state at this voltage, or at the one that ends the step at the current limit."""
+    """The next state under this voltage, reduced where the step would end beyond the current limit."""
     acting = Input(DRIVE, voltage, load)
     flat_out = held_step(motor, along, acting, state)
     if current_limit is None:

@@ -1,4 +1,4 @@
-"""The sampled closed loop: one exact step of the motor a sample, or several to see between the samples."""
+"""The sampled closed loop: one exact step of the motor per sample, or several to resolve the time between samples."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from .controllers import Number
 from .law import Law, LawState
 from .steady import steady_state
 
-REMEMBERED_SAMPLES = 32  # of the speed, for a sensor that is late
+REMEMBERED_SAMPLES = 32  # of the speed, for a sensor with delay
 
-# The motor's state, the law's, the voltage in V decided last, and the speeds in rad/s so far, latest first
+# States of motor and law, voltage computed at the previous sample (V), and past speeds (rad/s), latest first
 LoopState = tuple[State, LawState, Number, Float[Array, " remembered"]]
-# Current, speed and voltage at one instant, or at those of a sample
+# Current, speed and voltage at one instant, or at all instants of a sample
 Instants = tuple[Scalars, Scalars, Scalars]
 
 
 class Course(NamedTuple):
-    """What is asked of the loop, held from sample to sample.
+    """Inputs of the loop, held from sample to sample.
 
     `reference`, rad/s; `load`, N m, opposes positive motion; `speed_noise`, rad/s, added to the measured speed;
-    `initial`, rad/s, the speed at which the motor has long been held, without load.
+    `initial`, rad/s, the steady speed at the start, without load.
     """
 
     reference: Float[Array, " samples"]
@@ -40,7 +40,7 @@ class Course(NamedTuple):
 
 
 class Response(NamedTuple):
-    """A simulated loop. At instant k: time s, current A, speed rad/s, and the voltage V held from then on."""
+    """A simulated response: time (s), current (A) and speed (rad/s) at each instant, voltage (V) held from then on."""
 
     time: Float[Array | np.ndarray, " instants"]
     current: Float[Array | np.ndarray, " instants"]
@@ -51,10 +51,10 @@ class Response(NamedTuple):
 def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Response:
     """Simulate a motor under a sampled law.
 
-    **Arguments**: `motor`, of scalars, effects and all; `law`; `course`, one value a sample; `substeps`, instants
-    a sample in the response: the speed between samples is exact at every one of them.
+    **Arguments**: `motor`, with scalar fields, simulated with its effects; `law`; `course`, one value per sample;
+    `substeps`, instants per sample in the response, at each of which the speed is exact.
 
-    **Returns**: `Response` with samples x substeps instants. Differentiable in gains, motor and course; under
+    **Returns**: `Response` with samples x substeps instants. Differentiable in gains, motor and course, and works under
     `jax.vmap` over any of them.
     """
     drive, hardware = Drive(), law.hardware
@@ -81,7 +81,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
             seen = (state.current, state.speed, applied)
             return held_step(motor, along, Input(drive, applied, load), state), seen
 
-        # a loop and not written out: effects make long steps, and a sample may have dozens
+        # not unrolled: a step with effects is a long program, and a sample may have dozens
         state, instants = jax.lax.scan(between, state, length=substeps, unroll=substeps == 1)
         return (state, memory, decided, past), instants
 
@@ -97,14 +97,14 @@ closed_loop_jit = compiled(closed_loop)
 
 
 def _earlier(past: Float[Array, " remembered"], samples: Number) -> Float[Array, ""]:
-    """What was so many samples ago, latest first; interpolated linearly."""
+    """The value `samples` ago, linearly interpolated; `past` is latest first."""
     place = jnp.clip(samples, 0.0, REMEMBERED_SAMPLES - 1.001)
     k = jnp.floor(place).astype(int)
     return past[k] + (place - k) * (past[k + 1] - past[k])
 
 
 def _quantised(speed: Number, step: Number | None) -> Number:
-    """Rounded to the sensor's quantum; the derivative looks through the rounding."""
+    """Speed rounded to the sensor's quantum; the gradient ignores the rounding (straight-through)."""
     if step is None:
         return speed
     return speed + jax.lax.stop_gradient(jnp.round(speed / step) * step - speed)

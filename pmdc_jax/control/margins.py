@@ -1,4 +1,4 @@
-"""How far a sampled loop is from instability, and what it makes of noise: its linear range, analysed exactly."""
+"""Stability margins and noise amplification of a sampled loop, by exact analysis of its linear range."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ..effects.base import State
 from ..motor import Motor
 from .law import Law, LawState, SampledMotor
 
-FREQUENCIES = 48  # at which a tuning looks for the peak of the sensitivity
+FREQUENCIES = 48  # at which a tuning evaluates the sensitivity
 
 Matrix = Float[Array | np.ndarray, "n n"]
 Vector = Float[Array | np.ndarray, " n"]
 
 
 class Loop(NamedTuple):
-    """The loop cut open at the motor's terminals, per sample: z' = A z + B v + N n, and the voltage C z + D n that
-    the law would apply; n is an error of the measured speed."""
+    """The loop, opened at the motor's terminals, over one sample: z[k+1] = A z + B v + N n. The law would apply the
+    voltage C z + D n; n is an error of the measured speed."""
 
     A: Matrix
     B: Vector
@@ -32,13 +32,13 @@ class Loop(NamedTuple):
 
     @property
     def closed(self) -> Matrix:
-        """The matrix of the closed loop."""
+        """State matrix of the closed loop."""
         return self.A + self.B[:, None] * self.C
 
 
 def linear_loop(motor: Motor, law: Law) -> Loop:
-    """The loop at rest. A law is linear until its limits bind, so the derivatives there are the whole truth; of
-    the motor its linear part is taken."""
+    """The loop linearised at rest, with the motor's linear part. The law itself is linear until its limits bind, so
+    its derivatives describe it exactly."""
     model = SampledMotor.of(motor, law.hardware.sample_time)
     zero = State(jnp.zeros(()), jnp.zeros(()), {})
     start = law.start(0.0, zero, jnp.zeros(()))
@@ -59,9 +59,9 @@ def linear_loop(motor: Motor, law: Law) -> Loop:
 
 
 def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
-    """Largest |S| = |1 / (1 + loop gain)| over frequency: 1 / distance from the critical point.
+    """Largest |S| = |1 / (1 + loop gain)| over frequency: 1 / distance of the loop gain from -1.
 
-    S(z) = det(z - A) / det(z - A_closed), evaluated in z - 1, which keeps its digits where samples are dense.
+    S(z) = det(z - A) / det(z - A_closed), as polynomials in z - 1 to avoid cancellation at short sample times.
     """
     eye = jnp.eye(loop.A.shape[0])
     angle = jnp.asarray(np.geomspace(1e-3, np.pi, FREQUENCIES))
@@ -74,7 +74,7 @@ def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
 
 
 def _characteristic(matrix: Matrix) -> Float[Array, " n+1"]:
-    """Coefficients of det(x - matrix), highest power first, by Faddeev and LeVerrier."""
+    """Coefficients of det(x - matrix), highest power first, by the Faddeev-LeVerrier algorithm."""
     size = matrix.shape[0]
     eye = jnp.eye(size)
 
@@ -89,20 +89,20 @@ def _characteristic(matrix: Matrix) -> Float[Array, " n+1"]:
 
 @frozen
 class Margins:
-    """Of a loop. None where there is no limit: a gain margin where no gain makes it unstable, a delay margin where
-    the loop gain never reaches one."""
+    """Margins of a loop; all but `stable` are None where it is unstable. None also means no limit: no higher gain
+    makes the loop unstable, or its gain never crosses 1, so that phase and delay margins do not exist."""
 
     stable: bool
     gain_margin: float | None  # as a factor, > 1
     phase_margin_deg: float | None
     delay_margin_s: float | None
     sensitivity_peak: float | None
-    voltage_per_noise: float | None  # rms V for 1 rad/s rms of white speed noise
-    speed_per_noise: float | None  # rms rad/s likewise
+    voltage_per_noise: float | None  # rms V per 1 rad/s rms of white speed noise
+    speed_per_noise: float | None  # rms rad/s, likewise
 
 
 def margins(motor: Motor, law: Law) -> Margins:
-    """Stability and robustness of the linear range, and the amplification of white noise of the measured speed."""
+    """Margins of the loop within its limits, and its amplification of white noise on the measured speed."""
     loop = Loop(*map(np.asarray, linear_loop(motor, law)))
     loop = _connected(loop)
     step = float(law.hardware.sample_time)
@@ -125,7 +125,7 @@ def margins(motor: Motor, law: Law) -> Margins:
 
 
 def _connected(loop: Loop) -> Loop:
-    """Without the states of the law that no voltage depends on, such as the memory of a filter it has not got."""
+    """The loop without the law's unused states, such as the filter of a PI controller: no voltage depends on them."""
     link = (
         (loop.A != 0).astype(int)
         + np.outer(loop.B != 0, loop.C != 0)
@@ -138,7 +138,7 @@ def _connected(loop: Loop) -> Loop:
 
 
 def loop_gain(loop: Loop, angle: np.ndarray) -> np.ndarray:
-    """-C (e^j angle - A)^-1 B, the loop gain under negative feedback; `angle` in radians a sample."""
+    """-C (e^j angle - A)^-1 B, the loop gain under negative feedback; `angle` in radians per sample."""
     A, B, C = (np.asarray(x) for x in loop[:3])
     resolvent = np.exp(1j * angle)[:, None, None] * np.eye(len(A)) - A
     states = np.linalg.solve(resolvent, np.broadcast_to(B[:, None], (len(angle), len(A), 1)))
@@ -158,7 +158,7 @@ def _gain_margin(gain: np.ndarray) -> float | None:
 def _phase_margin(
     angle: np.ndarray, gain: np.ndarray, step: float
 ) -> tuple[float | None, float | None]:
-    """The smallest phase (degrees) and the smallest delay (s) that bring the loop gain to -1."""
+    """The smallest phase shift (degrees) and the smallest delay (s) that bring the loop gain to -1."""
     size = np.log(np.abs(gain))
     crossing = np.flatnonzero(size[:-1] * size[1:] <= 0)
     if not crossing.size:
@@ -166,7 +166,7 @@ def _phase_margin(
     share = size[crossing] / (size[crossing] - size[crossing + 1])
     at = angle[crossing] + share * (angle[crossing + 1] - angle[crossing])
     turned = gain[crossing] + share * (gain[crossing + 1] - gain[crossing])
-    phase = np.mod(np.angle(-turned), 2 * np.pi)  # lag that is left until -1
+    phase = np.mod(np.angle(-turned), 2 * np.pi)  # remaining lag to -1
     lead = np.minimum(phase, 2 * np.pi - phase)
     return float(np.degrees(lead.min())), float((phase / at).min() * step)
 

@@ -1,4 +1,4 @@
-"""Figures of merit of a response: exact ones, and smooth ones for gradients."""
+"""Metrics of a response: exact ones, and smooth approximations for gradients."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from jaxtyping import Array, Float
 
 from .controllers import Number
 
-BAND = 0.02  # within which a response has settled, either side, over the step
-TAIL_PARTS = 20  # the steady error is the mean over the last of so many equal parts
+BAND = 0.02  # half-width of the settling band, over the step
+TAIL_PARTS = 20  # the steady error is averaged over the last of so many equal parts
 Samples = Float[Array | np.ndarray, " instants"]
 One = Float[Array | np.ndarray, ""]
 
 
 class StepMetrics(NamedTuple):
-    """Of a step response; named as python-control's `step_info` names them. NaN where it never happens.
+    """Metrics of a step response, named as in python-control's `step_info`. NaN where the event never happens.
 
-    `RiseTime`, s, from 10 to 90 %; `SettlingTime`, s, of the last exit from the 2 % band; `Overshoot` and
+    `RiseTime`, s, from 10 to 90 %; `SettlingTime`, s, after which the response stays in the 2 % band; `Overshoot` and
     `Undershoot`, % of the step, never negative; `Peak`, rad/s, and `PeakTime`, s; `SteadyStateError`, rad/s.
     """
 
@@ -36,12 +36,12 @@ class StepMetrics(NamedTuple):
 def step_metrics(
     time: Samples, speed: Samples, final: Number, initial: Number = 0.0
 ) -> StepMetrics:
-    """Exact metrics of a step from `initial` to `final`, rad/s, between samples by interpolation.
+    """Exact metrics of a step from `initial` to `final`, rad/s, interpolated between samples.
 
-    Crossings are interpolated linearly and peaks by a parabola, so that the error falls with the square of the
-    distance of the samples, or faster. The steady error is the mean of the last twentieth.
+    Crossings are interpolated linearly and peaks by a parabola, so that the error falls at least with the square of
+    the sample spacing. The steady error is the mean over the last twentieth.
 
-    **Arguments**: `time`, s, evenly spaced, the step at its first instant; `speed`, rad/s.
+    **Arguments**: `time`, s, evenly spaced, with the step at the first instant; `speed`, rad/s.
     """
     share = (speed - initial) / (final - initial)
     rise = _first_reached(time, share, 0.9) - _first_reached(time, share, 0.1)
@@ -60,8 +60,8 @@ def step_metrics(
 
 
 class LoadMetrics(NamedTuple):
-    """Of a load step: `Deviation`, rad/s, the largest; `RecoveryTime`, s, back into the 2 % band of the set point
-    for good; `SteadyStateError`, rad/s."""
+    """Metrics of a load step: `Deviation`, rad/s, the largest; `RecoveryTime`, s, after which the speed stays within
+    2 % of the set point; `SteadyStateError`, rad/s."""
 
     Deviation: One
     RecoveryTime: One
@@ -69,7 +69,7 @@ class LoadMetrics(NamedTuple):
 
 
 def load_metrics(time: Samples, speed: Samples, reference: Number) -> LoadMetrics:
-    """Exact metrics of a response to a load that sets in at the first instant."""
+    """Exact metrics of the response to a load step at the first instant; `reference`, rad/s."""
     error = jnp.abs(speed - reference)
     tail = max(1, speed.size // TAIL_PARTS)
     return LoadMetrics(
@@ -82,14 +82,14 @@ def load_metrics(time: Samples, speed: Samples, reference: Number) -> LoadMetric
 def smooth_settling(
     time: Samples, speed: Samples, final: Number, initial: Number, width: Number
 ) -> One:
-    """Settling time with a derivative everywhere, s.
+    """Differentiable settling time, s.
 
-    The time during which the largest |error| still to come exceeds the band, with a logistic edge. Maximum and
-    edge soften by `width`, in bands; as it goes to zero, and the samples draw together, this becomes the exact
-    settling time. A loop that does not settle counts its whole duration.
+    The time during which the largest |error| still to come exceeds the band, with a soft maximum and a logistic edge
+    of `width`, in bands. It tends to the exact settling time as the width and the sample spacing go to zero. A loop
+    that does not settle gets its whole duration.
     """
     outside = jnp.abs((speed - final) / (final - initial)) / BAND - 1
-    # jax.lax.cumlogsumexp is the same, but unrolls into a tree that takes the compiler seconds
+    # jax.lax.cumlogsumexp is equivalent, but unrolls into a tree that takes seconds to compile
     _, to_come = jax.lax.scan(_largest, jnp.asarray(-jnp.inf), outside / width, reverse=True)
     step = time[1] - time[0]
     return step * jnp.sum(jax.nn.sigmoid(to_come))
@@ -101,13 +101,13 @@ def _largest(so_far: Number, value: Number) -> tuple[Number, Number]:
 
 
 def smooth_overshoot(speed: Samples, final: Number, initial: Number, width: Number) -> One:
-    """Overshoot in %, maximum and corner at zero softened by `width`, in %; the limit is the exact one."""
+    """Differentiable overshoot, %: maximum and corner at zero are smoothed by `width`, %; exact in the limit of 0."""
     above = 100 * (speed - final) / (final - initial) / width
     return width * jax.nn.softplus(jax.nn.logsumexp(above))
 
 
 def _first_reached(time: Samples, share: Samples, level: float) -> One:
-    """When `share` first reaches `level`."""
+    """Time until `share` first reaches `level`, or NaN."""
     reached = share >= level
     k = jnp.argmax(reached)
     before = jnp.maximum(k - 1, 0)
@@ -117,7 +117,7 @@ def _first_reached(time: Samples, share: Samples, level: float) -> One:
 
 
 def _last_inside(time: Samples, outside: Samples) -> One:
-    """Time from the start until `outside` is negative for good."""
+    """Time from the start after which `outside` stays negative, NaN if it does not."""
     count = outside.size
     out = outside > 0
     last = count - 1 - jnp.argmax(out[::-1])
@@ -129,7 +129,7 @@ def _last_inside(time: Samples, outside: Samples) -> One:
 
 
 def _peak(time: Samples, values: Samples) -> tuple[One, One]:
-    """Time and height of the largest value, by the parabola through it and its neighbours."""
+    """Time and height of the maximum, by a parabola through the largest value and its neighbours."""
     k = jnp.argmax(values)
     inside = (k > 0) & (k < values.size - 1)
     middle = jnp.clip(k, 1, values.size - 2)

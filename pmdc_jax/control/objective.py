@@ -1,4 +1,4 @@
-"""What a tuning minimises: settling time against the limit, and what it costs to miss the specification."""
+"""Cost that a tuning minimises: settling time over the fastest possible, plus penalties."""
 
 from __future__ import annotations
 
@@ -27,41 +27,42 @@ from .metrics import (
     step_metrics,
 )
 
-PARTS = 3  # of the task, equally long: the step, the load step, and the second step under load
+PARTS = 3  # equally long parts of the task: the step, the load step, and the second step under load
 SECOND_SETPOINT = 0.5  # set point of the second step, over that of the first
-EXACT_SUBSTEPS = 4  # instants a sample, between which exact metrics interpolate
-# Width of the smooth overshoot where 1 % is allowed, %, over the width of the smooth settling.
+EXACT_SUBSTEPS = 4  # simulated instants per sample; exact metrics interpolate between them
+# Width of the smooth overshoot (%) for an allowed overshoot of 1 %, over the width of the smooth settling (bands).
 SMOOTH_OVERSHOOT = 0.3
-# Share of each part over whose end the steady error is taken.
+# Last share of each part, over which the steady error is averaged.
 STEADY_SHARE = 0.25
 
-# Weights in the cost. Settling, over the fastest settling, counts 1, and so does the mean change of voltage from sample
-# to sample, over the voltage limit.
+# Weights in the cost. Two terms have weight 1: the settling time over the fastest settling, and the mean change of
+# voltage from sample to sample over the voltage limit.
 
-# Of the recovery from the load, over the fastest settling: the step itself comes first.
+# Weight of the recovery from the load, over the fastest settling: less than that of the step, which comes first.
 RECOVERY = 0.1
-# Of a relative steady error: one that fills the band costs as much as half the fastest settling.
+# Weight of the relative steady error: an error as large as the 2 % band costs as much as half the fastest settling.
 STEADY_ERROR = 25.0
-# Of the second step's settling, over the fastest settling, and of its overshoot, which may fill the band: it has no
-# specification of its own.
+# Weights of the second step's settling, over the fastest settling, and of its overshoot beyond the band. That step has
+# no specification of its own, so an overshoot within the band is free.
 SECOND_SETTLING = 0.05
 SECOND_OVERSHOOT = 0.15
-# An excess of overshoot costs its ratio to what is allowed, up to the first, and the second for each per cent of it:
-# steep at the edge, and yet no wall to a loop that starts far beyond.
+# Excess overshoot costs its ratio to the allowed overshoot, up to MOST_BY_RATIO, plus EACH_PER_CENT for each per cent:
+# steep at the limit, but the gradient stays moderate for a loop that starts far beyond it.
 MOST_BY_RATIO = 0.3
 EACH_PER_CENT = 0.3
 
-# Settling time that is put down for a loop that never settles, over the fastest settling.
+# Settling time assigned to a loop that never settles, over the fastest settling.
 NEVER_SETTLES = 10.0
-# Share of the motors that decides, the worst of them: the tail beyond a 95th percentile, and a little more.
+# Share of the motors, those of highest cost, whose mean makes half of the cost: covers the tail beyond the 95th
+# percentile with some margin.
 TAIL = 0.1
 
 
 class Strictness(NamedTuple):
-    """What differs between the cost that is followed down and the one by which the best is chosen.
+    """Settings in which the cost of the descent differs from the cost that selects the best result.
 
-    **Fields**: `overshoot`, weight of its excess; `allowed_overshoot`, over that of the specification;
-    `allowed_sensitivity`, likewise; `tracking_error`, its weight.
+    **Fields**: `overshoot`, weight of excess overshoot; `allowed_overshoot` and `allowed_sensitivity`, over the limits
+    of the specification; `tracking_error`, weight of the tracking error.
     """
 
     overshoot: float
@@ -70,28 +71,28 @@ class Strictness(NamedTuple):
     tracking_error: float
 
 
-# The descent keeps away from the limit of overshoot, which the smooth metrics blur, and the tracking error, 1 for each
-# part, draws it on where nothing settles yet.
+# The descent keeps a distance from the overshoot limit, which the smooth metrics blur. The tracking error, weight 1 for
+# each part, gives it a gradient where nothing settles yet.
 DESCENT = Strictness(
     overshoot=1.0, allowed_overshoot=0.8, allowed_sensitivity=1.0, tracking_error=3.0
 )
-# The choice goes by exact metrics: nearly all the overshoot may be used, but going beyond costs more than it can gain,
-# and a sensitivity at its limit, where the descent ends, is not held against a loop.
+# The choice uses exact metrics. Nearly all the allowed overshoot may be used, but exceeding it costs more than it can
+# gain. The tolerance on the sensitivity spares loops that the descent has left right at the limit.
 CHOICE = Strictness(
     overshoot=3.0, allowed_overshoot=0.97, allowed_sensitivity=1.01, tracking_error=0.0
 )
 
 
 class Task(eqx.Module):
-    """What the loop is to do, on which hardware, and how well.
+    """Test sequence that the loop is simulated on, its hardware and its specification.
 
-    From rest to the set point; then a load sets in; then, under load, on to half the set point. Gains that were only
-    ever asked for the first may do it by a windup that happens to fit.
+    The sequence has three parts: a step from rest to the set point; a load step; and, under load, a step to half the
+    set point. Gains tuned on the first part alone may rely on an integrator windup that happens to suit that step.
 
-    **Fields**: `setpoint`, rad/s; `load`, N m, a step that comes once the set point is held;
-    `fastest_settling`, of any controller within the limits, s; `max_overshoot`, %; `max_sensitivity`, of
-    the loop, None for any; `noise`, rad/s of measured speed at each sample; `step_samples`, how many each of the three
-    parts takes.
+    **Fields**: `setpoint`, rad/s; `load`, N m, applied in the second and third part; `fastest_settling`, s, of any
+    controller within the limits; `max_overshoot`, %; `max_sensitivity`, limit of the peak sensitivity, None for no
+    limit; `noise`, rad/s, added to the measured speed at each sample; `step_samples`, samples of each part; `substeps`,
+    simulation steps per sample, as the motor's effects need.
     """
 
     hardware: Hardware
@@ -102,17 +103,17 @@ class Task(eqx.Module):
     max_sensitivity: Number | None
     noise: Float[Array, " samples"]
     step_samples: int = eqx.field(static=True)
-    substeps: int = eqx.field(static=True, default=1)  # a sample, which the motor's effects need
+    substeps: int = eqx.field(static=True, default=1)
 
     def course(self) -> Course:
-        """Set point, load, half the set point."""
+        """Reference, load and noise at each sample of the three parts."""
         part = jnp.arange(PARTS * self.step_samples) // self.step_samples
         reference = jnp.where(part < 2, self.setpoint, SECOND_SETPOINT * self.setpoint)
         load = jnp.where(part < 1, 0.0, self.load)
         return Course(reference, load, self.noise)
 
     def parts(self, response: Response, substeps: int = 1) -> list[tuple[Samples, Samples]]:
-        """Time and speed of each of the parts."""
+        """Time (s) and speed (rad/s) of each part."""
         count = self.step_samples * substeps
         cuts = (slice(k * count, (k + 1) * count) for k in range(PARTS))
         return [(response.time[cut], response.speed[cut]) for cut in cuts]
@@ -123,11 +124,11 @@ Part = tuple[Samples, Samples]
 
 
 class Score(NamedTuple):
-    """Figures of one controller on each of the motors; NaN for times of what never happens.
+    """Metrics of one controller on each motor. A time is NaN where the event never happens.
 
     `settling`, s, and `overshoot`, %, of the step; `recovery` from the load, s; `second_settling`, s, and
-    `second_overshoot`, %, of the second step; `tracking_error`, mean error over the set point; `steady_error`, the
-    same at the end of the step, and of the load step, added up; `effort`, mean change of voltage from sample to
+    `second_overshoot`, %, of the second step; `tracking_error`, mean of |w / r - 1| over all parts; `steady_error`, its
+    means over the ends of the step and of the load step, summed; `effort`, mean change of voltage from sample to
     sample, over the voltage limit; `sensitivity`, peak over frequency, with the first motor.
     """
 
@@ -145,7 +146,7 @@ class Score(NamedTuple):
 def exact_score(
     task: Task, model: SampledMotor, motors: Motor, controller: AbstractController
 ) -> Score:
-    """The exact metrics of a controller on every motor, between samples too. `motors` has a leading axis."""
+    """Exact metrics of a controller on every motor, resolved between samples too. `motors` has a leading axis."""
     setpoint, lower = task.setpoint, SECOND_SETPOINT * task.setpoint
 
     def metrics(step: Part, loaded: Part, second: Part) -> dict[str, One]:
@@ -164,7 +165,7 @@ def exact_score(
 def smooth_score(
     task: Task, model: SampledMotor, motors: Motor, controller: AbstractController, width: Number
 ) -> Score:
-    """The metrics with a derivative everywhere, at the samples; `width` softens them, in bands."""
+    """Differentiable approximations of the metrics, from the samples alone; `width`, in bands, sets the smoothing."""
     setpoint, lower = task.setpoint, SECOND_SETPOINT * task.setpoint
     soft = SMOOTH_OVERSHOOT * width
 
@@ -188,7 +189,7 @@ def _score(
     substeps: int,
     metrics: Callable[[Part, Part, Part], dict[str, One]],
 ) -> Score:
-    """Exact or smooth metrics, and what is the same beside either."""
+    """The given metrics, exact or smooth, with the errors, effort and sensitivity that both share."""
     law, course = Law(controller, task.hardware, model), task.course()
     substeps *= task.substeps
     reference = jnp.repeat(course.reference, substeps)
@@ -211,7 +212,7 @@ def _score(
 
 
 def cost(task: Task, score: Score, strictness: Strictness) -> Float[Array, ""]:
-    """What is minimised: settling over the fastest settling on the motors, and what it costs to miss the rest."""
+    """Cost to minimise, over all motors: settling over the fastest settling, plus the weighted penalties."""
 
     def over_fastest(time: Each) -> Each:
         return jnp.nan_to_num(time / task.fastest_settling, nan=NEVER_SETTLES)
@@ -234,12 +235,12 @@ def cost(task: Task, score: Score, strictness: Strictness) -> Float[Array, ""]:
 
 
 def overshoot_cost(overshoot: Number, allowed: Number) -> Number:
-    """Nothing within what is allowed; beyond, the excess over it at first, then its per cent."""
+    """Penalty on overshoot, %: 0 up to `allowed`; with the excess e, min(e / allowed, 0.3) + 0.3 e beyond."""
     excess = jax.nn.relu(overshoot - allowed)
     return jnp.minimum(excess / allowed, MOST_BY_RATIO) + EACH_PER_CENT * excess
 
 
 def _mean_and_tail(costs: Each) -> Float[Array, ""]:
-    """The mean, and the mean of the worst tenth, half each."""
+    """Half the mean over the motors plus half the mean of the worst tenth."""
     worst = max(1, round(TAIL * costs.size))
     return 0.5 * jnp.mean(costs) + 0.5 * jnp.mean(jax.lax.top_k(costs, worst)[0])

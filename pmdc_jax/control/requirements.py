@@ -1,4 +1,4 @@
-"""What a specification needs of motor, voltage and current; what is beyond them is refused, with the number."""
+"""Feasibility of a specification within the limits of voltage and current; errors state the limit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .steady import steady_state
 
 
 def reach(motor: Motor, voltage_limit: float, load: float = 0.0) -> float:
-    """The speed that a voltage keeps up against a load, rad/s; of the linear part of the motor."""
+    """Steady speed (rad/s) at a voltage against a load (N m), of the linear part of the motor."""
     R, Kb, Kt, f = (float(getattr(motor, name)) for name in ("R", "Kb", "Kt", "f"))
     return (Kt * voltage_limit - R * load) / (R * f + Kt * Kb)
 
@@ -44,7 +44,7 @@ def check_reachable(
 
 
 def _highest_speed(motor: Motor, setpoint: float, voltage_limit: float, load: float) -> float:
-    """The highest speed that the voltage holds, effects and all, by halving."""
+    """The highest speed (rad/s) that the voltage holds; with the motor's effects, by bisection."""
     if not motor.effects:
         return max(0.0, reach(motor, voltage_limit, load))
     low, high = 0.0, abs(setpoint)
@@ -58,7 +58,7 @@ def _highest_speed(motor: Motor, setpoint: float, voltage_limit: float, load: fl
 def check_settling(
     max_settling: float | None, fastest_settling: float | None, setpoint: float
 ) -> float:
-    """The fastest settling, if there is one and the specification leaves time for it."""
+    """The fastest settling; an `InputError` where there is none, or `max_settling` is shorter."""
     if fastest_settling is None:
         raise InputError(
             "--setpoint",
@@ -78,7 +78,7 @@ def check_settling(
 def spare_torque(
     motor: Motor, setpoint: float, voltage_limit: float, current_limit: float | None
 ) -> float:
-    """Half the torque that can still be held at the set point, N m: a load to try a loop with."""
+    """Half the load torque that the limits still hold at the set point, N m: the default load step."""
     state, voltage = steady_state(motor, setpoint)
     spare = (voltage_limit - abs(float(voltage))) / float(motor.R)
     if current_limit is not None:

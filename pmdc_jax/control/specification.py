@@ -1,4 +1,4 @@
-"""What a loop is asked to do, on which hardware; what is left open is filled in, what cannot be is refused."""
+"""Specification of a loop and its hardware: defaults for what is left open, errors for what is impossible."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from .loop import REMEMBERED_SAMPLES
 from .requirements import check_reachable, check_settling, reach, spare_torque
 from .steady import steady_state
 
-NOMINAL_VOLTAGE = 24.0  # V, where neither limit nor set point is given
-VOLTAGE_RESERVE = 1.25  # voltage limit by default, over the voltage that holds the set point
-SETPOINT_SHARE = 0.8  # set point by default, over the speed that the voltage limit reaches
-MAX_SENSITIVITY = 2.0  # of the loop by default, over any frequency
-LONGEST_SAMPLE_TIME = 1e-3  # s, of those chosen by default
-SAMPLES_PER_SETTLING = 40  # samples by default in the fastest settling, at least
-FEW_SAMPLES = 10  # samples in the fastest settling; with fewer the loop loses much
-TOO_LONG = 10  # sample time over the fastest settling, beyond which it can only be a mistake
-# How long each part of the task takes: so many times the fastest settling, or beyond it so many times what no loop is
-# faster than.
+NOMINAL_VOLTAGE = 24.0  # V, voltage limit if neither it nor the set point is given
+VOLTAGE_RESERVE = 1.25  # default voltage limit over the voltage that holds the set point
+SETPOINT_SHARE = 0.8  # default set point over the speed that the voltage limit reaches
+MAX_SENSITIVITY = 2.0  # default limit of the peak sensitivity
+LONGEST_SAMPLE_TIME = 1e-3  # s, longest default sample time
+SAMPLES_PER_SETTLING = 40  # at least so many default sample times in the fastest settling
+FEW_SAMPLES = 10  # samples in the fastest settling; with fewer the loop loses much performance
+TOO_LONG = 10  # sample time over the fastest settling, above which it must be a mistake
+# Duration of each part of the task: at least 2.5 times the fastest settling, and at least the fastest settling plus 20
+# dead times of the loop.
 PART_SETTLINGS = 2.5
 PART_DEAD_TIMES = 20
-LEAST_SAMPLES = 32  # of each part of the task
-MOST_SAMPLES = 20_000  # of each part of the task
+LEAST_SAMPLES = 32  # in each part of the task
+MOST_SAMPLES = 20_000  # in each part of the task
 
 
 @frozen
 class LoopRequirements:
-    """What a user asks of a loop, None for what is left open. The fields are the arguments of `tune` of the same names.
+    """What a user asks of a loop; None leaves a value open. Fields are the arguments of `tune` of the same names.
 
-    **Raises**: `InputError` for what cannot be meant, naming the option.
+    **Raises**: `InputError`, naming the option, for an invalid value.
     """
 
     controller: str = "pid"
@@ -73,9 +73,9 @@ class LoopRequirements:
         _check("max_sensitivity", self.max_sensitivity, "a positive number", lambda x: x > 0)
 
     def completed(self, motor: Motor) -> Specification:
-        """The same with nothing left open.
+        """The specification for a motor, with defaults for what is left open.
 
-        **Raises**: `InputError` where no controller can meet it, with the limit.
+        **Raises**: `InputError`, stating the limit, where no controller can meet it.
         """
         setpoint, voltage_limit, chosen_limits = self._operating_point(motor)
         limits = motor, setpoint, voltage_limit, self.current_limit
@@ -97,7 +97,7 @@ class LoopRequirements:
         )
 
     def _operating_point(self, motor: Motor) -> tuple[float, float, list[str]]:
-        """Set point (rad/s) and voltage limit (V), and which of them were chosen here, in words."""
+        """Set point (rad/s), voltage limit (V), and a note on each that is a default."""
         notes = []
         voltage_limit, setpoint = self.voltage_limit, self.setpoint
         if voltage_limit is None:
@@ -114,8 +114,7 @@ class LoopRequirements:
         return setpoint, voltage_limit, notes
 
     def _sampling(self, fastest: float) -> tuple[float, list[str]]:
-        """Sample time (s) for a loop that settles at best within `fastest` (s), and a remark where it was left open or
-        is long."""
+        """Sample time (s) for a fastest settling of `fastest` (s), and a note if it is a default or rather long."""
         suitable = min(LONGEST_SAMPLE_TIME, _round_number(fastest / SAMPLES_PER_SETTLING))
         if self.sample_time is None:
             return suitable, [f"no sample time given: {suitable:g} s"]
@@ -138,11 +137,11 @@ class LoopRequirements:
 
 @frozen
 class Specification:
-    """What a loop is to do: as asked, and what stands for what was left open.
+    """Complete specification of a loop.
 
-    **Fields**: `setpoint`, rad/s; `voltage_limit`, V; `sample_time`, s; `load_torque`, N m;
-    `fastest_settling`, of any controller within the limits, s; `samples` of each part of the task;
-    `notes`, what was chosen, in words.
+    **Fields**: `asked`, the user's requirements; `setpoint`, rad/s; `voltage_limit`, V; `sample_time`, s;
+    `load_torque`, N m; `fastest_settling`, s, of any controller within the limits; `samples` in each part of the task;
+    `notes`, on the defaults chosen.
     """
 
     asked: LoopRequirements
@@ -155,7 +154,7 @@ class Specification:
     notes: tuple[str, ...]
 
     def hardware(self) -> Hardware:
-        """What the loop runs on. Numbers are arrays, so that other numbers need not be compiled again."""
+        """The loop's hardware. Its numbers are arrays, so that other values do not cause recompilation."""
         asked = self.asked
         hardware = Hardware(
             self.sample_time,
@@ -175,8 +174,8 @@ def _check(name: str, value: float | None, wanted: str, is_right: Callable[[floa
 
 
 def _samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> int:
-    """How many show one step, rounded up so that few shapes are ever compiled."""
-    # what no loop is much faster than: electrical time constant, hold and delay
+    """Samples in one part of the task, rounded up to 2^k or 1.5 2^k so that few shapes are compiled."""
+    # no loop is much faster than its hold, its delay and a quarter of the electrical time constant together
     dead_time = float(motor.L / motor.R) / 4 + (1 + delay) * sample_time
     duration = max(PART_SETTLINGS * fastest, fastest + PART_DEAD_TIMES * dead_time)
     needed = max(LEAST_SAMPLES, math.ceil(duration / sample_time))
@@ -191,7 +190,7 @@ def _samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> in
 
 
 def _check_sensor(motor: Motor, sample_time: float) -> None:
-    """Refuse a speed sensor that is later than the simulated loop can remember."""
+    """Raise an `InputError` if the speed sensor's delay is longer than the simulated loop remembers."""
     late = motor.speed_delay()
     if late is not None and float(late) > (REMEMBERED_SAMPLES - 2) * sample_time:
         raise InputError(
@@ -206,6 +205,6 @@ def _three_digits(value: float) -> float:
 
 
 def _round_number(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above."""
+    """Largest of 1, 2 or 5 times a power of ten that does not exceed `value`."""
     power = 10.0 ** math.floor(math.log10(value))
     return _three_digits(max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power)

@@ -1,4 +1,4 @@
-"""Motors as they might be: drawn from the uncertainty of an identification, or from an even spread."""
+"""Random motors: drawn from the uncertainty of an identification, or from an even spread."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ..motor_file import Uncertainty
 
 
 def even_spread(spread: float) -> Uncertainty:
-    """R, L, Kb, Kt, J and f alike and independent; `spread` is the standard deviation of each one's logarithm."""
+    """Independent, equal uncertainty of R, L, Kb, Kt, J and f: `spread`, the standard deviation of each logarithm."""
     return Uncertainty(tuple(PARAMETERS), spread**2 * np.eye(len(PARAMETERS)))
 
 
 def drawn_motors(motor: Motor, uncertainty: Uncertainty, count: int, seed: int) -> Motor:
-    """`count` motors about `motor`, stacked; drawn from a normal distribution of the coordinates: logarithms, or
-    the parameters themselves where an effect's table says linear."""
+    """Draw `count` motors around `motor`, stacked. The coordinates are normally distributed: logarithms of the
+    parameters, or the parameters themselves where the `ranges` of an effect say linear."""
     rng = np.random.default_rng(seed)
     deviations = _normal(rng, np.asarray(uncertainty.covariance, float), count)
     stacked = jax.tree.map(lambda leaf: jnp.full(count, leaf, float), motor)
@@ -35,7 +35,7 @@ def drawn_motors(motor: Motor, uncertainty: Uncertainty, count: int, seed: int) 
 
 
 def _normal(rng: np.random.Generator, covariance: np.ndarray, count: int) -> np.ndarray:
-    """Draws in pairs of opposite sign, so that their mean is exact. Directions without variance stay put."""
+    """Normal draws in pairs of opposite sign, so that the mean of an even count is 0; `covariance` may be singular."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     half = rng.standard_normal((-(-count // 2), len(covariance))) @ root.T

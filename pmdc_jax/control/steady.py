@@ -1,4 +1,4 @@
-"""Steady running: what a speed needs, and what the limits allow."""
+"""Steady state: the current and voltage that hold a speed."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from .controllers import Number
 
 
 def steady_state(motor: Motor, speed: Number, load: Number = 0.0) -> tuple[State, Number]:
-    """The state in which a speed is held against a load, and the voltage that it takes.
+    """The state in which a speed is held against a load, and the voltage (V) that holds it.
 
-    Linear motor: i = (f w + T) / Kt, v = R i + Kb w. With effects by Newton's method from there, states that
-    effects add included, so that a winding is as warm as it gets.
+    Linear motor: i = (f w + T) / Kt, v = R i + Kb w. With effects, Newton's method starts from there and also solves
+    for the states that they add, so that a winding is at its final temperature.
 
     **Arguments**: `speed`, rad/s; `load`, N m, opposes positive motion.
     """
@@ -36,7 +36,7 @@ def steady_state(motor: Motor, speed: Number, load: Number = 0.0) -> tuple[State
         return jnp.stack([rate.current, rate.speed, *(rate.extra[name] for name in motor.states)])
 
     def newton(_: Int[Array, ""], unknown: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
-        # a state that never rests, such as an angle, has no say: hence the pseudo-inverse
+        # pseudo-inverse, because a state without equilibrium, such as an angle, makes the Jacobian singular
         return unknown - jnp.linalg.pinv(jax.jacfwd(rates)(unknown)) @ rates(unknown)
 
     start = jnp.stack([current, voltage, *(jnp.zeros(()) for _ in motor.states)])

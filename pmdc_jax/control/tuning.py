@@ -1,4 +1,4 @@
-"""From a motor and a specification to gains that work on the sampled, limited loop."""
+"""Tuning: from a motor and a specification to gains for the sampled loop with its limits."""
 
 from __future__ import annotations
 
@@ -31,28 +31,29 @@ from .objective import PARTS, Task
 from .specification import MAX_SENSITIVITY, LoopRequirements, Specification
 from .spread import drawn_motors, even_spread
 
-TUNING_MOTORS = 32  # drawn from the uncertainty, that take part in the tuning
-VALIDATION_MOTORS = 256  # drawn apart from these, that judge it afterwards
-# Noise of the speed that a loop is tuned with at least, over the set point: gains that never saw any would shake.
+TUNING_MOTORS = 32  # motors drawn from the uncertainty to tune on, beside the nominal one
+VALIDATION_MOTORS = 256  # motors drawn independently of these to judge the result
+# Minimum standard deviation of the speed noise while tuning, over the set point: gains tuned without noise would make
+# the voltage jitter.
 TUNING_NOISE = 2e-4
-# Overshoot allowed at least in the cost, %: its excess is weighed over what is allowed.
+# Minimum of the allowed overshoot in the cost, %, because the excess is divided by it.
 LEAST_OVERSHOOT = 0.01
-# What is told of: the overshoot of a small step, over what the whole step may overshoot or does; and a peak of the
-# sensitivity, over the default limit.
+# Thresholds for a message: overshoot of the small step, over the larger of the allowed overshoot and the overshoot of
+# the full step; and peak sensitivity, over its default limit.
 NOTABLE_OVERSHOOT = 1.2
 NOTABLE_SENSITIVITY = 1.1
 
 
 @frozen
 class Tuning:
-    """Gains, how well they do, and how far that is from what is possible."""
+    """Result of a tuning: the law, its performance, and the fastest settling possible."""
 
     law: Law
     motor: Motor
     task: Task
     asked: LoopRequirements
     margins: Margins
-    candidates: tuple[JudgedController, ...]  # ours first
+    candidates: tuple[JudgedController, ...]  # the tuned one first
     response: Response = field(repr=False, converter=lambda r: Response(*map(np.asarray, r)))
     bundle: np.ndarray | None = field(repr=False)  # (motors, samples) rad/s, of the drawn motors
     seed: int
@@ -61,7 +62,7 @@ class Tuning:
 
     @property
     def metrics(self) -> Mapping[str, float | None]:
-        """Of the step, on the nominal motor."""
+        """Metrics of the step, on the nominal motor."""
         return self.candidates[0].metrics
 
     @property
@@ -71,32 +72,32 @@ class Tuning:
 
     @property
     def robust(self) -> Robustness | None:
-        """Over the drawn motors, if the motor is uncertain."""
+        """Metrics over the drawn motors; None without an uncertainty or spread."""
         return self.candidates[0].robust
 
     @property
     def setpoint(self) -> float:
-        """In rad/s."""
+        """Set point, rad/s."""
         return float(self.task.setpoint)
 
     @property
     def load_torque(self) -> float:
-        """The load step that the loop was tried with, N m."""
+        """Load step in the simulation, N m."""
         return float(self.task.load)
 
     @property
     def load_from(self) -> float:
-        """When the load sets in, s."""
+        """Time of the load step, s."""
         return self.task.step_samples * float(self.hardware.sample_time)
 
     @property
     def fastest_possible_settling(self) -> float:
-        """Of any controller within the limits, s."""
+        """Shortest settling time of any controller within the limits, s."""
         return float(self.task.fastest_settling)
 
     @property
     def peak_current(self) -> float:
-        """The largest on the way, A."""
+        """Largest simulated current, A."""
         return float(np.abs(self.response.current).max())
 
     @property
@@ -106,12 +107,12 @@ class Tuning:
 
     @property
     def hardware(self) -> Hardware:
-        """What it was tuned on."""
+        """The hardware that the loop was tuned for."""
         return self.law.hardware
 
     @property
     def meets_specification(self) -> bool:
-        """Are overshoot and, where it was limited, settling within the specification, on the nominal motor?"""
+        """Whether the overshoot, and the settling time if limited, meet the specification on the nominal motor."""
         overshoot, settling = self.metrics["Overshoot"], self.metrics["SettlingTime"]
         if overshoot is None or settling is None or overshoot > self.asked.max_overshoot:
             return False
@@ -142,20 +143,22 @@ def tune(
 ) -> Tuning:
     """Find the gains with which a motor settles fastest at a set point, within the specification.
 
-    The loop is simulated as it will run: sampled, late, limited in voltage and current, with the anti-windup on the
-    voltage really applied. Gains are screened at random, the best followed down the gradient of the settling time,
-    and judged by exact metrics between the samples.
+    The loop is simulated as it will run: sampled, delayed, limited in voltage and current, with anti-windup driven by
+    the voltage actually applied. Gains are drawn at random and screened; from the best, gradient descent minimises the
+    settling time; exact metrics, resolved between the samples, select the result.
 
-    **Arguments**: `motor`, of scalars; `controller`, a key of `CONTROLLERS`; `setpoint`, rad/s, by default 80 % of
-    what the voltage reaches; `voltage_limit`, V, by default a quarter above what the set point takes;
-    `current_limit`, A; `sample_time`, s, by default 1 ms or a fortieth of the fastest settling;
-    `max_overshoot`, %; `max_settling`, s; `load_torque`, N m, a load step to withstand, by default half of what
-    can be held; `delay`, samples, 0 or 1; `speed_step`, rad/s, quantum of the speed sensor; `speed_noise`, rad/s;
-    `measures_current`; `uncertainty` of the motor, from its file, or `spread`, a standard deviation of the
-    logarithm of each parameter: then the worst tenth of 32 drawn motors counts for half, and 256 others judge;
-    `max_sensitivity`, of the loop; `starts`, how many are followed; `seed`; `progress`.
+    **Arguments**: `motor`, with scalar fields; `controller`, a key of `CONTROLLERS`; `setpoint`, rad/s, by default 80 %
+    of the speed that the voltage limit reaches; `voltage_limit`, V, by default 1.25 times the voltage that holds the
+    set point, or 24 V if neither is given; `current_limit`, A; `sample_time`, s, by default at most 1 ms and at most a
+    fortieth of the fastest settling; `max_overshoot`, %; `max_settling`, s; `load_torque`, N m, a load step to
+    withstand, by default half of the torque that can still be held at the set point; `delay`, 0 or 1 samples from
+    measurement to voltage; `speed_step`, rad/s, quantum of the speed sensor; `speed_noise`, rad/s, its standard
+    deviation; `measures_current`, if False the law estimates the current; `uncertainty` of the motor, from its file, or
+    `spread`, standard deviation of the logarithm of each parameter: with either, the worst tenth of the nominal and 32
+    drawn motors makes half of the cost, and 256 others validate the result; `max_sensitivity`, limit of the peak
+    sensitivity, None for no limit; `starts`, number of descents; `seed`; `progress`.
 
-    **Raises**: `InputError` for a specification that no controller can meet, with the limit.
+    **Raises**: `InputError`, stating the limit, for a specification that no controller can meet.
     """
     requirements = LoopRequirements(
         controller=controller,
@@ -185,12 +188,12 @@ def design(
     seed: int = 0,
     progress: ReportProgress | None = None,
 ) -> Tuning:
-    """`tune`, with what is asked of the loop in one object.
+    """`tune`, with the specification in one object.
 
-    **Arguments**: `motor`, of scalars; `requirements`; `uncertainty` of the motor, which the spread of the requirements
-    takes the place of; `starts`, how many are followed; `seed`; `progress`.
+    **Arguments**: `motor`, with scalar fields; `requirements`; `uncertainty` of the motor, replaced by the spread of
+    the requirements if they give one; `starts`, number of descents; `seed`; `progress`.
 
-    **Raises**: `InputError` for requirements that no controller can meet, with the limit.
+    **Raises**: `InputError`, stating the limit, for requirements that no controller can meet.
     """
     begin = time.perf_counter()
     make_room()
@@ -215,13 +218,13 @@ def design(
 
 @double_precision
 def robustness(tuning: Tuning, spread: float, seed: int) -> Robustness | None:
-    """How a tuning does on motors it was not tuned for; see `tune` for `spread`."""
+    """Metrics of a tuning over motors that it was not tuned for; `spread` as in `tune`."""
     _, motors = _tuning_and_validation_motors(tuning.motor, None, spread, seed)
     return judged("tuned", tuning.task, tuning.motor, tuning.controller, motors).robust
 
 
 def _task(specification: Specification, motor: Motor, unit_noise: np.ndarray) -> Task:
-    """What is simulated and judged; its noise has the size of the sensor's."""
+    """The task on which a controller is judged, with the noise of the sensor."""
     asked = specification.asked
     stall = float(specification.voltage_limit / motor.R)
     most = min(stall, asked.current_limit or stall)
@@ -248,7 +251,7 @@ def _tuned(
     seed: int,
     starts: int,
 ) -> AbstractController:
-    """The best of many starts, tuned with some noise even where there is none."""
+    """Best controller of all starts, tuned with at least `TUNING_NOISE` even if the sensor has none."""
     nominal = jax.tree.map(lambda leaf: leaf[0], motors)
     stiffness = jnp.asarray(specification.voltage_limit / abs(specification.setpoint))
     period, kind = task.hardware.sample_time, specification.asked.controller
@@ -267,7 +270,7 @@ def _judged(
     validation_motors: Motor | None,
     seed: int,
 ) -> Tuning:
-    """The tuned controller and what the textbook would have chosen, by exact metrics."""
+    """Exact metrics of the tuned controller and of its textbook rivals."""
     law = Law.of(controller, task.hardware, motor)
     asked = specification.asked
     return Tuning(
@@ -291,7 +294,7 @@ def _judged(
 def _tuning_and_validation_motors(
     motor: Motor, uncertainty: Uncertainty | None, spread: float | None, seed: int
 ) -> tuple[Motor, Motor | None]:
-    """Those to tune on, the nominal one first, and others to judge by; along a leading axis."""
+    """Motors to tune on, the nominal one first, and motors to validate on (None without uncertainty), stacked."""
     nominal = jax.tree.map(lambda leaf: leaf[None], motor)
     if spread is not None:
         uncertainty = even_spread(spread)
@@ -305,14 +308,14 @@ def _tuning_and_validation_motors(
 def _rivals(
     task: Task, motor: Motor, kind: str, validation_motors: Motor | None
 ) -> Iterator[JudgedController]:
-    """What the textbook would have chosen."""
+    """Controllers by textbook rules, for comparison."""
     if kind in RULED:
         rule = ziegler_nichols(motor, task.hardware, kind)
         yield judged("Ziegler-Nichols", task, motor, rule, validation_motors)
 
 
 def _undetermined(uncertainty: Uncertainty | None) -> Iterator[str]:
-    """What of the motor is taken as it stands in the file."""
+    """A message on the parameters that no recording determined."""
     if uncertainty is not None and uncertainty.undetermined:
         yield (
             f"no recording determined {', '.join(uncertainty.undetermined)} of this motor: the values in the file are"
@@ -321,7 +324,7 @@ def _undetermined(uncertainty: Uncertainty | None) -> Iterator[str]:
 
 
 def _verdicts(result: Tuning) -> Iterator[str]:
-    """What of the specification is not met, and what is to be minded."""
+    """Messages on unmet requirements, and warnings."""
     yield from _unmet(result)
     yield from _small_step_remark(result)
     peak = result.margins.sensitivity_peak
@@ -330,7 +333,7 @@ def _verdicts(result: Tuning) -> Iterator[str]:
 
 
 def _unmet(result: Tuning) -> Iterator[str]:
-    """Where settling or overshoot miss what was asked for."""
+    """Messages where settling or overshoot miss the specification."""
     overshoot, settling = result.metrics["Overshoot"], result.metrics["SettlingTime"]
     max_settling, max_overshoot = result.asked.max_settling, result.asked.max_overshoot
     if settling is None:
@@ -342,8 +345,8 @@ def _unmet(result: Tuning) -> Iterator[str]:
 
 
 def _small_step_remark(result: Tuning) -> Iterator[str]:
-    """Whether a small step overshoots notably more than the step to the set point, and by more than the sensor's
-    quantum alone explains."""
+    """A message where a small step overshoots notably more than the step to the set point, and by more than the
+    sensor's quantum."""
     overshoot = result.candidates[0].small_step["Overshoot"] or 0.0
     step = SMALL_STEP * result.setpoint
     allowed = NOTABLE_OVERSHOOT * max(
