@@ -45,7 +45,7 @@ def identification_json(identification: Identification) -> dict[str, Any]:
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """A diagnosis as such: the content of `identification_json` for the completed motor, and what was missing."""
+    """A diagnosis as plain dictionaries: `identification_json` of the completed motor, and what was missing."""
     before = diagnosis.base.parameters.items()
     gap = {role: _gap(diagnosis.gap.get(role)) for role in ("train", "holdout")}
     found = {

@@ -101,7 +101,7 @@ def pretty_unit(unit: str) -> str:
 
 
 def percent(value: float | None) -> str:
-    """A percentage with two significant digits, three from 10 on, and two decimals from 90 to 100, as fits need."""
+    """A percentage with two significant digits, three from 10 on, and two decimals from 90 to 100 (fits)."""
     if value is None or not isfinite(value):
         return UNKNOWN
     if 90 < abs(value) <= 100:
