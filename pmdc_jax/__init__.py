@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .recording_file import read_recording, write_recording
     from .simulate import simulate
 
-# Names are loaded when first used: importing this package costs nothing and changes no setting.
+# Names are imported on first use, so that importing this package is fast and changes no setting.
 _HOME = {
     "Diagnosis": "diagnose.diagnosis",
     "Identification": "identify.identification",
@@ -88,7 +88,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(types.ModuleType):
-    """`pmdc_jax.identify` is the function, also once the subpackage of that name has been imported."""
+    """Keeps `pmdc_jax.identify` the function when the subpackage of the same name is imported."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not (name in _HOME and isinstance(value, types.ModuleType)):

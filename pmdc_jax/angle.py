@@ -1,4 +1,4 @@
-"""Shaft angles that were recorded to start again after each turn."""
+"""Unwrapping of shaft angles that were recorded modulo one turn."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ from jaxtyping import Float, Int
 
 Samples = Float[np.ndarray, " samples"]
 
-# A wrapped angle spans no more than so many turns
+# Largest span of a wrapped angle, turns
 ONE_TURN = 1.01
 
 
 def unwrapped(angle: Samples) -> tuple[Samples, Int[np.ndarray, " wraps"]]:
-    """An angle that goes on, where it was recorded to start again after each turn.
+    """Unwrap an angle that was recorded modulo one turn.
 
     **Arguments**: `angle`, rad, (samples,), NaN where it is missing.
 
-    **Returns**: the angle, rad, (samples,), as it was if it wraps nowhere; and the samples that come after a wrap.
+    **Returns**: the continuous angle, rad, (samples,), which is `angle` itself if it is not wrapped; and the indices of
+    the samples that follow a wrap.
     """
     known = np.flatnonzero(~np.isnan(angle))
-    # a wrapped angle jumps by most of a turn between samples; a travel in metres or turns never does
+    # only a wrapped angle jumps by more than half a turn between samples; a travel in metres or turns does not
     wraps = known[1:][np.abs(np.diff(angle[known])) > np.pi]
-    # of the encoders in use, one counts 0 ... 2 pi and the other -pi ... pi
+    # encoders count either 0 ... 2 pi or -pi ... pi: only the span is the same
     if not len(wraps) or np.ptp(angle[known]) > 2 * np.pi * ONE_TURN:
         return angle, wraps[:0]
     going_on = np.full_like(angle, np.nan)

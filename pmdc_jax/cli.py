@@ -1,9 +1,9 @@
 """The command line: parse, call one function, print, exit status.
 
-Everything heavy is imported inside the commands, so that help and usage errors come at once.
+Slow imports are inside the commands, so that help and usage errors come at once.
 """
 
-# ruff: noqa: B006  typer copies the lists that stand as defaults
+# ruff: noqa: B006  typer copies default lists
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ app = typer.Typer(
     epilog="Start with: pmdc demo",
     add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # plain help is shorter and comes in half the time
+    rich_markup_mode=None,  # plain help is shorter and takes half the time
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 
@@ -103,8 +103,8 @@ def identify(
     """Find the parameters of a motor from recordings.
 
     R, L, Kb, Kt, J and f are found from voltage, current and speed, each with its standard error
-    and whether the recordings determine it at all. A run without current or voltage is used for
-    what it can say.
+    and whether the recordings determine it at all. A run without current or voltage contributes
+    what it can.
     """
     from .files import check_outputs
 
@@ -143,9 +143,9 @@ def diagnose(
     unloaded: Unloaded = False,
     search: Search = "cma_es",
 ) -> None:
-    """Find what a motor has that its model lacks.
+    """Find physical effects that the model of a motor lacks.
 
-    Says where simulation and measurement disagree, names the missing effect, adds it, and shows
+    Shows where simulation and measurement disagree, names the missing effect, adds it, and shows
     how much of the disagreement is gone. The motor saved is the completed one.
     """
     from .files import check_outputs
@@ -177,7 +177,7 @@ def diagnose(
 def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -> None:
     """Simulate a motor under a recorded voltage.
 
-    Voltage and load come from the recording; current and speed are written to another.
+    Voltage and load are read from the recording; current and speed are written to another file.
     """
     from .files import check_outputs
 
@@ -216,8 +216,8 @@ def tune(
 ) -> None:
     """Find the gains of a speed controller.
 
-    They work on the sampled, late and limited loop, and over the uncertainty of the motor; beside
-    them stands the fastest settling that voltage and current allow.
+    They are tuned on the sampled loop with its delay and limits, and over the uncertainty of the
+    motor, and compared with the fastest settling that voltage and current allow.
     """
     from .files import check_outputs
 
@@ -264,9 +264,9 @@ def tune(
 
 @app.command(epilog="Example: pmdc export controller.json --c controller.h")
 def export(controller: ControllerFile, c: HeaderFile) -> None:
-    """Write a controller as C.
+    """Write a controller as C code.
 
-    Plain C99 in one header: the sampled law with its limits and anti-windup.
+    One C99 header: the sampled control law with its limits and anti-windup.
     """
     from .files import check_outputs
 
@@ -279,7 +279,7 @@ def export(controller: ControllerFile, c: HeaderFile) -> None:
 
 @app.command(epilog="Example: pmdc paper --out paper_out")
 def paper(out: Folder = Path("paper_out")) -> None:
-    """Do the wheelchair-motor paper again.
+    """Reproduce the wheelchair-motor paper.
 
     Its tables and figures beside ours, printed, and as paper.html and paper.json in a folder.
     """
@@ -298,7 +298,7 @@ def paper(out: Folder = Path("paper_out")) -> None:
 def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
     """Take the tour: identify and diagnose the packaged sample, and tune a controller.
 
-    Four runs are fitted, a fifth tests the motor; results and reports go to a folder.
+    Four runs are fitted, a fifth is held out as a test; results and reports go to a folder.
     """
     from .demo import FILES, demo
     from .report.diagnosis_tables import print_diagnosis
@@ -322,7 +322,7 @@ def _read_and_work(
     columns: dict[str, str],
     options: dict[str, Any],
 ) -> Result:
-    """Read the runs and do the long work on them, telling how far it got."""
+    """Read the runs and call `work` on them, showing progress."""
     from .recording_file import read_recording
     from .report.terminal import progress
 
@@ -333,7 +333,7 @@ def _read_and_work(
 
 
 def _print_findings_and_save(identification: Identification, path: Path | None) -> None:
-    """Tell what was found about the recordings, and save the motor where that was asked for."""
+    """Print the findings about the recordings, and save the motor if a path is given."""
     from .report.terminal import print_findings
 
     print_findings(identification)
@@ -349,7 +349,7 @@ def _write_and_print(
     as_json: Callable[[Result], dict[str, Any]],
     print_result: Callable[[Result], None],
 ) -> None:
-    """Write JSON where that was asked for; print the result unless standard output is taken."""
+    """Write JSON if a path is given; print the result unless the JSON went to standard output."""
     if json:
         from .report.json import write_json
 
@@ -359,10 +359,12 @@ def _write_and_print(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; the exit status: 0 done, 2 bad input or arguments, 130 interrupted.
+    """Run one command.
 
-    Without `arguments` this process is the command: it takes its own, keeps what it compiles, and leaves its memory
-    to its end.
+    **Arguments**: `arguments`, those of the process if None; the process is then taken to do nothing else, and so keeps
+    what JAX compiles for later processes, and collects garbage rarely.
+
+    **Returns**: the exit status: 0 done, 2 bad input or arguments, 130 interrupted.
     """
     if arguments is None:
         keep_compiled()
@@ -387,8 +389,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _collect_garbage_rarely() -> None:
-    """Spare a command an eighth of its time: what it imports and traces, millions of objects, lives as long as it does,
-    and the garbage collector would look through it again and again, at last when it ends."""
+    """Save an eighth of the time of a command: the millions of objects that it imports and traces live until it ends,
+    yet the garbage collector would scan them repeatedly, and once more at exit."""
     gc.set_threshold(100_000, 50, 50)
     atexit.register(gc.freeze)
 

@@ -1,4 +1,4 @@
-"""What a column header means: the quantity, and how its unit becomes SI."""
+"""The meaning of column headers: quantity, and conversion of the unit to SI."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from .units import UnitError, conversion
 class Quantity:
     """One canonical column.
 
-    `header` is how it is written to files; `units` are what it is converted to, on a rotating
-    shaft first, on a linear axis second; `names` speak for themselves, `symbols` only together
-    with a unit.
+    **Fields**: `header`, written to files; `units`, the SI units it is converted to, that of a rotating shaft first and
+    that of a linear axis second; `names`, recognised without a unit; `symbols`, recognised only with one.
     """
 
     header: str
@@ -92,14 +91,14 @@ QUANTITIES = {
 }
 
 
-# Symbols that say whose they are, such as u_motor and Vmot, and need no unit
+# Symbols with a suffix for the motor, such as u_motor and Vmot, which need no unit
 MOTOR_SYMBOLS = {
     quantity: re.compile(rf"({symbol})_?(mot|motor|arm|armature)")
     for quantity, symbol in {"voltage": "u|v", "current": "i", "speed": "w|omega"}.items()
 }
-# Quantities that a unit tells, if one column has it: a torque may be the load or the motor's
+# Quantities recognised by their unit alone, if only one column has it; not torques, which may be load or motor torque
 TOLD_BY_UNIT = ("time", "voltage", "current", "speed", "angle")
-# ... and words in the names of columns that hold something else than what was measured
+# Words in the names of columns that hold set points, limits or supplies rather than a measurement of the motor
 NOT_MEASURED = re.compile(
     r"(?i)(?<![a-z])(ref|set|soll|cmd|command|target|demand|desired|limit|max|min|supply|bat)"
 )
@@ -109,8 +108,8 @@ NOT_MEASURED = re.compile(
 class Column:
     """A header understood: SI value = scale * number + offset.
 
-    `unit` is None where the header names none and SI was assumed; `base` is the SI unit; `by_unit` where the unit alone
-    says what it is.
+    `unit` is None where the header names none and SI was assumed; `base` is the SI unit; `by_unit` is true where the
+    quantity was recognised by the unit alone.
     """
 
     header: str
@@ -127,12 +126,12 @@ def match_columns(
 ) -> dict[str, Column]:
     """Which header holds which quantity.
 
-    **Arguments**: `headers` of the file; `columns`, what the user maps by hand, quantity to
-    "header[:unit]"; `where`, the file, for messages.
+    **Arguments**: `headers` of the file; `columns`, the mapping of the user from quantity to "header[:unit]", which
+    takes precedence; `where`, the file, for messages.
 
-    **Returns**: columns by quantity, those mapped by hand before those understood.
+    **Returns**: the columns by quantity.
 
-    **Raises**: `InputError` on unknown names or units, and where two headers mean the same.
+    **Raises**: `InputError` for unknown names or units, and if two headers mean the same quantity.
     """
     if not isinstance(columns, Mapping | None):
         what = f"columns are {columns!r}, and no mapping"
@@ -165,7 +164,7 @@ def match_columns(
 def _match_by_unit_or_symbol(
     headers: Sequence[str], found: Mapping[str, Column]
 ) -> dict[str, Column]:
-    """Quantities that no name tells of, where the unit or the symbol of one header alone does."""
+    """Quantities recognised by the unit or the motor symbol of exactly one of the remaining headers."""
     taken = {column.header for column in found.values()}
     free = [header for header in headers if header not in taken]
     known: dict[str, Column] = {}
@@ -184,7 +183,7 @@ def _match_by_unit_or_symbol(
 
 
 def _measured_unit(header: str, quantity: str) -> str | None:
-    """The unit in a header if it is one of the quantity, on a shaft, and the name is of nothing that was asked for."""
+    """The shaft unit of the quantity in a header, None without one or if the name has a word of `NOT_MEASURED`."""
     for name, unit, _ in _readings(header):
         if unit and _is_unit_of(unit, quantity, QUANTITIES[quantity].units[:1]):
             return None if NOT_MEASURED.search(name) else unit
@@ -192,9 +191,9 @@ def _measured_unit(header: str, quantity: str) -> str | None:
 
 
 def understand(header: str) -> Column | None:
-    """What a header such as `Speed [rpm]`, `u / V` or `time_ms` means; None if nothing known.
+    """What a header such as `Speed [rpm]`, `u / V` or `time_ms` means; None if it is not recognised.
 
-    **Raises**: `UnitError` where the quantity is clear and the unit in brackets is not one of it.
+    **Raises**: `UnitError` if the name identifies the quantity but the unit in brackets does not measure it.
     """
     if _normalised(header) == "rpm":
         return _column(header, "speed", "rpm")
@@ -219,8 +218,8 @@ def understand(header: str) -> Column | None:
 
 
 def likely_quantity(header: str) -> str | None:
-    """The quantity that an unused header may be, if any: the one that it begins with, such as speed for `speed_kg`;
-    or the load for the unit of a torque, as in `M_Nm`."""
+    """The quantity that an unused header may hold: the one whose name it begins with, such as speed for `speed_kg`; or
+    the load for a unit of torque, as in `M_Nm`; else None."""
     readings = [(name, unit) for name, unit, _ in _readings(header) if unit is not None]
     for name, _ in readings:
         for quantity, known in QUANTITIES.items():
@@ -231,7 +230,7 @@ def likely_quantity(header: str) -> str | None:
 
 
 def mixed_axes(found: Mapping[str, Column]) -> tuple[Column, Column] | None:
-    """A column of a shaft (rad, N m) and one of a linear axis (m, N), if there are both."""
+    """A column in units of a shaft (rad, N m) and one in those of a linear axis (m, N); None without both."""
     sorts: dict[bool, Column] = {}
     for quantity in ("speed", "angle", "load", "torque"):
         column = found.get(quantity)
@@ -249,7 +248,7 @@ def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column
     if spec not in headers:
         header, _, unit = (part.strip() for part in spec.rpartition(":"))
         header, unit = (header, unit) if header else (spec.strip(), None)
-    # a unit may stand in the line below the name
+    # `header` may lack the unit that was read from the line below the names
     named = [h for h in headers if h.rpartition(" [")[0] == header]
     if header not in headers and len(named) == 1:
         (header,) = named
@@ -264,7 +263,7 @@ def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column
 
 
 def _unit_in_header(header: str, quantity: str) -> str | None:
-    """The unit inside a header whose name need not be known."""
+    """The unit in a header, whose name need not be recognised."""
     for _, unit, explicit in _readings(header):
         if unit is not None and (explicit or _is_unit_of(unit, quantity)):
             return unit
@@ -278,9 +277,9 @@ def _column(header: str, quantity: str, unit: str | None) -> Column:
 
 
 def _readings(header: str) -> Iterator[tuple[str, str | None, bool]]:
-    """Ways to read a header as name and unit, the surest first; True where it has brackets."""
+    """Ways to split a header into name and unit, the most certain first; True if the unit is in brackets."""
     header = header.strip()
-    # a colon in brackets is MATLAB's, and means a column or a row of a matrix
+    # a colon in brackets is MATLAB notation for a column or a row of a matrix
     if brackets := re.fullmatch(r"(.*?)[\s_]*[\[({]\s*([^:]*?)\s*[\])}]", header):
         name, unit = brackets.groups()
         yield name, None if unit in ("", "-") else unit, True

@@ -30,8 +30,7 @@ def demo(
 ) -> DemoResult:
     """Diagnose the packaged sample and tune a PID controller for the motor found; write `FILES` to `out`.
 
-    **Arguments**: `out`, a folder, made where it does not exist; `seed` of the searches; `progress`,
-    called now and then with what is being done.
+    **Arguments**: `out`, a folder, made if missing; `seed` of the searches; `progress`, a callback for progress.
 
     **Returns**: the diagnosis, whose `final` is the identification of the completed motor, and the tuning.
     """

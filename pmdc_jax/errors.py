@@ -1,8 +1,8 @@
-"""The one exception that means: the input, not the program, has to be mended."""
+"""The exception for bad input, as opposed to a defect of the program."""
 
 
 class InputError(ValueError):
-    """Bad input or arguments, told in one message.
+    """Bad input or arguments.
 
     The message names the file or argument, the line or column, what is wrong and how to mend it. The
     command line prints it on standard error and exits with status 2; a Python caller catches it as a

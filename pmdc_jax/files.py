@@ -1,4 +1,4 @@
-"""Result files: checked before the long work begins, written whole or not at all."""
+"""Result files: checked before a long computation, and written atomically."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from .errors import InputError
 
 
 def check_outputs(outputs: dict[str, Path | str | None], inputs: list[Path]) -> None:
-    """Refuse now what could not be written at the end; `outputs` maps each option to its path.
+    """Check before a computation that its results can be written; `outputs` maps each option to its path.
 
-    Two outputs in one file, or an output over an input, would lose data, so they are refused too.
+    **Raises**: `InputError` if one cannot, or if two outputs, or an output and an input, share a file.
     """
     taken = {path.resolve(): "an input" for path in inputs}
     for option, output in outputs.items():
@@ -30,7 +30,7 @@ def check_outputs(outputs: dict[str, Path | str | None], inputs: list[Path]) -> 
 
 
 def check_writable(option: str, path: Path) -> None:
-    """Raise an InputError where a file of that name cannot be written."""
+    """**Raises**: `InputError` if a file cannot be written at `path`, the value of `option`."""
     if str(path) == "-":
         raise InputError(option, "only --json can go to standard output", "Give the name of a file")
     if path.is_dir():
@@ -46,8 +46,10 @@ def check_writable(option: str, path: Path) -> None:
 
 
 def result_folder(path: Path, first: str) -> Path:
-    """Make the folder now, and see whether a file `first` can be written there: better to fail before the work than
-    after it."""
+    """Make a folder for results, and check that a file named `first` can be written there, before the work begins.
+
+    **Raises**: `InputError` if not.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
@@ -57,7 +59,7 @@ def result_folder(path: Path, first: str) -> Path:
 
 
 def _takes_files(folder: Path) -> bool:
-    """Whether a file can be made in a folder: to the superuser, all of them seem to let one."""
+    """Whether a file can be made in a folder; tried, because `os.access` grants the superuser every folder."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             return True
@@ -66,18 +68,21 @@ def _takes_files(folder: Path) -> bool:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a file atomically: readers see the old one or the new one, never half of it."""
+    """Write a file atomically: readers see either the old or the new content.
+
+    **Raises**: `InputError` if it cannot be written.
+    """
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Where to write what is to stand in `path` once it is whole; nothing is left of it where writing fails.
+    """Yield a temporary path whose file replaces `path` at the end, and is deleted if writing fails.
 
-    **Raises**: `InputError` where it cannot be written.
+    **Raises**: `InputError` if it cannot be written.
     """
-    path = Path(path).resolve()  # through a link, so that the link stays
+    path = Path(path).resolve()  # resolves a link, which then stays a link
     if path.exists() and not path.is_file():  # a device such as /dev/stdout cannot be replaced
         yield path
         return

@@ -1,4 +1,4 @@
-"""JSON files that people may have edited: what cannot be right is refused in one message."""
+"""Reading of JSON files that may have been edited by hand, with one message for what is invalid."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from .errors import InputError
 
 
 def read_object(path: str | Path, form: str, mend: str) -> dict[str, Any]:
-    """The object that a file holds.
+    """Read a JSON object from a file.
 
-    **Arguments**: `form`, what its "format" must be if it has one; `mend`, how to get a good file.
+    **Arguments**: `form`, the value that its "format" must have if there is one; `mend`, for messages, how to get a
+    valid file.
 
-    **Raises**: `InputError` where the file is missing, cannot be read, is no JSON object, or of another format.
+    **Raises**: `InputError` if the file is missing, cannot be read, is not a JSON object, or has another format.
     """
     where = str(path)
     try:
@@ -36,11 +37,11 @@ def read_object(path: str | Path, form: str, mend: str) -> dict[str, Any]:
 
 
 def finite_number(where: str, name: str, value: object, mend: str) -> float:
-    """A number of a file; raises `InputError` for anything else, and for one that no double holds."""
+    """A number from a file as float; raises `InputError` for anything else, and for one beyond double precision."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         try:
             if math.isfinite(value):
                 return float(value)
-        except OverflowError:  # JSON holds whole numbers of any length
+        except OverflowError:  # integers in JSON may have any length
             raise InputError(where, f"{name} is beyond what a double holds", mend) from None
     raise InputError(where, f"{name} is {value!r}, not a number", mend)

@@ -1,4 +1,4 @@
-"""Motors as JSON files: values, and how sure they are."""
+"""Motors as JSON files: parameter values and their uncertainty."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def save_motor(
 ) -> None:
     """Write a motor as JSON, atomically.
 
-    **Arguments**: `motor`, of scalars; `identification`, whose standard errors, statuses and covariance (of the
-    coordinates: natural logarithms of positive parameters) are kept beside the values.
+    **Arguments**: `motor`, with scalar parameters; `identification`, whose standard errors, statuses and covariance (of
+    the coordinates: natural logarithms of positive parameters) are saved with the values.
     """
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -53,7 +53,7 @@ def save_motor(
 
 
 class Uncertainty(NamedTuple):
-    """How sure a motor is: names of its coordinates, and their covariance; and the parameters that no recording
+    """Uncertainty of a motor: the names of its coordinates, their covariance, and the parameters that no recording
     determined."""
 
     names: tuple[str, ...]
@@ -62,9 +62,9 @@ class Uncertainty(NamedTuple):
 
 
 def load_uncertainty(path: str | Path) -> Uncertainty | None:
-    """The covariance that an identification left in a motor file, or None where there is none.
+    """The uncertainty that an identification saved in a motor file; None if the file has no covariance.
 
-    **Raises**: `InputError` where it is there but cannot be one.
+    **Raises**: `InputError` if the covariance is not valid, or the file cannot be read.
     """
     where, content = str(path), _content(path)
     given = content.get("covariance")
@@ -84,7 +84,7 @@ def load_uncertainty(path: str | Path) -> Uncertainty | None:
 
 
 def _is_covariance(names: Sequence[str], matrix: np.ndarray) -> bool:
-    """Whether it may be one, of parameters that there are."""
+    """Whether names are unique and known, and the matrix is finite and symmetric with no negative variance."""
     known = {*PARAMETERS, *(f"{e}.{f}" for e, kind in EFFECTS.items() for f in kind.ranges)}
     once = known.issuperset(names) and len(set(names)) == len(names)
     alike = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=1e-6)
@@ -92,9 +92,9 @@ def _is_covariance(names: Sequence[str], matrix: np.ndarray) -> bool:
 
 
 def load_motor(path: str | Path) -> Motor:
-    """Read a motor written by `save_motor`, or by hand: only "parameters" is needed.
+    """Read a motor written by `save_motor` or by hand; only "parameters" is required.
 
-    **Raises**: `InputError` where the file is missing, is not JSON, or lacks or misspells something.
+    **Raises**: `InputError` if the file is missing, is not JSON, or has missing or invalid entries.
     """
     where, content = str(path), _content(path)
     constants = _numbers(where, content["parameters"], PARAMETERS, "parameters")
@@ -111,7 +111,7 @@ def _content(path: str | Path) -> dict[str, Any]:
 
 
 def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:
-    """The effects of a file, each `{"name": ..., "parameters": {...}}` and none of them twice."""
+    """The effects in a file, each `{"name": ..., "parameters": {...}}`, none of them twice."""
     if not isinstance(entries, list):
         raise InputError(where, f'"effects" is {entries!r}, not a list', "Write [] for none")
     effects: dict[str, AbstractEffect] = {}

@@ -1,4 +1,4 @@
-"""What the commands are told: their options, and how what is written in them is read."""
+"""Options of the commands, and parsing of their values."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ Folder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result
 def fit_options(
     tie: list[str], known: list[str], unloaded: bool, search: str, seed: int
 ) -> dict[str, Any]:
-    """What identification and diagnosis are told beside the runs."""
+    """The keyword arguments that `identify` and `diagnose` have in common."""
     return {
         "tie": tuple(pairs("--tie", tie)),
         "known": {name: _number("--known", name, text) for name, text in pairs("--known", known)},
@@ -133,7 +133,7 @@ def pairs(option: str, texts: list[str]) -> list[tuple[str, str]]:
 
 
 def _pair(option: str, text: str) -> tuple[str, str]:
-    """ "Kt=Kb" as ("Kt", "Kb")."""
+    """Split "Kt=Kb" into ("Kt", "Kb")."""
     left, equals, right = (part.strip() for part in text.partition("="))
     if not (left and equals and right):
         examples = {"--column": "speed=rpm_meas:rpm", "--tie": "Kt=Kb", "--known": "R=0.157"}

@@ -1,4 +1,4 @@
-"""The tables and figures of the wheelchair-motor paper beside ours."""
+"""The wheelchair-motor paper reproduced: its tables and figures beside ours."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def paper(out: str | Path = "paper_out", progress: ReportProgress | None = None) -> Paper:
-    """Do the paper again, and write paper.html and paper.json to the folder `out`, made where it does not exist.
+    """Reproduce the paper, and write paper.html and paper.json to the folder `out`, which is made if missing.
 
-    Table 1 from a virtual load test by the paper's genetic algorithm and by ours, Figs 4 to 8, and Table 2 beside
-    what is physically possible.
+    Table 1 is recovered from a virtual load test by the paper's genetic algorithm and by `identify`; Figs 4 to 8 are
+    drawn again; Table 2 is compared with what is physically possible.
     """
     from .report.json import write_json
     from .report.paper import paper_json, write_paper

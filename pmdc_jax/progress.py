@@ -1,4 +1,4 @@
-"""How long work tells how far it got."""
+"""Progress callbacks of long computations."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 @runtime_checkable
 class ReportProgress(Protocol):
-    """What long work calls now and then: what it does, how good it is, how far it got (0 to 1)."""
+    """A callback for progress: the current step, the best fitness so far, and the fraction done (0 to 1)."""
 
     def __call__(
         self, doing: str, fitness: float | None = None, fraction: float | None = None
@@ -15,4 +15,4 @@ class ReportProgress(Protocol):
 
 
 def silent(doing: str, fitness: float | None = None, fraction: float | None = None) -> None:
-    """The `ReportProgress` of work that nobody watches."""
+    """A `ReportProgress` that does nothing."""

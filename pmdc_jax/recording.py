@@ -1,4 +1,4 @@
-"""One run of one motor in SI: time, voltage, current, speed, load, and why a run cannot be used."""
+"""One run of one motor in SI: time, voltage, current, speed and load, and the faults that make a run unusable."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Samples = Float[np.ndarray, " samples"]
 MIN_SAMPLES = 10
 MAX_MISSING = 0.2  # share of an output's samples that may be missing
 OUTPUTS = ("speed", "angle", "current")
-# What is needed beside time, to simulate and to identify
+# Columns needed besides time: to simulate, and to identify
 DRIVES = "voltage, current or torque"
 OUTPUTS_TOO = "voltage with current, speed or angle; or current or torque with speed or angle"
 
@@ -28,9 +28,8 @@ OUTPUTS_TOO = "voltage with current, speed or angle; or current or torque with s
 class Finding:
     """Something about the data that a user should know before a fit.
 
-    `run` and `column` name where it was seen (`column` None for the run as a whole), `where` the
-    place in it; `what` is wrong and how to `mend` it. An "error" makes a fit meaningless, a
-    "warning" may spoil it.
+    **Fields**: `run`; `column`, None for the run as a whole; `severity`: an "error" makes a fit meaningless, a
+    "warning" may spoil it; `what` is wrong; `where`, the place in the data; `mend`, the remedy.
     """
 
     run: str
@@ -42,21 +41,24 @@ class Finding:
 
 
 class Averaging(NamedTuple):
-    """Of what a recorded speed is the mean, as a difference of angles is: how much of it is that over the last sample,
-    and how much that over the next."""
+    """A recorded speed that is a mean over the neighbouring sample intervals, as a difference of angles is.
+
+    **Fields**: `last` and `next`, the weights of the means over the previous and over the following interval; the rest
+    of the weight is that of the instantaneous speed.
+    """
 
     last: float
     next: float
 
     def known_of(self, speed: np.ndarray) -> np.ndarray:
-        """Such a speed, NaN where samples would be averaged in which nothing was recorded."""
+        """`speed`, NaN at the ends whose averaging interval lies outside the record."""
         known = speed.copy()
         known[: 1 if self.last else 0] = np.nan
         known[len(known) - 1 if self.next else len(known) :] = np.nan
         return known
 
     def of(self, speed: np.ndarray) -> np.ndarray:
-        """What is recorded of a speed, (samples, ...), that goes straight from sample to sample."""
+        """The recorded speed for an instantaneous speed, (samples, ...), that is linear between samples."""
         means = (speed[:-1] + speed[1:]) / 2
         last, coming = np.concatenate([speed[:1], means]), np.concatenate([means, speed[-1:]])
         return (1 - self.last - self.next) * speed + self.last * last + self.next * coming
@@ -71,20 +73,18 @@ def _samples(values: ArrayLike) -> np.ndarray:
 
 @frozen(eq=False)
 class Recording:
-    """One run of one motor, in SI; on a linear axis m for rad and N for N m.
+    """One run of one motor, in SI; on a linear axis, m instead of rad and N instead of N m.
 
-    The voltage at sample k is held until sample k + 1. `load` opposes positive motion; None is
-    unknown, not zero. `torque` is the known torque of the motor. Missing samples of an output are
-    NaN.
+    The voltage at sample k is held until sample k + 1. `load` opposes positive motion; None means unknown, not zero.
+    `torque` is the known torque of the motor. Missing samples of an output are NaN.
 
-    **Fields**: `name`, shown in results; `time`, s, (samples,), strictly increasing from any start;
-    and, None where not recorded, of the same shape: `voltage` V, `current` A, `speed` rad/s, `load`
-    N m, `angle` rad, `temperature` degrees C, `torque` N m. `held`, whether the rotor was locked;
-    `source`, the file; `ignored`, headers not used; `notes`, what was assumed while reading; `uneven`, the record
-    that this one lays on an even clock, None where it is a record itself; `averaging`, of what the speed is the mean,
-    None where it is that of the moment.
+    **Fields**: `name`, shown in results; `time`, s, (samples,), strictly increasing from any start. The following have
+    the same shape, and are None where not recorded: `voltage` V, `current` A, `speed` rad/s, `load` N m, `angle` rad,
+    `temperature` degrees C, `torque` N m. `held`, whether the rotor was locked; `source`, the file; `ignored`, headers
+    not used; `notes`, assumptions made while reading; `uneven`, the original record if this one was resampled to an
+    even clock, else None; `averaging`, the averaging of the speed, None for an instantaneous speed.
 
-    **Raises**: `InputError` where nothing drives the motor, or the arrays are no record of it.
+    **Raises**: `InputError` if no recorded quantity drives the motor, or the arrays are faulty (see `faults`).
     """
 
     name: str
@@ -104,7 +104,7 @@ class Recording:
     averaging: Averaging | None = field(default=None, kw_only=True)
 
     def __attrs_post_init__(self) -> None:
-        # what was laid on an even clock was a sound record before
+        # the original of a resampled record has already been checked
         for fault in faults(self.columns()) if self.uneven is None else ():
             sample = "" if fault.row is None else f"sample {fault.row + 1}"
             column = fault.quantity and f"column {fault.quantity}"
@@ -116,34 +116,34 @@ class Recording:
 
     @property
     def sample_time(self) -> float:
-        """Median step of time, s."""
+        """Median sample interval, s."""
         return float(np.median(np.diff(self.time)))
 
     @property
     def duration(self) -> float:
-        """From the first to the last sample, s."""
+        """Time from the first to the last sample, s."""
         return float(self.time[-1] - self.time[0])
 
     @property
     def recorded(self) -> Recording:
-        """As it was recorded, on whatever clock."""
+        """The original record, before any resampling to an even clock."""
         return self if self.uneven is None else self.uneven
 
     @property
     def drive(self) -> Literal["voltage", "current", "torque"]:
-        """What drives the motor in a simulation: the first there is of voltage, torque, current."""
+        """The input of a simulation: the first of voltage, torque and current that was recorded."""
         if self.voltage is not None:
             return "voltage"
         return "current" if self.torque is None else "torque"
 
     @property
     def tells(self) -> bool:
-        """Whether anything was measured of what the motor does, so that it can be identified from it."""
+        """Whether the recorded quantities suffice to identify a motor; see `is_identifiable_from`."""
         return is_identifiable_from(self.columns())
 
     @property
     def stands_still(self) -> bool:
-        """Whether the rotor never moves in the least, whatever the voltage and the current."""
+        """Whether the rotor is locked or does not move at all while current flows; needs voltage and current."""
         if self.voltage is None or self.current is None or not np.any(np.nan_to_num(self.current)):
             return False
         motion = (
@@ -152,18 +152,18 @@ class Recording:
         return self.held or (motion is not None and not np.any(np.nan_to_num(motion)))
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The arrays that there are, by quantity."""
+        """The recorded arrays, by quantity."""
         values = ((quantity, getattr(self, quantity)) for quantity in QUANTITIES)
         return {quantity: array for quantity, array in values if array is not None}
 
 
 def place_of_sample(run: Recording, row: int | np.integer) -> str:
-    """Where a sample is, for people: `row` counts from 0, and people from 1."""
+    """The place of a sample for messages, which count samples from 1; `row` counts from 0."""
     return f"sample {row + 1} ({run.time[row]:.6g} s)"
 
 
 class Fault(NamedTuple):
-    """Why a recording cannot be used; `row` counts from 0, None for the whole column."""
+    """Why a recording cannot be used; `row` counts from 0 and is None for the whole column."""
 
     quantity: str | None
     row: int | None
@@ -172,7 +172,7 @@ class Fault(NamedTuple):
 
 
 def faults(columns: Mapping[str, np.ndarray]) -> Iterator[Fault]:
-    """All that makes these columns unusable, the most basic first."""
+    """Every fault that makes these columns unusable, the most basic first."""
     if not is_driven(columns):
         what = f"nothing drives the motor in {', '.join(columns)}"
         yield Fault(None, None, what, f"Needed beside time: {DRIVES}")
@@ -214,7 +214,7 @@ def _not_finite(
         first = int(np.argmax(infinite))
         what = f"{infinite.sum()} infinite values, the first here"
         yield Fault(quantity, first, what, "Leave cells without a measurement empty")
-    # current is an input where nothing else drives the motor
+    # the current is an input if neither voltage nor torque was recorded
     output = quantity in OUTPUTS and (
         quantity != "current" or "voltage" in columns or "torque" in columns
     )

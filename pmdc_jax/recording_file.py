@@ -1,4 +1,4 @@
-"""Recordings in files: read from CSV, Parquet and MAT, written as CSV and Parquet."""
+"""Recording files: read from CSV, Parquet and MAT, written as CSV and Parquet."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .recording import (
 )
 from .tables import Table, open_table
 
-# one run or several, each as it is or the file that holds it
+# one run or several, each a recording or the path of its file
 Run = Recording | str | os.PathLike[str]
 Runs = Run | Sequence[Run]
 
@@ -36,14 +36,13 @@ def read_recording(
 ) -> Recording:
     """Read one run from a CSV, Parquet or MAT file.
 
-    **Arguments**: `path`; `columns`, what the headers do not say by themselves: quantity (time,
-    voltage, current, speed, load, angle, temperature, torque) to "header" or "header:unit"; `to_simulate`, whether it
-    is enough that something drives the motor.
+    **Arguments**: `path`; `columns`, for headers that are not understood by themselves: a mapping from quantity (time,
+    voltage, current, speed, load, angle, temperature, torque) to "header" or "header:unit"; `to_simulate`, whether the
+    inputs of a simulation suffice, so that no output need be recorded.
 
     **Returns**: the run in SI, named after the file.
 
-    **Raises**: `InputError` that names the file, the line or column, what is wrong and how to mend
-    it.
+    **Raises**: `InputError` that names the file, the line or column, the fault and its remedy.
     """
     path = Path(path)
     table = open_table(path)
@@ -68,9 +67,9 @@ def read_recording(
 
 
 def recordings_of(runs: Runs, to_simulate: bool = False) -> list[Recording]:
-    """Runs as they are, and files read; see `read_recording`.
+    """A list of recordings from one run or several, where files are read by `read_recording`.
 
-    **Raises**: `InputError` where a file cannot be read.
+    **Raises**: `InputError` if a file cannot be read.
     """
     several = [runs] if isinstance(runs, Recording | str | os.PathLike) else runs
     return [
@@ -80,11 +79,11 @@ def recordings_of(runs: Runs, to_simulate: bool = False) -> list[Recording]:
 
 
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a run as CSV or Parquet, by suffix, under canonical headers and in full precision.
+    """Write a run as CSV or Parquet, by suffix, with canonical headers and in full precision.
 
-    The file appears complete or not at all.
+    The file is written atomically.
 
-    **Raises**: `InputError` on another suffix, or where the file cannot be written.
+    **Raises**: `InputError` for another suffix, or if the file cannot be written.
     """
     import polars as pl
 

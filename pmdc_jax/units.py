@@ -1,4 +1,4 @@
-"""Units in the spellings that logs use, turned into SI by pint."""
+"""Conversion of units, in the spellings common in log files, to SI with pint."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pint
 
-# An angle is a dimension here, unlike in pint's own registry: it keeps 1/s, Hz and rad/s apart.
-# "Nm" would be a nano-something there, and its whole registry takes a second to build.
+# Replaces pint's default registry, in which angles are dimensionless, so that 1/s, Hz and rad/s are alike, and "Nm" is
+# not a newton metre; it also takes a second to build. Here an angle is a dimension.
 UNITS = """
 nano- = 1e-9 = n-
 micro- = 1e-6 = µ- = μ- = u-
@@ -38,12 +38,12 @@ turn = 6.283185307179586 * radian = rev = revolution
 rpm = turn / minute
 rps = turn / second
 """
-# how speed in turns per minute is written where "turn" goes without saying
+# Further spellings of rpm, most of which omit the turn
 RPM = {"1/min", "min^-1", "min-1", "min⁻¹", "/min", "u/min", "upm", "r/min"}
 
 
 class UnitError(ValueError):
-    """The unit of `quantity` is unknown or measures something else; the message says which."""
+    """The unit of `quantity` is unknown or measures another quantity; the message says which."""
 
     def __init__(self, quantity: str, why: str) -> None:
         self.quantity = quantity
@@ -51,14 +51,14 @@ class UnitError(ValueError):
 
 
 def conversion(unit: str, quantity: str, bases: Sequence[str]) -> tuple[str, float, float]:
-    """How numbers in `unit` become SI.
+    """The conversion of a unit to SI.
 
-    **Arguments**: `unit` as found in a header; `quantity`, for the message; `bases`, the SI units
-    it may become, in order of preference.
+    **Arguments**: `unit`, as found in a header; `quantity`, for the message; `bases`, the SI units allowed, in order of
+    preference.
 
-    **Returns**: the SI unit, scale and offset: SI = scale * number + offset.
+    **Returns**: the SI unit, scale and offset: SI value = scale * number + offset.
 
-    **Raises**: `UnitError`.
+    **Raises**: `UnitError` if `unit` is unknown or converts to none of `bases`.
     """
     unknown = True
     for spelling in _spellings(unit):
@@ -76,7 +76,7 @@ def conversion(unit: str, quantity: str, bases: Sequence[str]) -> tuple[str, flo
 
 
 def _spellings(unit: str) -> Iterator[str]:
-    """The unit as written, then as it may be meant: rad_s for rad/s, N_m for N m, RPM for rpm."""
+    """The unit as written, then other readings: rad_s as rad/s, N_m as N m, RPM as rpm."""
     unit = unit.strip()
     if unit.casefold() in RPM:
         yield "rpm"
@@ -91,12 +91,12 @@ def _spellings(unit: str) -> Iterator[str]:
 def _convert(unit: str, base: str) -> tuple[float, float]:
     """Scale and offset; `LookupError` if the unit is unknown, `ArithmeticError` if incompatible."""
     if unit in (base, base.replace(" ", ""), base.replace("/", "_")):
-        return 1.0, 0.0  # pint takes a tenth of a second to wake up
+        return 1.0, 0.0  # saves the import of pint, 0.1 s
     import pint
 
     try:
         parsed = _registry().Unit(unit)
-    except Exception:  # pint raises a dozen kinds, down to those of the tokenizer
+    except Exception:  # pint raises many kinds, even those of the tokenizer
         raise LookupError(unit) from None
     try:
         zero, one = (_registry().Quantity(x, parsed).to(base).magnitude for x in (0.0, 1.0))

@@ -1,5 +1,5 @@
-"""Samples that are no measurements: they leap out and straight back, as where a telegram was lost, or the channel could
-not show more than the end of its range."""
+"""Samples that are no measurements: single-sample spikes, for example from a lost telegram, and values clipped at the
+end of the measuring range."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from jaxtyping import Bool, Float
 from .differences import noise_by_differences
 from .recording import MAX_MISSING, Finding, Recording, place_of_sample
 
-# A spike is so many times what a signal usually bends from sample to sample ...
+# Least height of a spike over the median absolute second difference of the signal ...
 SPIKE_RATIO = 50.0
-# ... and this share of its range at least
+# ... and over the range of the signal (from its 2 % to its 98 % quantile)
 MIN_SPIKE = 0.2
-# Its neighbours differ by no more than this share of it
+# Largest difference between the two neighbours of a spike, over its height
 MAX_STEP_ASIDE = 0.2
-# ... and what drives moves by no more of its range about it
+# Largest step of the driving signal next to a spike, over the range of that signal
 MAX_STEP_OF_DRIVE = 0.2
-# More than this share of all samples are no spikes
+# If more than this share of all samples look like spikes, they are taken for the signal
 MAX_SPIKES = 0.01
-# Probability that a run of equal extreme values is chance
+# Probability at which a run of equal extreme values is still taken for chance
 CHANCE_OF_STAY = 1e-9
 
 
 def without_unmeasured(run: Recording) -> Recording:
-    """A run in which the outputs' spikes, and what was clipped of them, is missing, with a note on either."""
+    """The run with the spikes and the clipped samples of its outputs set to NaN, and a note on each."""
     outputs = ("speed", "current") if run.drive == "voltage" else ("speed",)
     for name in outputs:
         signal = getattr(run, name)
@@ -46,7 +46,7 @@ def without_unmeasured(run: Recording) -> Recording:
 
 
 def _without(run: Recording, name: str, lost: Bool[np.ndarray, " samples"], how: str) -> Recording:
-    """A run less some samples of an output."""
+    """The run with the `lost` samples of an output set to NaN, and a note that says `how` they were recognised."""
     signal, rows = getattr(run, name), np.flatnonzero(lost)
     others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
     note = Finding(
@@ -71,7 +71,7 @@ def _spikes(signal: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples
 
 
 def _steady(run: Recording) -> Bool[np.ndarray, " samples"]:
-    """Where what drives cannot have made a spike, for it is as it was."""
+    """Samples around which the driving signal does not step, so that it cannot have caused a spike."""
     drive = np.asarray(getattr(run, run.drive))
     leaps = np.abs(np.diff(drive, prepend=drive[0])) > MAX_STEP_OF_DRIVE * np.ptp(drive)
     return ~(leaps | np.roll(leaps, 1) | np.roll(leaps, -1))
@@ -80,7 +80,7 @@ def _steady(run: Recording) -> Bool[np.ndarray, " samples"]:
 def clipped_extremes(
     values: Float[np.ndarray, " samples"],
 ) -> Iterator[tuple[float, int, int]]:
-    """Extremes at which a noisy signal stays as no chance makes it, and start and length of the longest stay there."""
+    """Extremes at which a noisy signal stays longer than by chance, with start and length of the longest stay."""
     for extreme in (np.nanmax(values), np.nanmin(values)) if _is_noisy(values) else ():
         start, length, expected = _longest_stay_at(values, extreme)
         if length > expected:
@@ -88,7 +88,7 @@ def clipped_extremes(
 
 
 def _is_noisy(values: np.ndarray) -> bool:
-    """Whether the channel scatters: neither a clean simulation nor one rounded to a few digits."""
+    """Whether the channel carries noise, unlike a simulation, whether in full precision or rounded to a few digits."""
     values = values[np.isfinite(values)]
     inner = values[(values > values.min()) & (values < values.max())]
     if len(inner) < 100 or noise_by_differences(3, inner) < 1e-5 * np.ptp(values):
@@ -98,8 +98,8 @@ def _is_noisy(values: np.ndarray) -> bool:
 
 
 def _longest_stay_at(values: np.ndarray, extreme: float) -> tuple[int, int, float]:
-    """Start and length of the longest run of the extreme value, and the length chance may make."""
-    if extreme == 0:  # a motor at rest, or a sensor that knows one direction
+    """Start and length of the longest stay at the extreme value, and the length that chance may explain."""
+    if extreme == 0:  # a motor at rest, or a sensor of one direction only
         return 0, 0, np.inf
     padded = np.concatenate(([False], values == extreme, [False])).astype(np.int8)
     starts, ends = (np.flatnonzero(np.diff(padded) == sign) for sign in (1, -1))
@@ -111,7 +111,7 @@ def _longest_stay_at(values: np.ndarray, extreme: float) -> tuple[int, int, floa
     inner = values[(values != extreme) & np.isfinite(values)]
     repeats = (np.count_nonzero(np.diff(inner) == 0) + 1) / len(inner)
     expected = 1 + np.log(CHANCE_OF_STAY / len(values)) / np.log(min(repeats, 0.999))
-    # a speed in counts stays wherever the motor turns steadily
+    # a speed in encoder counts stays at one value whenever the motor turns steadily
     elsewhere = 2.0 * _second_longest_stay(inner[inner != 0])
     return (
         int(starts[longest]),
@@ -121,7 +121,7 @@ def _longest_stay_at(values: np.ndarray, extreme: float) -> tuple[int, int, floa
 
 
 def _second_longest_stay(values: Float[np.ndarray, " samples"]) -> int:
-    """How long a signal stays at one value, but for once."""
+    """Length of the second longest stay of a signal at one value."""
     ends = np.flatnonzero(np.diff(values, append=np.nan) != 0)
     stays = np.sort(np.diff(ends, prepend=-1))
     return int(stays[-2]) if len(stays) > 1 else 0

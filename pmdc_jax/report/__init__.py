@@ -1,1 +1,1 @@
-"""Results made readable as HTML, terminal tables and JSON: presentation, no computing."""
+"""Presentation of results as HTML reports, terminal tables and JSON."""

@@ -1,4 +1,4 @@
-"""Plotly figures of a diagnosis: where it was off, by how much, and what is left."""
+"""Plotly figures of a diagnosis: where the model misfits, by how much, and the residuals before and after."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ AXIS_TITLES = {
     "angle": "angle [rad]",
     "time": "share of a run",
 }
-# of equally many samples, over which residuals are averaged
+# number of bins with equally many samples, over each of which residuals are averaged
 BINS = 30
-# gap, in times the noise, from which on the bars need a logarithmic axis
+# gap over the noise above which the bars need a logarithmic axis
 LOGARITHMIC_FROM = 20.0
 
 
 def where_figure(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> go.Figure:
-    """The misfit over its standard error in every region, a panel for each equation and variable.
+    """The misfit over its standard error (z) in every region, a panel for each equation and variable.
 
-    Axes span what the runs (`fits`) have of the variable.
+    Axes span the range of the variable in the runs, `fits`.
     """
     kinds = list(dict.fromkeys((one.equation, one.variable) for one in regions))
     titles = [f"{equation} equation over {variable}" for equation, variable in kinds]
@@ -71,7 +71,7 @@ def where_figure(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> go.Fi
 
 
 def gap_figure(gaps: Mapping[str, Gap]) -> go.Figure:
-    """Bars of the error over the noise before and after, and the noise floor, for every run."""
+    """Bars of the error over the noise before and after adding the effects, and the noise floor, for every run."""
     runs = list(gaps)
     figure = go.Figure()
     for name, colour in (("before", BEFORE), ("after", AFTER)):
@@ -95,7 +95,7 @@ def gap_figure(gaps: Mapping[str, Gap]) -> go.Figure:
 def residual_figure(
     before: RunFit, after: RunFit, noise: Mapping[str, float | None], points: int
 ) -> go.Figure | None:
-    """What free-run simulation missed over time, by the motor without and with the effects."""
+    """Free-run residuals over time, of the motor without and with the effects; None without any output."""
     channels = [one for one in RESIDUALS if residual(before, one) is not None]
     if not channels:
         return None
@@ -122,7 +122,7 @@ def residual_figure(
 def residual_over_variable_figure(
     before: Mapping[str, RunFit], after: Mapping[str, RunFit], variable: str, channel: str
 ) -> go.Figure | None:
-    """The residual of all runs, averaged over stretches of a variable, before and after."""
+    """The residual of all runs, averaged over bins of a variable, before and after; None where it is not known."""
     figure = go.Figure()
     for name, fits, colour in (("before", before, BEFORE), ("after", after, AFTER)):
         averaged = averages(fits, variable, channel)
@@ -142,7 +142,7 @@ def residual_over_variable_figure(
 def averages(
     fits: Mapping[str, RunFit], variable: str, channel: str
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Mean variable and mean residual in bins that hold equally many samples, of all runs together."""
+    """Mean variable and mean residual of all runs together, in bins of equally many samples; None without data."""
     pairs = [(_values(fit, variable), residual(fit, channel)) for fit in fits.values()]
     there = [(x, r) for x, r in pairs if x is not None and r is not None]
     if not there:
@@ -156,7 +156,7 @@ def averages(
 
 
 def curve_figure(curve: LearnedCurve) -> go.Figure:
-    """A term of an equation as the data draw it, with a band of two standard errors either side."""
+    """A learned term of an equation, with a band of two standard errors either side."""
     over, under = curve.value + 2 * curve.stderr, curve.value - 2 * curve.stderr
     figure = go.Figure()
     band = go.Scatter(
@@ -186,7 +186,7 @@ def curve_figure(curve: LearnedCurve) -> go.Figure:
 
 
 def experiment_figure(experiment: NextExperiment, points: int) -> go.Figure:
-    """The voltage to record next."""
+    """The voltage of the next experiment over time."""
     time, voltage = envelope(experiment.time, experiment.voltage, points)
     line = {"color": INPUT, "width": 1.2, "shape": "hv"}
     figure = go.Figure(go.Scatter(x=time, y=voltage, mode="lines", line=line, name="voltage"))
@@ -197,7 +197,7 @@ def experiment_figure(experiment: NextExperiment, points: int) -> go.Figure:
 
 
 def _range(fits: Mapping[str, RunFit], variable: str) -> list[float] | None:
-    """From the lowest to the highest of all runs; None where no run has it."""
+    """Lowest and highest value of a variable in all runs; None if no run has it."""
     found = [values for fit in fits.values() if (values := _values(fit, variable)) is not None]
     if not found:
         return None
@@ -205,7 +205,7 @@ def _range(fits: Mapping[str, RunFit], variable: str) -> list[float] | None:
 
 
 def _values(fit: RunFit, variable: str) -> np.ndarray | None:
-    """The variable along a run; simulated where it was not measured."""
+    """The variable along a run, simulated if it was not measured, None if neither; "time" runs from 0 to 1."""
     if variable == "time":
         return np.linspace(0, 1, len(fit.time))
     measured = getattr(fit, variable, None)

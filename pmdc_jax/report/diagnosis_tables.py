@@ -1,4 +1,4 @@
-"""The tables of a diagnosis for the terminal."""
+"""Terminal tables of a diagnosis."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from .verdict import detectable_others, drift_words, drifts, verdict_sentences
 
 
 def print_diagnosis(diagnosis: Diagnosis) -> None:
-    """Effects, what adding them did, and the verdict on standard output."""
+    """Print the effects, what adding them changed, and the verdict to standard output."""
     print_tables(diagnosis_tables(diagnosis))
 
 
 def diagnosis_tables(diagnosis: Diagnosis) -> RenderableType:
-    """Tables of what there is to tell, and under them the verdict in words."""
+    """Tables of effects, parameters, gaps and detectable amplitudes, as far as they apply, and the verdict in words."""
     tables = [_effects(diagnosis)] if diagnosis.effects else []
     tables += [_parameters(diagnosis), _gaps(diagnosis)]
     if diagnosis.verdict == "none_detected" and diagnosis.detectable:

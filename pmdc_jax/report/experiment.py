@@ -1,4 +1,4 @@
-"""The next experiment as a file that a power stage can play."""
+"""The next experiment as a CSV file for a power stage."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from ..files import write_text
 
 
 def write_experiment(diagnosis: Diagnosis, path: str | Path) -> bool:
-    """Write the waveform that would decide as CSV: time_s, and voltage_V held until the next row.
+    """Write the voltage of the next experiment as CSV: time_s, and voltage_V held until the next row.
 
-    **Returns**: whether there is one to write.
+    **Returns**: False, with nothing written, if the diagnosis has no next experiment.
     """
     experiment = diagnosis.next_experiment
     if experiment is None:

@@ -1,4 +1,4 @@
-"""Plotly figures of results. Long runs are thinned for display, keeping every peak."""
+"""Plotly figures of results. Long runs are thinned for display without loss of peaks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GRID = "#e6e9ee"
 EDGE = "#c3cad4"
 DASHED = {"color": INK, "width": 1, "dash": "4px 3px"}
 FONT = "Inter, system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
-# axis title of a residual, and the key of its noise
+# by channel: axis title of its residual, and key of its noise
 RESIDUALS = {
     "speed": ("Δ speed<br>[rad/s]", "speed_rad_s"),
     "current": ("Δ current<br>[A]", "current_A"),
@@ -33,17 +33,17 @@ POINTS_PER_PAGE = 90_000  # about one megabyte as base64: the page stays under 6
 
 
 def points_per_trace(traces: int) -> int:
-    """How many points each of so many traces may have, so that the whole page stays small."""
+    """Number of points for each of `traces` traces that keeps the whole page small."""
     return min(POINTS_PER_TRACE, max(200, POINTS_PER_PAGE // max(traces, 1)))
 
 
 def count_traces(fit: RunFit) -> int:
-    """How many traces the figure of a run will have."""
+    """Number of traces in the figure of a run."""
     return sum(len(panel.traces) for panel in _panels(fit, {}))
 
 
 def run_figure(fit: RunFit, noise: Mapping[str, float | None], points: int) -> go.Figure:
-    """Measured against simulated with a shared time axis, and the residuals underneath.
+    """Measured and simulated signals over a shared time axis, and the residuals underneath.
 
     Dashed lines mark two standard deviations of the noise either side of zero residual.
     """
@@ -65,9 +65,9 @@ def run_figure(fit: RunFit, noise: Mapping[str, float | None], points: int) -> g
 
 
 def mark_noise(figure: go.Figure, row: int, noise: float | None) -> None:
-    """Dashed lines at two standard deviations of the noise either side of zero, where it is known."""
+    """Draw dashed lines two standard deviations of the noise either side of zero, if it is known."""
     for level in (-2 * noise, 2 * noise) if noise else ():
-        # plotly's annotation of `row` knows only "all"
+        # the type annotation of `row` in plotly allows only "all"
         figure.add_hline(y=level, line=DASHED, row=row)  # pyright: ignore[reportArgumentType]
 
 
@@ -131,7 +131,7 @@ def correlation_figure(correlation: np.ndarray, names: Sequence[str]) -> go.Figu
 def correlations(
     covariance: np.ndarray, names: Sequence[str]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The correlation matrix of the parameters that are free, and their names."""
+    """The correlation matrix of the free parameters, those with a finite positive variance, and their names."""
     variance = np.diag(covariance) if np.size(covariance) else np.zeros(0)
     free = np.flatnonzero(np.isfinite(variance) & (variance > 0))
     deviation = np.sqrt(variance[free])
@@ -140,9 +140,9 @@ def correlations(
 
 
 def envelope(time: np.ndarray, values: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most `points` samples: the lowest and the highest of each group of neighbours, in order.
+    """Thin a trace to at most `points` samples (even): the lowest and highest of each group of neighbours, in order.
 
-    Unlike a stride this keeps every peak, at the price of showing noise at its full width.
+    Unlike decimation this keeps every peak, but shows noise at its full width.
     """
     if len(values) > points:
         group = group_size(len(values), points)
@@ -154,17 +154,17 @@ def envelope(time: np.ndarray, values: np.ndarray, points: int) -> tuple[np.ndar
         keep = inside + group * np.arange(len(groups))[:, None]
         keep = np.minimum(keep.ravel(), len(values) - 1)
         time, values = time[keep], values[keep]
-    exact = np.abs(time).max(initial=0.0) > 1e5  # a clock, not seconds since the start
+    exact = np.abs(time).max(initial=0.0) > 1e5  # absolute times, which float32 would round
     return np.asarray(time, float if exact else np.float32), np.asarray(values, np.float32)
 
 
 def group_size(samples: int, points: int) -> int:
-    """How many neighbours share one lowest and one highest in a thinned trace."""
+    """Number of samples in each group of which a thinned trace keeps the lowest and the highest."""
     return -(-2 * samples // points)
 
 
 class _Panel(NamedTuple):
-    """One row of a picture: axis title, relative height, traces, noise of a residual."""
+    """One row of a figure: axis title, relative height, traces, and noise of a residual."""
 
     title: str
     height: float
@@ -173,7 +173,7 @@ class _Panel(NamedTuple):
 
 
 def _panels(fit: RunFit, noise: Mapping[str, float | None]) -> list[_Panel]:
-    """What is drawn from top to bottom; no empty panels."""
+    """The panels of a run from top to bottom, without empty ones."""
     speed = [
         _line("measured", fit.speed, MEASURED, 2.6, legend=True),
         _line("simulated", fit.speed_simulated, SIMULATED, 1.1, legend=True),
@@ -182,7 +182,7 @@ def _panels(fit: RunFit, noise: Mapping[str, float | None]) -> list[_Panel]:
         _line("measured", fit.current, MEASURED, 2.6, legend=fit.speed is None),
         _line("simulated", fit.current_simulated, SIMULATED, 1.1),
     ]
-    # the voltage recorded at a sample is held until the next
+    # zero-order hold between samples
     voltage = _line("applied", fit.voltage, INPUT, 1.2, shape="hv")
     panels = [
         _Panel("speed<br>[rad/s]", 1.0, speed),
@@ -190,7 +190,7 @@ def _panels(fit: RunFit, noise: Mapping[str, float | None]) -> list[_Panel]:
         _Panel("voltage<br>[V]", 0.55, [voltage]),
         *(_residual_panel(fit, channel, noise) for channel in RESIDUALS),
     ]
-    # a quantity the run does not hold is an empty trace
+    # a quantity that was not recorded is an empty trace
     panels = [panel._replace(traces=[one for one in panel.traces if one]) for panel in panels]
     return [panel for panel in panels if panel.traces]
 
@@ -202,7 +202,7 @@ def _residual_panel(fit: RunFit, channel: str, noise: Mapping[str, float | None]
 
 
 def residual(fit: RunFit, channel: str) -> np.ndarray | None:
-    """Measured minus simulated of "speed" or "current", None where the run does not hold it."""
+    """Measured minus simulated "speed" or "current"; None if it was not recorded."""
     measured, simulated = getattr(fit, channel), getattr(fit, f"{channel}_simulated")
     return None if measured is None or simulated is None else np.asarray(measured - simulated)
 
@@ -228,13 +228,13 @@ def _line(
 
 
 def _positive(values: np.ndarray) -> np.ndarray:
-    """Values a log axis can show; the rest become gaps."""
+    """Values for a logarithmic axis: NaN, which leaves a gap, where not positive and finite."""
     values = np.asarray(values, float)
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
 
 AXIS = {"gridcolor": GRID, "zeroline": False, "linecolor": EDGE, "title": {"font": {"size": 12}}}
-# in place of plotly's own, which would add 7 kB to every figure
+# in place of plotly's default template, which would add 7 kB to every figure
 TEMPLATE = go.layout.Template(
     layout={
         "margin": {"l": 62, "r": 12, "t": 34, "b": 44},
@@ -251,5 +251,5 @@ TEMPLATE = go.layout.Template(
 
 
 def style(figure: go.Figure, height: int) -> None:
-    """The look that every figure has."""
+    """Apply the template common to all figures, and a height in pixels."""
     figure.update_layout(template=TEMPLATE, height=height)

@@ -43,9 +43,9 @@ def write_report(identification: Identification, path: str | Path) -> None:
 
 
 def identification_content(identification: Identification, other_traces: int = 0) -> dict[str, Any]:
-    """What the sections on the motor, its data and its fit are filled with.
+    """Template content of the sections on the motor, its data and its fit.
 
-    `other_traces` are drawn elsewhere on the page, which is to stay small.
+    `other_traces`, drawn elsewhere on the page, leave fewer points to each trace here, so that the page stays small.
     """
     traces = other_traces + sum(count_traces(fit) for fit in identification.fit.values())
     points = points_per_trace(traces)
@@ -82,7 +82,7 @@ class _Run:
 
 
 def _tiles(identification: Identification) -> list[tuple[str, str, str]]:
-    """Label, number and small print of the figures worth knowing first."""
+    """Label, number and note of each tile at the top of the report."""
     parameters = identification.parameters.values()
     identified = sum(one.status == "identified" for one in parameters)
     tiles = [("Parameters identified", f"{identified} of {len(parameters)}", "")]
@@ -104,7 +104,7 @@ def _tiles(identification: Identification) -> list[tuple[str, str, str]]:
 
 def _parameters(identification: Identification) -> list[_Parameter]:
     def row(symbol: str, estimate: Estimate) -> _Parameter:
-        if "." in symbol:  # of an effect: it has a name and no symbol
+        if "." in symbol:  # a parameter of an effect has a name but no symbol
             symbol, name = "", parameter_words(*symbol.split("."))
         else:
             name = PARAMETER_NAMES.get(symbol, "")
@@ -142,7 +142,7 @@ def _numbers(fit: RunFit) -> dict[str, str]:
 
 
 def _caption(fit: RunFit, points: int) -> str:
-    """The fits of the run, and how its picture was thinned where not every sample is drawn."""
+    """The fits of the run, and the thinning of its figure if not every sample is drawn."""
     shares = (("speed", fit.speed_fit_percent), ("current", fit.current_fit_percent))
     fits = [f"{quantity} fit {percent(share)}" for quantity, share in shares if share is not None]
     samples = len(fit.time)

@@ -1,4 +1,4 @@
-"""Results as JSON after the contract: SI numbers, finite, and null for what is unknown."""
+"""Results as JSON: finite numbers in SI, and null for unknown values."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def identification_json(identification: Identification) -> dict[str, Any]:
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """A diagnosis: what an identification holds, of the completed motor, and what was missing."""
+    """A diagnosis as plain dictionaries: `identification_json` of the completed motor, and what was missing."""
     before = diagnosis.base.parameters.items()
     gap = {role: _gap(diagnosis.gap.get(role)) for role in ("train", "holdout")}
     found = {
@@ -65,8 +65,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def write_json(obj: Any, path: str | Path) -> None:
-    """Write `obj` to a file, whole or not at all, or to standard output where the path is "-"."""
-    to_stdout = str(path) == "-"  # whose encoding is anybody's guess, hence plain ASCII
+    """Write `obj` to a file atomically, or to standard output if the path is "-"."""
+    to_stdout = str(path) == "-"  # its encoding is unknown, hence plain ASCII
     text = json.dumps(obj, indent=2, ensure_ascii=to_stdout, allow_nan=False) + "\n"
     if to_stdout:
         sys.stdout.write(text)
@@ -100,7 +100,7 @@ def _gap(gap: Gap | None) -> dict[str, Any] | None:
 
 
 def _experiment(experiment: NextExperiment | None) -> dict[str, Any] | None:
-    """What to record; the waveform itself is what --experiment writes."""
+    """The next experiment without its waveform, which --experiment writes."""
     if experiment is None:
         return None
     return {name: getattr(experiment, name) for name in ("why", "description", "power")}
@@ -134,9 +134,9 @@ def _finding(finding: Finding) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Tuples and arrays as lists, NumPy and JAX scalars as Python's, NaN and infinity as None.
+    """Tuples and arrays as lists, NumPy and JAX scalars as Python scalars, NaN and infinity as None.
 
-    An interval with an unknown end is unknown as a whole.
+    A confidence interval with an unknown end becomes None as a whole.
     """
     if isinstance(value, dict):
         return {

@@ -1,4 +1,4 @@
-"""Numbers, units and names as an engineer writes them: 157.3 mΩ, not 0.157312 ohm."""
+"""Numbers, units and names in engineering notation: 157.3 mΩ, not 0.157312 ohm."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..effects import EFFECTS
 from ..identify.identification import Estimate
 
 UNKNOWN = "–"
-NARROW = "\u202f"  # narrow space where no line may break
+NARROW = "\u202f"  # narrow no-break space
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 PARAMETER_NAMES = {
     "R": "armature resistance",
@@ -26,7 +26,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @frozen
 class Written:
-    """An estimate in words: value, error and interval share one scaled unit and its decimals."""
+    """An estimate as texts: value, standard error and interval share one scaled unit and number of decimals."""
 
     value: str
     stderr: str
@@ -36,7 +36,7 @@ class Written:
 
 
 def write_estimate(estimate: Estimate) -> Written:
-    """Write an estimate with as many decimals as its standard error deserves (two digits of it)."""
+    """Write an estimate with as many decimals as give its standard error two significant digits."""
     exponent = engineering_exponent(estimate.value or 0.0, estimate.unit)
     scale = 10.0**exponent
     decimals = _decimals((estimate.value or 0.0) / scale, (estimate.stderr or 0.0) / scale)
@@ -55,7 +55,7 @@ def write_estimate(estimate: Estimate) -> Written:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """A number with so many significant digits, for columns whose unit stands in the header."""
+    """A number with `digits` significant digits, as a power of ten if very large or small; a dash if it is unknown."""
     if value is None or not isfinite(value):
         return UNKNOWN
     if value and not -5 < _magnitude(value) < 6:
@@ -64,26 +64,26 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 
 def value_with_unit(value: float, unit: str, digits: int = 3) -> str:
-    """A number with its unit, (0.00321, "N m") as "3.21 mN·m"."""
+    """A number with its scaled unit: (0.00321, "N m") as "3.21 mN·m"."""
     exponent = engineering_exponent(value, unit)
     scaled = significant(value / 10.0**exponent, digits)
     return f"{scaled} {scaled_unit(unit, exponent)}".strip()
 
 
 def thousands(count: int) -> str:
-    """Groups of three digits, held together by narrow spaces."""
+    """A count in groups of three digits, separated by narrow no-break spaces."""
     return f"{count:,}".replace(",", NARROW)
 
 
 def engineering_exponent(value: float, unit: str) -> int:
-    """The multiple of three that leaves 1 to 999 before the decimal point; none for a mere number from 0.001 on."""
+    """The power of ten, a multiple of three, that leaves 1 to 999; 0 for a number without unit from 0.001 to 1e6."""
     if not value or not isfinite(value) or (not unit and 1e-3 <= abs(value) < 1e6):
         return 0
     return max(-12, min(9, 3 * floor(log10(abs(value)) / 3)))
 
 
 def scaled_unit(unit: str, exponent: int) -> str:
-    """The unit with its prefix, ("N m/A", -3) as "mN·m/A"; kilograms and reciprocals take a power of ten."""
+    """The unit with its prefix: ("N m/A", -3) as "mN·m/A"; a power of ten instead for kg..., 1/... and no unit."""
     unit = pretty_unit(unit)
     if not exponent:
         return unit
@@ -101,7 +101,7 @@ def pretty_unit(unit: str) -> str:
 
 
 def percent(value: float | None) -> str:
-    """A percentage with two digits, or two decimals near 100 where the differences lie."""
+    """A percentage with two significant digits, three from 10 on, and two decimals from 90 to 100 (fits)."""
     if value is None or not isfinite(value):
         return UNKNOWN
     if 90 < abs(value) <= 100:
@@ -110,7 +110,7 @@ def percent(value: float | None) -> str:
 
 
 def fixed(value: float | None, decimals: int) -> str:
-    """A number with fixed decimals and a true minus sign; a dash where it is unknown."""
+    """A number with fixed decimals and a true minus sign; a dash if it is unknown."""
     if value is None or not isfinite(value):
         return UNKNOWN
     return f"{value:.{decimals}f}".replace("-", "−")
@@ -124,7 +124,7 @@ def effect_words(effect: str) -> str:
 
 
 def field_words(effect: str, field: str) -> str:
-    """A field without the unit in its name: "time constant" for time_constant_s."""
+    """A parameter of an effect without the unit in its name: "time constant" for time_constant_s."""
     unit = EFFECTS[effect].ranges[field].unit
     suffix = unit.removeprefix("1/").replace(" ", "").replace("^", "").replace("/", "_")
     if field == f"per_{suffix}":

@@ -19,7 +19,7 @@ PACKAGES = ("pmdc_jax", "jax", "diffrax", "equinox", "optimistix", "evosax", "nu
 
 
 def write_page(path: str | Path, template: str, **content: Any) -> None:
-    """Render a template of this folder with `content` and write it, whole or not at all."""
+    """Render a template of this folder with `content`, and write the page atomically."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,  # run and column names come from files
@@ -38,14 +38,14 @@ def write_page(path: str | Path, template: str, **content: Any) -> None:
 
 
 def figure_json(figure: go.Figure) -> Markup:
-    """A figure as JSON that may stand inside a script element."""
+    """A figure as JSON that is safe inside a script element."""
     text = figure.to_json()
-    # "<" occurs only inside strings, where the escape means the same and cannot close the element
+    # in JSON, "<" occurs only inside strings, where the escape is equivalent and cannot close the element
     return Markup((text or "{}").replace("<", "\\u003c"))
 
 
 def _options(text: str) -> Markup:
-    """Plain text with every command-line option in it set as code, never broken over two lines."""
+    """Plain text as HTML with command-line options marked as code, which the style never breaks over two lines."""
     option = r"(--[a-z][\w-]*(?: \w+=\w+| [A-Z]+\b)?)"
     return Markup(re.sub(option, r"<code>\1</code>", str(escape(text))))
 

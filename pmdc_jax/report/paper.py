@@ -1,4 +1,4 @@
-"""The paper beside ours: terminal tables, JSON, one HTML page."""
+"""The report of the reproduced paper: terminal tables, JSON, one HTML page."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COLOURS = (RESIDUAL, SIMULATED, INPUT)
 
 
 def table_1(paper: Paper) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows: each parameter as printed, recovered, and its error."""
+    """Headings and rows of Table 1: each parameter as printed, and as recovered by each method with its error."""
     headings = ["", "Printed"]
     for one in paper.recovered:
         headings += [one.method, "error [%]"]
@@ -61,7 +61,7 @@ def _effort_row(name: str, paper: Paper, shown: Callable[[Recovered], str]) -> l
 
 
 def table_2(paper: Paper) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows: overshoot and settling in four columns each."""
+    """Headings and rows of Table 2: settling and overshoot of each controller, with the physical limits beside them."""
     headings = [
         "",
         "Printed",
@@ -97,7 +97,7 @@ def table_2(paper: Paper) -> tuple[list[str], list[list[str]]]:
 
 
 def remarks(paper: Paper) -> list[str]:
-    """Where the paper cannot be right, with the number."""
+    """Errors and impossible results in the paper, with the numbers that show them."""
     return [
         f"{VOLTAGE:g} V holds {paper.reach:.1f} rad/s: the set point of {SETPOINT:g} rad/s is beyond it, for any"
         " controller.",
@@ -130,7 +130,7 @@ def paper_tables(paper: Paper) -> RenderableType:
 
 
 def paper_json(paper: Paper) -> dict[str, Any]:
-    """All numbers as plain dictionaries."""
+    """All numbers as plain dictionaries, for JSON."""
     return {
         "table_1": {
             one.method: {
@@ -167,7 +167,7 @@ def _as_printed(paper: Paper, kind: str) -> dict[str, float] | None:
 
 
 def write_paper(paper: Paper, path: str | Path) -> None:
-    """Write everything to one self-contained HTML file."""
+    """Write tables, figures and remarks to one self-contained HTML file."""
     steps = f"0 to {SETPOINT:g}, then to {LOWER_SETPOINT:g} rad/s"
     figures = [
         ("Fig. 4", "Best fitness against generations", fitness_figure(paper.recovered)),
@@ -190,7 +190,7 @@ def write_paper(paper: Paper, path: str | Path) -> None:
 
 
 def fitness_figure(recovered: tuple[Recovered, ...]) -> go.Figure:
-    """Fig. 4."""
+    """Fig. 4: the best fitness of each method over the generations."""
     figure = go.Figure()
     for one, colour in zip(recovered, COLOURS, strict=False):
         figure.add_trace(
@@ -205,7 +205,7 @@ def fitness_figure(recovered: tuple[Recovered, ...]) -> go.Figure:
 
 
 def errors_figure(paper: Paper, row: int) -> go.Figure:
-    """Figs 5 and 6: `row` 0 for speed, 1 for current."""
+    """Figs 5 and 6: error of the steady speed (`row` 0) or current (`row` 1) over the load torque."""
     figure = go.Figure()
     for one, colour in zip(paper.recovered, COLOURS, strict=False):
         errors = load_errors(one.motor)[row]
@@ -219,7 +219,7 @@ def errors_figure(paper: Paper, row: int) -> go.Figure:
 
 
 def steps_figure(paper: Paper) -> go.Figure:
-    """Figs 7 and 8 with the voltages that bring them about."""
+    """Figs 7 and 8: speed over time, and below it the voltage that produces it."""
     figure = make_subplots(
         rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[1.0, 0.5]
     )
@@ -238,7 +238,7 @@ def steps_figure(paper: Paper) -> go.Figure:
             figure.add_trace(go.Scatter(**shared, y=printed.speed, line=thin), row=1, col=1)
     for level in (SETPOINT, LOWER_SETPOINT):
         line = {"color": MEASURED, "width": 1, "dash": "dash"}
-        # plotly's annotation of `row` knows only "all"
+        # the type annotation of `row` in plotly allows only "all"
         figure.add_hline(y=level, line=line, row=1)  # pyright: ignore[reportArgumentType]
     figure.update_yaxes(title_text="speed<br>[rad/s]", row=1, col=1)
     figure.update_yaxes(title_text="voltage<br>[V]", row=2, col=1)

@@ -1,4 +1,4 @@
-"""The result in plain English: what was found, how well it holds, what the logs cannot tell."""
+"""The result of an identification in sentences: what was found, how well it fits, and what remains unidentified."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ STATUS_WORDS = {
     "not_identifiable": "not identifiable",
 }
 MODEL_ASSUMPTION = "All errors presume that the motor has nothing that the model lacks: `pmdc diagnose` tests that."
-# a residual up to this multiple of the noise is called noise: RMS of few samples scatter as much
+# an RMS residual up to this multiple of the noise counts as noise: the RMS of few samples scatters as much
 MAX_NOISE_RATIO = 1.25
 
 
 def status_word(status: str) -> str:
-    """The status as it is printed everywhere."""
+    """The status as printed in all reports."""
     return STATUS_WORDS.get(status, status.replace("_", " "))
 
 
 def role_word(role: Role) -> str:
-    """What a run was for, as it is printed everywhere."""
+    """The role of a run as printed in all reports."""
     return "hold-out" if role == "holdout" else "training"
 
 
@@ -64,7 +64,7 @@ def cautions(identification: Identification) -> list[str]:
 
 
 def runs_in_order(identification: Identification) -> list[tuple[str, RunFit]]:
-    """The runs, the hold-outs first: they are the test, the others only the lesson."""
+    """The runs, hold-outs first, because they are what tests the fit."""
     return sorted(identification.fit.items(), key=lambda item: item[1].role != "holdout")
 
 
@@ -139,7 +139,7 @@ class _Channel(NamedTuple):
 
 
 def _channels(fit: RunFit, noise: Mapping[str, float | None]) -> list[_Channel]:
-    """What the run holds of speed and current."""
+    """Residual, fit and noise of speed and current, as far as the run has them."""
     channels = []
     if fit.speed_rmse is not None:
         one = ("speed", fit.speed_rmse, fit.speed_fit_percent, "rad/s", noise.get("speed_rad_s"))
@@ -151,7 +151,7 @@ def _channels(fit: RunFit, noise: Mapping[str, float | None]) -> list[_Channel]:
 
 
 def _misfit(fit: RunFit, noise: Mapping[str, float | None]) -> float:
-    """Residuals in units of the noise, added up over the channels, to find the worst run."""
+    """Residuals in units of the noise, summed over the channels, to find the worst run."""
     return sum(one.rmse / (one.noise or 1.0) for one in _channels(fit, noise))
 
 

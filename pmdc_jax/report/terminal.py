@@ -20,32 +20,32 @@ from .summary import role_word, runs_in_order, status_word, summary
 
 STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
 SEVERITY_STYLES = {"error": "red", "warning": "yellow"}
-# Seconds after which work that no terminal shows says what it does
+# Least seconds between progress lines where standard error is no terminal
 SILENCE = 15.0
-PIPE_WIDTH = 100  # rich would fold tables at 80 columns where there is no terminal
+PIPE_WIDTH = 100  # without a terminal, rich would fold tables at 80 columns
 
 
 def print_identification(identification: Identification) -> None:
-    """Summary, parameters and fits on standard output."""
+    """Print summary, parameters and fits to standard output."""
     print_tables(identification_tables(identification))
 
 
 def print_tables(tables: RenderableType) -> None:
-    """Tables and sentences on standard output."""
+    """Print tables and sentences to standard output."""
     console_for(stderr=False).print(tables)
 
 
 def print_messages(messages: Iterable[str]) -> None:
-    """Remarks on standard error."""
+    """Print remarks to standard error."""
     console = console_for(stderr=True)
     for message in messages:
         console.print(Text(f"note: {message}"), soft_wrap=True)
 
 
 def print_findings(identification: Identification) -> None:
-    """What the data checks found, and remarks of the identification, on standard error."""
+    """Print findings of the data checks, and remarks of the identification, to standard error."""
     console = console_for(stderr=True)
-    runs: dict[Finding, list[str]] = {}  # what is the same in several is told once
+    runs: dict[Finding, list[str]] = {}  # a finding common to several runs is printed once
     for finding in identification.findings:
         runs.setdefault(evolve(finding, run=""), []).append(finding.run)
     for finding, names in runs.items():
@@ -65,7 +65,7 @@ def identification_tables(identification: Identification) -> RenderableType:
 
 @contextmanager
 def progress() -> Iterator[ReportProgress]:
-    """A live line on standard error saying what goes on; where that is no terminal, a line of it now and then."""
+    """A live progress line on standard error; if that is no terminal, a line at most every `SILENCE` seconds."""
     console = console_for(stderr=True)
     if not console.is_terminal:
         yield _now_and_then(console)
@@ -110,7 +110,7 @@ def parameter_table(identification: Identification) -> Table:
 
 
 def status_text(estimate: Estimate) -> Text:
-    """The status in its colour."""
+    """The status, coloured."""
     return Text(status_word(estimate.status), STATUS_STYLES.get(estimate.status, ""))
 
 
@@ -138,10 +138,10 @@ def plain_table(
     left: Sequence[int] = (0,),
     first_wraps: OverflowMethod | None = None,
 ) -> Table:
-    """A table without lines.
+    """A table without rules.
 
-    **Arguments**: `left`, numbers of the columns that are flush left; `first_wraps`, what a narrow terminal does to a
-    word too long for the first column, whose cells it wraps; None where it wraps no column, and shortens all.
+    **Arguments**: `left`, indices of the left-aligned columns; `first_wraps`, what to do with words too long for the
+    first column, whose cells then wrap on a narrow terminal; None if they do not wrap. Other columns are shortened.
     """
     table = Table(
         title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0)
@@ -149,7 +149,7 @@ def plain_table(
     for number, heading in enumerate(headings):
         wraps = first_wraps if number == 0 else None
         table.add_column(
-            Text(heading),  # not markup: units stand in brackets
+            Text(heading),  # not markup: headings may have units in brackets
             justify="left" if number in left else "right",
             no_wrap=wraps is None,
             overflow=wraps or "ellipsis",
@@ -160,7 +160,7 @@ def plain_table(
 
 
 def console_for(stderr: bool) -> Console:
-    """Standard output or standard error, wide enough where it is a pipe."""
+    """A console on standard output or standard error, `PIPE_WIDTH` wide if that is no terminal."""
     console = Console(stderr=stderr, highlight=False)
     return (
         console

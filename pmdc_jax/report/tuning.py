@@ -1,4 +1,4 @@
-"""A tuning made readable: sentences, terminal tables, JSON, and one HTML page."""
+"""The report of a tuning: sentences, terminal tables, JSON, and one HTML page."""
 
 from __future__ import annotations
 
@@ -25,11 +25,10 @@ COMPARISON_HEADINGS = (
     "Settling\np95 [ms]",
     "Overshoot\np95 [%]",
 )
-# by the name of the controller, for the report of the paper
 
 
 def tuning_json(tuning: Tuning) -> dict[str, Any]:
-    """A tuning after the contract, as plain dictionaries, finite numbers and None."""
+    """A tuning as plain dictionaries, lists, finite numbers and None, for JSON."""
     content = law_content(tuning.law)
     limits = content.pop("limits")
     content.pop("format")
@@ -77,7 +76,7 @@ def _robust_json(robust: Robustness | None) -> dict[str, Any] | None:
 
 
 def summary(tuning: Tuning) -> list[str]:
-    """The sentences at the top, the most important first."""
+    """The sentences at the top of the report, the most important first."""
     sentences = (
         _step_sentence(tuning),
         _load_sentence(tuning),
@@ -157,7 +156,7 @@ def _time(seconds: float | None) -> str:
 
 
 def tuning_tables(tuning: Tuning) -> RenderableType:
-    """Gains and the comparison, and what they mean."""
+    """Gains, comparison and summary for the terminal."""
     gains = plain_table(tuning.controller.label, GAIN_HEADINGS, gain_rows(tuning))
     compared = plain_table("Step from rest", ("", *COMPARISON_HEADINGS), comparison(tuning))
     sentences = [Text(sentence) for sentence in summary(tuning)]
@@ -173,7 +172,7 @@ def gain_rows(tuning: Tuning) -> list[tuple[str, str, str]]:
 
 
 def comparison(tuning: Tuning) -> list[tuple[str, ...]]:
-    """Ours, the textbook's and the limit, a row each."""
+    """A row for each candidate (tuned, and textbook rule if any), and one for the physical limit."""
     fastest = tuning.fastest_possible_settling
     last = ("fastest possible", significant(1e3 * fastest, 4), "1", *(UNKNOWN,) * 4)
     return [*(_row(one, fastest) for one in tuning.candidates), last]
@@ -220,7 +219,7 @@ def write_tuning_report(tuning: Tuning, path: str | Path) -> None:
 
 
 def _tiles(tuning: Tuning) -> list[tuple[str, str, str]]:
-    """The figures at the top: label, number and note of each."""
+    """Label, number and note of each tile at the top of the report."""
     settling, overshoot = tuning.metrics["SettlingTime"], tuning.metrics["Overshoot"]
     ratio = None if settling is None else settling / tuning.fastest_possible_settling
     tiles = [

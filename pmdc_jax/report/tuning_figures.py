@@ -1,4 +1,4 @@
-"""Plotly figures of a tuning: the loop over time, and the motors it might be."""
+"""Plotly figures of a tuning: the loop over time, and its spread over the drawn motors."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from ..control.objective import SECOND_SETPOINT
 from ..control.tuning import Tuning
 from .figures import INPUT, MEASURED, RESIDUAL, SIMULATED, style
 
-# rows of the figure of the loop
+# rows of the loop figure
 SPEED = 1
 VOLTAGE = 2
 CURRENT = 3
 AXIS_TITLES = {SPEED: "speed<br>[rad/s]", VOLTAGE: "voltage<br>[V]", CURRENT: "current<br>[A]"}
 HEIGHTS = [1.0, 0.6, 0.6]
 
-SPREAD_COLOUR = "rgba(163,176,192,0.35)"  # MEASURED, seen through
+SPREAD_COLOUR = "rgba(163,176,192,0.35)"  # MEASURED, translucent
 DOTTED = {"color": RESIDUAL, "width": 0.8, "dash": "dot"}
 DASHED = {"color": RESIDUAL, "width": 1, "dash": "dash"}
 
-Traces = Iterator[tuple[int, go.Scatter]]  # each with its row
+Traces = Iterator[tuple[int, go.Scatter]]  # each trace with its row
 
 
 def loop_figure(tuning: Tuning) -> go.Figure:
-    """Speed, voltage and current over time: the step, then the load, then the second step."""
+    """Speed, voltage and current over time: the step, the load step, and the second step under load."""
     figure = make_subplots(
         rows=len(HEIGHTS), cols=1, shared_xaxes=True, vertical_spacing=0.04, row_heights=HEIGHTS
     )
@@ -47,7 +47,7 @@ def loop_figure(tuning: Tuning) -> go.Figure:
 
 
 def _spread_traces(tuning: Tuning) -> Traces:
-    """Between which speeds nine of ten of the drawn motors run."""
+    """The band from the 5 % to the 95 % quantile of the speeds of the drawn motors."""
     if tuning.bundle is None:
         return
     instants = _milliseconds(tuning)
@@ -60,7 +60,7 @@ def _spread_traces(tuning: Tuning) -> Traces:
 
 
 def _setpoint_traces(tuning: Tuning) -> Traces:
-    """The set point and the band about it, which is as wide as the step was."""
+    """The set point and the 2 % band about it; its width is a share of the set point."""
     end, second = _milliseconds(tuning)[-1], 2e3 * tuning.load_from
     corners = np.array([0.0, second, second, end])
     share = np.array([1.0, 1.0, SECOND_SETPOINT, SECOND_SETPOINT])
@@ -71,7 +71,7 @@ def _setpoint_traces(tuning: Tuning) -> Traces:
 
 
 def _response_traces(tuning: Tuning) -> Traces:
-    """The nominal motor."""
+    """Speed, voltage and current of the nominal motor."""
     time, response = _milliseconds(tuning).astype(np.float32), tuning.response
     line = {"color": SIMULATED, "width": 1.6}
     yield SPEED, _line("speed", time, response.speed, line, in_legend=True)
@@ -81,7 +81,7 @@ def _response_traces(tuning: Tuning) -> Traces:
 
 
 def _limit_traces(tuning: Tuning) -> Traces:
-    """The largest voltage and current there may be."""
+    """The voltage limit, and the current limit if there is one."""
     ends, hardware = np.array([0.0, _milliseconds(tuning)[-1]]), tuning.hardware
     for row, limit in ((VOLTAGE, hardware.voltage_limit), (CURRENT, hardware.current_limit)):
         if limit is not None:
@@ -89,7 +89,7 @@ def _limit_traces(tuning: Tuning) -> Traces:
 
 
 def _mark(figure: go.Figure, moment: float, label: str) -> None:
-    """A vertical line at a moment, s, and what it is."""
+    """Draw a labelled vertical line at the time `moment`, s."""
     at = 1e3 * moment
     figure.add_vline(x=at, line=DASHED)
     figure.add_annotation(
@@ -98,7 +98,7 @@ def _mark(figure: go.Figure, moment: float, label: str) -> None:
 
 
 def _milliseconds(tuning: Tuning) -> np.ndarray:
-    """The instants of the response."""
+    """The sample times of the response, ms."""
     return 1e3 * np.asarray(tuning.response.time)
 
 
@@ -122,7 +122,7 @@ def _line(
 
 
 def robust_figure(tuning: Tuning) -> go.Figure:
-    """Overshoot against settling time of every drawn motor, ours beside the textbook's."""
+    """Overshoot against settling time of every drawn motor that settles, for the tuned and the textbook controller."""
     figure = go.Figure()
     for one, colour in zip(tuning.candidates, (SIMULATED, RESIDUAL), strict=False):
         if one.robust is None:

@@ -1,4 +1,4 @@
-"""Named columns of numbers in CSV, Parquet and MAT files, before anyone asks what they mean."""
+"""Named columns of numbers in CSV, Parquet and MAT files, not yet interpreted."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ class Table(Protocol):
     headers: tuple[str, ...]
 
     def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
-        """These columns as float64 of shape (rows,); NaN where a cell is empty."""
+        """The columns with these headers as float64 of shape (rows,), NaN where a cell is empty."""
         ...
 
     def place(self, row: int) -> str:
-        """Where an editor shows this row (counted from 0), such as "line 17"."""
+        """The place of a row, counted from 0, for messages, such as "line 17" of a text file."""
         ...
 
 
 def open_table(path: Path) -> Table:
     """Open a CSV, Parquet or MAT file by its suffix.
 
-    **Raises**: `InputError` if it cannot be read as such.
+    **Raises**: `InputError` if it is missing, empty, of another kind, or cannot be read.
     """
     kinds = dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm"), CsvTable)
     kinds |= {".parquet": ParquetTable, ".pq": ParquetTable, ".mat": MatTable}

@@ -1,4 +1,4 @@
-"""What cells hold: plain numbers, or dates with times."""
+"""Conversion of cells: plain numbers, and dates with times."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ if TYPE_CHECKING:
     import polars as pl
 
 NUMBERS_ONLY = "Recordings hold plain numbers; leave a cell empty where a sample is missing"
-# Numbers that a spreadsheet shows with a sign between thousands, by that sign; only where the decimal sign tells it
+# Numbers with a thousands separator, by that separator; without a decimal separator they would be ambiguous
 GROUPED = {",": r"^[+-]?\d{1,3}(,\d{3})+\.\d*$", ".": r"^[+-]?\d{1,3}(\.\d{3})+,\d*$"}
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell holds one plain number, with a point or a comma."""
+    """Whether a cell holds one plain number, with a decimal point or comma."""
     try:
         float(cell.replace(",", "."))
     except ValueError:
@@ -22,7 +22,7 @@ def is_number(cell: str) -> bool:
 
 
 def ungrouped(text: pl.Series) -> pl.Series:
-    """Numbers without a sign between thousands."""
+    """Texts of numbers without thousands separators."""
     for sign, pattern in GROUPED.items():
         grouped = text.str.contains(pattern).fill_null(False)
         text = text.str.replace_all(sign, "", literal=True).zip_with(grouped, text)
@@ -30,7 +30,7 @@ def ungrouped(text: pl.Series) -> pl.Series:
 
 
 def as_dates(text: pl.Series) -> pl.Series | None:
-    """Dates with times, None if a text is none."""
+    """Texts converted to dates with times; None if one of them is not a date."""
     import polars as pl
 
     try:
@@ -40,6 +40,6 @@ def as_dates(text: pl.Series) -> pl.Series | None:
 
 
 def seconds_since_first(dates: pl.Series) -> pl.Series:
-    """Seconds since the first of some dates with times."""
+    """Dates with times as seconds since the first of them."""
     first = dates.drop_nulls().first()
     return (dates - first).dt.cast_time_unit("ns").dt.total_nanoseconds() / 1e9

@@ -1,4 +1,4 @@
-"""Text with a header line, separated by comma, semicolon or tab."""
+"""CSV files: text with a header line, separated by comma, semicolon or tab."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ MISSING = ["NA", "N/A", "n/a", "null", "NULL", "None"]
 
 
 class CsvTable:
-    """Text with a header line; separated by comma, semicolon or tab.
+    """A text file with a header line, separated by comma, semicolon or tab.
 
-    Lines that begin with # and empty ones are skipped, and what an instrument writes before the header. Numbers may
-    have a decimal comma unless the comma separates. A second line of units belongs to the header. Dates with times are
-    read as seconds since the first of them.
+    Skipped are empty lines, lines that begin with #, and a preamble of the instrument before the header. Numbers may
+    have a decimal comma unless the comma is the separator. A line of units below the header is read as part of it.
+    Dates with times are read as seconds since the first of them.
     """
 
     def __init__(self, path: Path) -> None:
@@ -40,9 +40,9 @@ class CsvTable:
         wanted = [str(self.headers.index(header)) for header in headers]
         frame = self._frame(wanted)
         if frame[str(len(self.headers) - 1)].null_count():
-            self._refuse_ragged()  # polars fills short lines without a word
+            self._refuse_ragged()  # polars silently fills short lines with nulls
         if frame.height and all(frame[i].null_count() for i in wanted):
-            # a spreadsheet ends with lines of empty cells
+            # spreadsheets may append lines of empty cells
             self._kept = np.array([bool(line.strip(b" \t\r,;")) for _, line in self._lines()])
             if len(self._kept) != frame.height:
                 what = "it breaks lines inside quotes"
@@ -63,7 +63,7 @@ class CsvTable:
         return self._raw[self._header.end :].rstrip(b"\r\n")
 
     def _frame(self, wanted: Sequence[str]) -> pl.DataFrame:
-        """Wanted columns as numbers and the last one of any kind, empty cells null."""
+        """The wanted columns as numbers, and the last column, of any type, to detect short lines; null if empty."""
         import polars as pl
 
         last = str(len(self.headers) - 1)
@@ -73,7 +73,7 @@ class CsvTable:
             return self._parse(dict.fromkeys(wanted, pl.Float64), last)
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
             self._refuse_ragged()
-        try:  # padded numbers and other texts, more slowly
+        try:  # padded numbers, dates and the like: slower
             text = self._parse({}, last)
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
             what = f"it cannot be read as a table ({str(error).splitlines()[0]})"
@@ -96,7 +96,7 @@ class CsvTable:
         return frame.select(i for i in schema if i in kinds or i == last or not kinds)
 
     def _numbers(self, text: pl.Series, header: str) -> pl.Series:
-        """What the cells of a column say as numbers: those of a decimal comma, and dates, too."""
+        """A column of text, which may hold decimal commas or dates, as numbers; `InputError` where it holds neither."""
         import polars as pl
 
         text = text.str.strip_chars().replace("", None)
@@ -114,7 +114,7 @@ class CsvTable:
         raise InputError(where, f"'{text[row]}' is not a number", NUMBERS_ONLY)
 
     def _lines(self) -> Iterator[tuple[int, bytes]]:
-        """Number and text of each line that polars makes a row of."""
+        """Number and text of each line that is a row for polars."""
         first = self._raw.count(b"\n", 0, self._header.end) + 1
         for number, line in enumerate(self._body.split(b"\n"), first):
             if not line.startswith(b"#"):
@@ -133,7 +133,7 @@ class CsvTable:
 
 
 def _text(path: Path) -> bytes:
-    """The bytes of a UTF-8 text, without byte order mark and with \\n somewhere."""
+    """The bytes of a UTF-8 text file, without byte order mark; line ends \\r alone become \\n."""
     raw = path.read_bytes()
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(str(path), "it is UTF-16 text", "Save it as UTF-8")

@@ -1,4 +1,4 @@
-"""The header of a CSV file: below what an instrument wrote of itself, above a line of units perhaps."""
+"""The header of a CSV file, which may follow a preamble of the instrument and precede a line of units."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ..errors import InputError
 from .cells import is_number
 from .headers import refuse_duplicates, with_unit
 
-# Lines that an instrument may write before its header
+# Number of lines searched for the header
 PREAMBLE = 200
 
 
 class Header(NamedTuple):
-    """Names of the columns with their units, and the file about them: the rows begin at byte `end`."""
+    """The column names with their units, the line number of the header, and the byte `end` at which the rows begin."""
 
     names: tuple[str, ...]
     line: int
@@ -27,7 +27,7 @@ class Header(NamedTuple):
 
 
 class _Line(NamedTuple):
-    """A line of a file and where it stands: its number from 1, and the bytes that it and the next begin with."""
+    """A line of a file: its text, its number from 1, and the bytes at which it and the next line begin."""
 
     text: str
     number: int
@@ -36,9 +36,11 @@ class _Line(NamedTuple):
 
 
 def find_header(raw: bytes, path: Path) -> Header:
-    """What the header of a CSV file says, and where it stands.
+    """Find and read the header of a CSV file.
 
-    **Raises**: `InputError` where there is none, or where it names two columns alike.
+    **Arguments**: `raw`, the content of the file; `path`, for messages.
+
+    **Raises**: `InputError` if there is none, or if two columns have the same name.
     """
     line = _past_preamble(raw, _first_line(raw, path))
     separator = _separator(line.text)
@@ -50,16 +52,21 @@ def find_header(raw: bytes, path: Path) -> Header:
 
 
 def fields_of(line: str, separator: str) -> list[str]:
-    """The cells of a line, out of their quotes."""
+    """The cells of a line, without quotes."""
     line = line.rstrip("\r\n")
     try:
         return next(csv.reader([line], delimiter=separator), [])
-    except csv.Error:  # a field longer than any number
+    except csv.Error:  # a field longer than the limit of the module, hence no number
         return line.split(separator)
 
 
 def _first_line(raw: bytes, path: Path) -> _Line:
-    """The first line that is no comment: the header, unless an instrument wrote of itself before."""
+    """The first line that is neither empty nor a comment: the header, or the first line of a preamble.
+
+    A comment directly above numbers is the header if it has as many commas.
+
+    **Raises**: `InputError` if numbers come first without one, or there is no such line.
+    """
     above = _Line("", 0, 0, 0)
     for line in _lines(raw):
         if line.text.strip() and not line.text.startswith(("#", "sep=")):
@@ -74,8 +81,10 @@ def _first_line(raw: bytes, path: Path) -> _Line:
 
 
 def _past_preamble(raw: bytes, first: _Line) -> _Line:
-    """The header: the first line, or, where its fields are not as many as the numbers have that follow, the last line
-    before these that has as many, for an instrument wrote of itself before."""
+    """The header: the last line above the numbers with as many fields as these have, preferably without a number.
+
+    It is the `first` line if that has as many fields, or if no line has.
+    """
     texts: list[_Line] = []
     for line in islice(_lines(raw, first), PREAMBLE):
         if not line.text.strip() or not _is_numbers(line.text):
@@ -86,14 +95,14 @@ def _past_preamble(raw: bytes, first: _Line) -> _Line:
         if count < 2 or len(fields_of(first.text, separator)) == count:
             return first
         alike = [text for text in texts if len(fields_of(text.text, separator)) == count]
-        # a row with a remark in it is none of numbers, and no header either
+        # a row of data with a remark is not all numbers, but not a header either
         words = [text for text in alike if not _has_number(fields_of(text.text, separator))]
         return (words or alike or [first])[-1]
     return first
 
 
 def _find_units(raw: bytes, start: int, separator: str, count: int) -> tuple[list[str] | None, int]:
-    """The units in the line at `start`, if it holds nothing else, and the byte where the rows begin."""
+    """The units in the line at byte `start`, None if it is no line of units, and the byte at which the rows begin."""
     line = _line_at(raw, start, 0)
     fields = [field.strip() for field in fields_of(line.text, separator)]
     if len(fields) != count or _has_number(fields):
@@ -103,7 +112,7 @@ def _find_units(raw: bytes, start: int, separator: str, count: int) -> tuple[lis
 
 
 def _lines(raw: bytes, after: _Line | None = None) -> Iterator[_Line]:
-    """All lines, or those after one."""
+    """All lines, or those after the line `after`."""
     start, number = (after.end, after.number) if after else (0, 0)
     while start < len(raw):
         number += 1
@@ -118,18 +127,18 @@ def _line_at(raw: bytes, start: int, number: int) -> _Line:
 
 
 def _past_empty_lines(raw: bytes, start: int) -> int:
-    """The next byte that does not end a line; polars would take an empty first line for a column."""
+    """The next byte that is no line end; polars would misread an empty first line as a column."""
     found = re.compile(rb"[\r\n]*").match(raw, start)
     return found.end() if found else start
 
 
 def _separator(line: str) -> str:
-    """What separates the fields of a line: a tab, else a semicolon, else a comma."""
+    """The separator of the fields of a line: a tab, else a semicolon, else a comma."""
     return next((s for s in "\t;" if s in line), ",")
 
 
 def _is_numbers(line: str) -> bool:
-    """Whether a line holds nothing but numbers, in quotes perhaps, and empty cells."""
+    """Whether a line holds nothing but numbers, quoted or not, and empty cells."""
     cells = " ".join(fields_of(line, _separator(line))).replace(",", " ").split()
     return all(map(is_number, cells))
 

@@ -1,4 +1,4 @@
-"""MATLAB files: vectors, also those inside structures and matrices."""
+"""MATLAB files: vectors, including those in structures and matrices."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from .headers import refuse_duplicates, with_unit
 
 
 class MatTable:
-    """Vectors of a MATLAB file, also those inside structures and matrices: a header is then the path to it, or the name
-    that a signal of Simulink or ControlDesk has beside its numbers."""
+    """The vectors of a MATLAB file, including those in structures and matrices.
+
+    The header of a vector is the path to it in the file, or the name of the signal in structures saved by Simulink or
+    ControlDesk.
+    """
 
     def __init__(self, path: Path) -> None:
         from scipy.io import loadmat
@@ -25,7 +28,7 @@ class MatTable:
         except NotImplementedError:
             what, mend = "it is a MATLAB v7.3 (HDF5) file", "Save it in MATLAB with the option -v7"
             raise InputError(str(path), what, mend) from None
-        except Exception:  # a damaged file makes scipy raise anything, down to UnboundLocalError
+        except Exception:  # damaged files make scipy raise many kinds, even UnboundLocalError
             what, mend = "it is no MATLAB file, or damaged", "Save it in MATLAB with the option -v7"
             raise InputError(str(path), what, mend) from None
         vectors = list[tuple[str, np.ndarray]]()
@@ -56,7 +59,7 @@ class MatTable:
 
 
 def _vectors(value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
-    """Header and numbers of every vector in what MATLAB saved under this path."""
+    """Header and numbers of every vector in the `value` at this path; matrices are split into their longer vectors."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
             yield from _vectors(inner, _signal(value, name, path) or f"{path}.{name}".strip("."))
@@ -68,23 +71,23 @@ def _vectors(value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
             yield path, value
         elif value.ndim == 2 and value.shape[0] >= value.shape[1]:
             yield from ((f"{path}(:,{k})", column) for k, column in enumerate(value.T, 1))
-        elif value.ndim == 2:  # as Simulink's block "To File" writes it
+        elif value.ndim == 2:  # as Simulink's block "To File" saves it
             yield from ((f"{path}({k},:)", row) for k, row in enumerate(value, 1))
 
 
 def _signal(structure: Mapping[str, Any], field: str, path: str) -> str | None:
-    """What the numbers in a field are called by the structure around them, as in Simulink's "structure with time" and
-    in files of ControlDesk; None where it says nothing."""
+    """The name that a structure gives to the numbers in its `field`, as Simulink's "structure with time" and files of
+    ControlDesk do; None without one."""
     naming = {"values": "label", "Data": "Name"}.get(field)
     if naming is None or naming not in structure:
         return None
     name, unit = structure[naming], structure.get("Unit")
-    if not (isinstance(name, str) and name):  # Simulink's label may be empty
+    if not (isinstance(name, str) and name):  # Simulink's label may be empty: the path stands in
         return path.removesuffix(".signals")
     return with_unit(name, unit) if isinstance(unit, str) else name
 
 
 def _same_time(header: str, vector: np.ndarray, other: str, found: np.ndarray) -> bool:
-    """Whether this is the time of another structure, which Simulink saves with every signal."""
+    """Whether this is a copy of the time vector `found`: Simulink saves one with every signal."""
     leaves = {name.rpartition(".")[2] for name in (header, other)}
     return leaves == {"time"} and np.array_equal(vector, found)
