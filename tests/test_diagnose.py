@@ -115,11 +115,11 @@ class Undecided(StepwiseSelection):
         assert self.trials < 5
         return [self.other if current is self.one else self.one]
 
-    assess = staticmethod(lambda model: Mock(spec=Assessment, unexplained=np.inf, left=1.0))
+    assess = staticmethod(lambda model: Mock(spec=Assessment, unexplained=np.inf, p_value=1.0))
     _by_unfiltered_misfit = staticmethod(lambda *models: None)
     _by_likeliest_effect = staticmethod(lambda *models: None)
     _best = staticmethod(lambda tried, white: tried[0])
-    _eliminated = staticmethod(lambda model: model)
+    elimination = Mock(reduced=lambda model: model)
     _explains_more_than_a_formula = staticmethod(lambda *models: True)
     _equivalent_swaps = staticmethod(lambda *models: [])
     _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))
@@ -166,7 +166,7 @@ def test_of_what_promises_little_beside_a_curve_that_is_kept_which_settles_it(se
         "brush_voltage_drop": 5.0,
     }
     found = promises_of(gains, unexplained=np.inf)
-    found.left, found.is_formula = 0.0, lambda model: False
+    found.p_value, found.is_formula, found.is_misread = 0.0, lambda model: False, lambda: False
     selection = StepwiseSelection.__new__(StepwiseSelection)
     tried = Mock(spec=Model, effects=("stribeck_friction",))
     selection.refits = Mock(with_signal=Mock(return_value=tried))
@@ -180,8 +180,8 @@ def test_of_what_promises_little_beside_a_curve_that_is_kept_which_settles_it(se
     assert asked == list(gains)[:2]
 
 
-@pytest.mark.parametrize(("count", "left", "asked"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])
-def test_a_full_set_exchanges_what_acts_in_the_same_equation(monkeypatch, count, left, asked):
+@pytest.mark.parametrize(("count", "p_value", "asked"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])
+def test_a_full_set_exchanges_what_acts_in_the_same_equation(monkeypatch, count, p_value, asked):
     """Dry friction, a delay and an offset, where a peak of friction is what promises most."""
     effects = ("asymmetric_friction", "speed_sensor_delay", "current_sensor_offset")[:count]
     peak = Mock(spec=Signal, candidate=Mock(effect="stribeck_friction"), gain=1.0)
@@ -194,7 +194,7 @@ def test_a_full_set_exchanges_what_acts_in_the_same_equation(monkeypatch, count,
     )
     selection._better = lambda current, found, tried: tried[0] if tried else None
     found = Mock(
-        spec=Assessment, left=left, is_trace=lambda model: False, screen=Mock(white="white")
+        spec=Assessment, p_value=p_value, is_trace=lambda model: False, screen=Mock(white="white")
     )
     current = Mock(spec=Model, effects=effects)
     better = selection._in_exchange(current, found)

@@ -98,6 +98,23 @@ def test_nothing_is_found_where_nothing_is_missing(noise):
     assert 0 < by_name["coulomb_friction"].amplitude < 0.05
 
 
+@pytest.mark.parametrize("periods", [1, pytest.param(14, marks=pytest.mark.slow)])
+def test_a_swinging_speed_reading_is_no_torque(periods):
+    """An encoder off its centre, and the ripple of a tachometer, swing with the angle as cogging does."""
+    runs = []
+    for run in recorded(vb.BenchMotor(**PAPER), 6, NOISE):
+        angle = np.append(0, np.cumsum((run.speed[1:] + run.speed[:-1]) / 2 * np.diff(run.time)))
+        swinging = run.speed * (1 + 0.02 * np.cos(periods * angle))
+        runs.append(attrs.evolve(run, speed=swinging))
+    found = diagnose(runs)
+    assert found.verdict == "not_in_library"
+    assert found.effects == ()
+    clearest = found.curves[0]
+    assert (clearest.equation, clearest.variable) == ("sensor", "angle")
+    assert 2 * np.pi / clearest.x[-1] == pytest.approx(periods)
+    assert np.max(np.abs(clearest.value)) == pytest.approx(0.02, rel=0.05)
+
+
 @pytest.mark.slow
 def test_a_voltage_recorded_by_ten_bits_hides_no_dead_zone():
     """Levels are off by half a bit each, which lasts as long as they do; the motor feels the real ones."""

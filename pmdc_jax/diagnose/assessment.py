@@ -47,7 +47,7 @@ class Assessment(NamedTuple):
     screen: Screen
     of_candidates: list[Signal]  # the most significant first
     of_curves: list[Signal]  # the most significant first
-    left: float  # p-value of it if nothing more were missing
+    p_value: float  # of it if nothing more were missing
     # squared white residuals of the motor without effects, less those of the model
     explained: float
     removed: float  # the same of the unfiltered misfit, `Fit.fitness`
@@ -70,7 +70,7 @@ class Assessment(NamedTuple):
 
     def asks_for_more(self) -> bool:
         """Whether more is missing, and a single candidate would explain much of it."""
-        return bool(self.left < ALARM and self.by_one_more > MUCH_OF_IT)
+        return bool(self.p_value < ALARM and self.by_one_more > MUCH_OF_IT)
 
     def is_another(self) -> bool:
         """Whether what is left is clearly one more effect, and no model-form error.
@@ -137,7 +137,7 @@ class Assessment(NamedTuple):
 
         Never beside a harder form: what gear teeth leave, which meet at unpredictable times, can look like anything.
         """
-        if _is_hard(model) or self.left >= ALARM or self.by_one_more < MOST_OF_IT:
+        if _is_hard(model) or self.p_value >= ALARM or self.by_one_more < MOST_OF_IT:
             return False
         best, effect = max(self.of_curves, key=_gain), max(self.of_candidates, key=_gain).candidate
         assert isinstance(best.of, Curve) and effect is not None

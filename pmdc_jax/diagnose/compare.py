@@ -44,12 +44,12 @@ class Comparison:
         """
         least = min(m.fit.fitness for m in models)
         fitted = [
-            self.left(m, white) if m.fit.fitness < FAR * least else Fitted(m, np.inf, np.inf)
+            self.fitted(m, white) if m.fit.fitness < FAR * least else Fitted(m, np.inf, np.inf)
             for m in models
         ]
         return sorted(fitted, key=lambda f: f.criterion)
 
-    def left(self, model: Model, white: Whitener) -> Fitted:
+    def fitted(self, model: Model, white: Whitener) -> Fitted:
         """A model fitted to its residuals whitened by a filter."""
         key = model, white
         if key not in self._fitted:

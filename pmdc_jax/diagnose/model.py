@@ -26,6 +26,8 @@ from ..identify.uncertainty import FLAT
 from ..motor import Motor
 from .response import Path, path_of
 
+# Largest number of effects in a set
+MOST_EFFECTS = 3
 # A model is exact if its residuals are a smaller share of what was measured, as root mean squares
 CLOSE = 1e-4
 

@@ -21,15 +21,15 @@ from ..progress import ReportProgress
 from .assessment import ALARM, HARDER, MUCH_OF_IT, Assessment, chance_of_nothing
 from .candidates import TRIALS
 from .compare import FAR, MARGIN, Comparison, Fitted, plainest
-from .effect_relations import CONTAINS, FULLER, are_rivals, spelt_out
+from .effect_relations import CONTAINS, are_rivals
+from .elimination import BackwardElimination
 from .library import Library
-from .model import Model, final_fit
+from .model import MOST_EFFECTS, Model, final_fit
 from .periodic import Line, line_of
 from .refits import Refits
 from .rivals import chances_without, rivals_of
 from .screen import Screen, Signal, beyond_curves, screen, signals
 from .shortlist import (
-    COMPARABLE,
     SHORTLIST,
     clear,
     effect_of,
@@ -38,8 +38,6 @@ from .shortlist import (
     shortlist,
 )
 
-# Largest number of effects in a set
-MOST = 3
 # Limits of `_leaves_little`, as shares of the squares that the better model takes away. LITTLE applies where an effect
 # was replaced by another form, or where the effects before cannot have left the misfit.
 NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
@@ -48,8 +46,6 @@ NEXT_TO_NOTHING, LITTLE = 0.1, 0.5
 SWALLOWED = 1e-2
 # Least share of the unfiltered squares that a candidate must promise to be tried on the unfiltered misfit
 FORETOLD = 0.05
-# A simpler form may leave at most so many times the unfiltered squares of the richer one
-HARDLY_MORE = 1.5
 # Scale of the misfit (noise variances per output) from which a first-order start may lead a refit astray
 LOST = 10.0
 # The simplest effect that makes a rotor stick, the effect that imitates friction and load together, and that load
@@ -63,11 +59,11 @@ class Naming(NamedTuple):
     rivals: list[Model]
     first: Screen  # evidence against the motor without effects
     last: Screen  # and against the chosen one
-    nothing: float  # p-value of the evidence if nothing were missing
-    left: float  # p-value of what is left if nothing more were missing
+    p_nothing: float  # p-value of the evidence if nothing were missing
+    p_nothing_more: float  # p-value of what is left if nothing more were missing
     explained: bool  # whether what is left may be model-form error of the chosen effects
     # root mean square of the chosen one's residuals beyond all curves, over that of all; 1 if nothing more is missing
-    noise: float
+    noise_share: float
     without: dict[str, float]  # by effect of the chosen: p-value of the data without it
     ended: tuple[Prepared, Fit]  # the last fit of the chosen one
     line: Line | None  # a steady oscillation that the chosen one does not have
@@ -86,6 +82,9 @@ class StepwiseSelection:
         self.instead: dict[str, set[str]] = {}
         # models that a better one has replaced or is to: by different filters, each of two may look like the better one
         self.superseded: set[Model] = set()
+        self.elimination = BackwardElimination(
+            self.refits, self.comparison, self.assess, self._is_new
+        )
 
     def name(self) -> Naming:
         """Add effects while the evidence asks for them; then try other effects in the place of those found."""
@@ -96,7 +95,7 @@ class StepwiseSelection:
             self.superseded.add(current)
         others = self._equivalent_swaps(current, found)
         # however little: what backlash leaves is small beside what a large effect explains
-        if found.left < ALARM:
+        if found.p_value < ALARM:
             others += self._in_harder_form(current, found, set(current.effects))
         return self._naming(self._better(current, found, others) or current)
 
@@ -142,7 +141,7 @@ class StepwiseSelection:
         # by the filter fitted without the clearest signal: one of the current residuals absorbs what is missing
         if plainest(self.comparison.ranked([current, best], found.screen.white)) is current:
             return None
-        return self._eliminated(best)
+        return self.elimination.reduced(best)
 
     def _is_new(self, model: Model | None) -> TypeGuard[Model]:
         """Whether a model exists, is physically possible, and was not superseded by a better one."""
@@ -162,12 +161,12 @@ class StepwiseSelection:
     def _leaves_little(self, current: Model, better: Model) -> bool:
         """Whether a better model leaves nothing significant, or little compared with what it takes away."""
         again = self.assess(better)
-        if again.left >= ALARM:
+        if again.p_value >= ALARM:
             return True
         white, grown = self.comparison.white(better), len(better.effects) > len(current.effects)
         gained = (
-            self.comparison.left(current, white).squares
-            - self.comparison.left(better, white).squares
+            self.comparison.fitted(current, white).squares
+            - self.comparison.fitted(better, white).squares
         )
         share = (
             NEXT_TO_NOTHING if grown and not self.assess(current).is_foreign(current) else LITTLE
@@ -181,8 +180,8 @@ class StepwiseSelection:
         moved far to compensate for two effects. Not tried where model-form error may explain what is left, or a sensor
         of the speed that misreads it.
         """
-        full = len(current.effects) == MOST
-        if full or found.left >= ALARM or found.is_formula(current) or found.is_misread():
+        full = len(current.effects) == MOST_EFFECTS
+        if full or found.p_value >= ALARM or found.is_formula(current) or found.is_misread():
             return None
         if current.effects:
             others = [s for s in clear(found) if effect_of(s) not in current.effects]
@@ -198,8 +197,8 @@ class StepwiseSelection:
         """The current model with one of the effects that promise most on the unfiltered misfit, if that falls by a
         factor of `FAR`: a whitening filter takes for noise what lasts as long as a short run."""
         far = current.fit.fitness / FAR
-        full = len(current.effects) == MOST
-        if full or found.left >= ALARM or far < current.given.problem.outputs:
+        full = len(current.effects) == MOST_EFFECTS
+        if full or found.p_value >= ALARM or far < current.given.problem.outputs:
             return None
         pointed = found.screen._replace(evidence=found.screen.unfiltered)
         least = FORETOLD * found.screen.unfiltered.regress().squares
@@ -209,8 +208,8 @@ class StepwiseSelection:
         return self._better(current, found, better)
 
     def _in_exchange(self, current: Model, found: Assessment) -> Model | None:
-        """A model with `MOST` effects, with the most promising new one in place of one in the same equation."""
-        if len(current.effects) < MOST or found.left >= ALARM or found.is_trace(current):
+        """A model with `MOST_EFFECTS` effects, with the most promising new one in place of one in the same equation."""
+        if len(current.effects) < MOST_EFFECTS or found.p_value >= ALARM or found.is_trace(current):
             return None
         others = [s for s in clear(found) if effect_of(s) not in current.effects]
         if not others:
@@ -237,10 +236,10 @@ class StepwiseSelection:
             rivals=rivals_of(current, found, self.refits, self.comparison),
             first=first.screen,
             last=found.screen,
-            nothing=first.left,
-            left=found.left,
+            p_nothing=first.p_value,
+            p_nothing_more=found.p_value,
             explained=found.is_formula(current),
-            noise=np.sqrt(beyond_curves(found.screen)) if found.left < ALARM else 1.0,
+            noise_share=np.sqrt(beyond_curves(found.screen)) if found.p_value < ALARM else 1.0,
             without=chances_without(current, found.screen.white, self.refits, self.comparison),
             ended=final_fit(current, self.comparison.white(current)),
             line=line_of(current),
@@ -249,7 +248,7 @@ class StepwiseSelection:
     def _trials(self, current: Model, found: Assessment) -> list[Model | None]:
         """The current model with one effect more, or with a richer or harder form of one that it has."""
         here = set(current.effects)
-        if len(here) == MOST:
+        if len(here) == MOST_EFFECTS:
             return []
         if found.is_trace(current):
             foreign = found.is_foreign(current)
@@ -264,7 +263,7 @@ class StepwiseSelection:
             if any(model and model.effects_at_end for model in tried):
                 # not a richer form alone: asymmetric friction, at its bound, is no load larger than friction
                 tried += self._with(current, found, shortlist(current, found, fuller=False))
-        if found.left < ALARM and not here:
+        if found.p_value < ALARM and not here:
             tried += self._searched_with_friction(current, found, tried)
         return tried + harder
 
@@ -276,7 +275,7 @@ class StepwiseSelection:
         if model is None or not model.is_possible:
             return False
         found = self.assess(model)
-        return found.left >= ALARM or found.is_trace(model)
+        return found.p_value >= ALARM or found.is_trace(model)
 
     def _searched_with_friction(
         self, current: Model, found: Assessment, tried: Sequence[Model | None]
@@ -348,14 +347,14 @@ class StepwiseSelection:
         found = screen(model, self.library)
         of_candidates, of_curves = signals(found)
         count = len(found.candidates) + len(found.curves)
-        count *= MOST if model.effects else 1
-        left = 1.0 if model.is_exact else chance_of_nothing(of_candidates, of_curves, count)
+        count *= MOST_EFFECTS if model.effects else 1
+        p_value = 1.0 if model.is_exact else chance_of_nothing(of_candidates, of_curves, count)
         explained = 0.0
         if model.effects:
-            base, mine = (self.comparison.left(m, found.white) for m in (self.base, model))
+            base, mine = (self.comparison.fitted(m, found.white) for m in (self.base, model))
             explained = base.squares - mine.squares
         removed = self.base.fit.fitness - model.fit.fitness
-        return Assessment(found, of_candidates, of_curves, left, explained, removed)
+        return Assessment(found, of_candidates, of_curves, p_value, explained, removed)
 
     def _best(self, tried: Sequence[Model], white: Whitener) -> Model:
         """The best of some refits, compared by the whitening filter of the one with the least squares."""
@@ -375,75 +374,3 @@ class StepwiseSelection:
             its = set(other.model.effects)
             if len(mine - its) == len(its - mine) == 1 and are_rivals(mine, its):
                 self.instead.setdefault(*(mine - its), set()).update(its - mine)
-
-    def _eliminated(self, model: Model) -> Model:
-        """The model after backward elimination: without effects that it does not need, and with simpler forms of
-        effects, alone or with another effect added, where these do as well."""
-        white = self.comparison.white(model)
-        for effect in model.effects[:-1]:
-            smaller = self.refits.without(model, effect, white)
-            if (
-                self._is_new(smaller)
-                and self.comparison.ranked([model, smaller], white)[0].model is smaller
-            ):
-                return self._eliminated(smaller)
-        for effect in model.effects:
-            for simple in self._simpler_forms(effect):
-                simpler = self.refits.in_place(model, white, effect, simple)
-                if self._is_new(simpler) and self._does_as_well(simpler, model):
-                    return self._eliminated(simpler)
-                two = simpler and self._simple_form_with_another(simpler, model, effect)
-                if two and self._is_far_better(two, model, white):
-                    return self._eliminated(two)
-        return model
-
-    def _simpler_forms(self, effect: str) -> list[str]:
-        """The simpler effects that may replace one: contained ones that were begun, and that of which it is fuller."""
-        reduced = {s for s, form in FULLER.items() if form.effect == effect and form.reduced}
-        return sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys() | reduced)
-
-    def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:
-        """A model with a simpler form of a rich effect, and one more effect that promises as much (`COMPARABLE`).
-
-        Stribeck friction is curved like drag, for instance, if viscous friction compensates for the rest.
-        """
-        if len(simpler.effects) == MOST:
-            return None
-        found = self.assess(simpler)
-        promised = {effect_of(s): s for s in clear(found)}
-        enough = COMPARABLE * promised[rich].gain if rich in promised else 0.0
-        here = set(simpler.effects)
-        others = [
-            s
-            for effect, s in promised.items()
-            if effect not in {*model.effects, *CONTAINS}
-            and spelt_out({*here, effect}) != spelt_out(set(model.effects))
-            and s.gain > enough
-        ]
-        best = max(others, key=lambda s: s.gain, default=None)
-        two = best and self.refits.with_signal(simpler, best, found.screen)
-        return two if two and two.is_possible else None
-
-    def _is_far_better(self, two: Model, model: Model, white: Whitener) -> bool:
-        """Whether two effects beat a rich one by `MARGIN` in the criterion, and leave no more unfiltered squares."""
-        if two.fit.fitness > model.fit.fitness:
-            return False
-        criterion = {f.model: f.criterion for f in self.comparison.ranked([two, model], white)}
-        return bool(criterion[two] + MARGIN < criterion[model])
-
-    def _does_as_well(self, simpler: Model, model: Model) -> bool:
-        """Whether a simpler form does as well as the richer one, chosen when another effect may have been missing.
-
-        Its criterion is worse by less than `MARGIN` and what neither explains; or, by its own filter, nothing
-        significant is left, and hardly more unfiltered squares.
-        """
-        rich, plain = (
-            self.comparison.left(m, self.comparison.white(model)).criterion
-            for m in (model, simpler)
-        )
-        rest = self.assess(model)
-        margin = MARGIN + (rest.clearest.gain if rest.left < ALARM else 0.0)
-        if plain < rich + margin:
-            return True
-        hardly_more = simpler.fit.fitness < HARDLY_MORE * model.fit.fitness
-        return bool(hardly_more and self.assess(simpler).left >= ALARM)

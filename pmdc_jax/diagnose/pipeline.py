@@ -90,7 +90,7 @@ def diagnose(
     before, electrical = (electrical_misfit(m) for m in (selection.base, naming.chosen))
     breaks = breaks_electrical_equation(before, electrical)
     verdict = "not_in_library" if breaks else _verdict(naming)
-    gaps = _gaps(base, final, naming.noise if verdict == "not_in_library" else 1.0)
+    gaps = _gaps(base, final, naming.noise_share if verdict == "not_in_library" else 1.0)
     total = _total(gaps, base)
     if unlike_held_out(total):
         verdict = "not_in_library"
@@ -112,11 +112,11 @@ def diagnose(
         detectable=_detectable(naming.last),
         base=base,
         final=final,
-        p_nothing=naming.nothing,
+        p_nothing=naming.p_nothing,
         electrical_misfit=electrical,
         electrical_misfit_before=before,
         seconds=seconds,
-        leaves_noise=naming.left >= ALARM,
+        leaves_noise=naming.p_nothing_more >= ALARM,
     )
 
 
@@ -158,9 +158,9 @@ def may_be_none(final: Identification, effect: str, amplitude: str) -> bool:
 def _verdict(naming: Naming) -> Verdict:
     if naming.line is not None:
         return "not_in_library"
-    if naming.nothing >= ALARM:
+    if naming.p_nothing >= ALARM:
         return "none_detected"
-    if naming.left < ALARM and not naming.explained:
+    if naming.p_nothing_more < ALARM and not naming.explained:
         return "not_in_library"
     if not naming.chosen.effects:
         return "not_in_library"
@@ -227,7 +227,7 @@ def _stretches(equation: str, variable: str, knots: np.ndarray, z: np.ndarray) -
 def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
     """The curves that the data still show, at most three, the most significant first; none for a line in frequency."""
     found = naming.last
-    if naming.left >= ALARM:
+    if naming.p_nothing_more >= ALARM:
         return ()
     base = found.evidence.regress().squares
     learned = []
@@ -278,7 +278,10 @@ def _gaps(base: Identification, final: Identification, share: float) -> dict[str
     The noise is the final model's residuals in the training runs times `share`, below 1 where part of them is no noise,
     and at least `FLOOR` times what was measured; all as root mean squares of each channel.
     """
-    noise = {c: max(share * _left(final, c), FLOOR * _size(final, c)) for c in ("current", "speed")}
+    noise = {
+        c: max(share * _rms_residual(final, c), FLOOR * _size(final, c))
+        for c in ("current", "speed")
+    }
 
     def misfit(found: Identification, run: str) -> float:
         ratios = [
@@ -295,7 +298,7 @@ def _gaps(base: Identification, final: Identification, share: float) -> dict[str
     return gaps
 
 
-def _left(found: Identification, channel: str) -> float:
+def _rms_residual(found: Identification, channel: str) -> float:
     """Root mean square of a channel's residuals in the training runs."""
     return _rms_of_all((getattr(f, f"{channel}_rmse"), len(f.time)) for f in _fitted(found))
 

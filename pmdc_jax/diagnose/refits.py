@@ -86,7 +86,7 @@ class Refits:
 
     def _keeps(self, model: Model, current: Model, signal: Signal, white: Whitener) -> bool:
         """Whether a refit realises at least the share `KEPT` of the gain that the evidence promised."""
-        before, after = (self.comparison.left(m, white).squares for m in (current, model))
+        before, after = (self.comparison.fitted(m, white).squares for m in (current, model))
         return bool(before - after > KEPT * signal.gain)
 
     def _better_from(
@@ -244,7 +244,7 @@ class Refits:
         if plain.fitness < KEPT * _fitness(model):
             return model_of(effects, given, plain)
         plainly = refit_from(effects, given, plain.optimum, white)
-        left = self.comparison.left
+        left = self.comparison.fitted
         return min((model, plainly), key=lambda m: left(m, white).squares)
 
     def _pointed_at(

@@ -27,14 +27,14 @@ def rivals_of(
     models = [chosen, *(m for m in refits.models.values() if m.is_possible)]
     ranked = comparison.ranked(models, white)
     least = next(f.criterion for f in ranked if f.model is chosen)
-    margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.left < ALARM else 0.0)
+    margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.p_value < ALARM else 0.0)
     near = [f.model for f in ranked if f.criterion < least + margin]
     rivals = [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]
     # the fuller form clearly there: a free fit would fall back on the simple form where the runs show too little
     simple = [effect for effect in chosen.effects if effect in FULLER]
     fuller = [refits.clearly_in_full(chosen, white, effect) for effect in simple]
-    enough = comparison.left(chosen, white).squares + RULED_OUT
-    return rivals + [m for m in fuller if comparison.left(m, white).squares < enough]
+    enough = comparison.fitted(chosen, white).squares + RULED_OUT
+    return rivals + [m for m in fuller if comparison.fitted(m, white).squares < enough]
 
 
 def chances_without(

@@ -146,7 +146,7 @@ def signals(found: Screen) -> tuple[list[Signal], list[Signal]]:
     for k, curve in enumerate(found.curves):
         if drift is not None and curve.reverses:
             # a slowly fluctuating torque is noise; a changing friction, which reverses with the motion, is not
-            gains[k] = _left(found, drift) - _left(found, drift, found.of_curve[k])
+            gains[k] = _squares_left(found, drift) - _squares_left(found, drift, found.of_curve[k])
         elif found.of_curve[k] is drift:
             gains[k] /= SLOWER
         elif curve.noise or _is_trace(found, curve, found.of_curve[k]):
@@ -162,7 +162,7 @@ def _gain_of_curve(found: Screen, curve: Curve, block: Block) -> float:
     if curve.is_misread:
         pairs = zip(found.candidates, found.of_candidate, strict=True)
         beside = [rival for candidate, rival in pairs if _swings(candidate, curve.periods)]
-    return max(_left(found, *beside) - _left(found, *beside, block), 0.0)
+    return max(_squares_left(found, *beside) - _squares_left(found, *beside, block), 0.0)
 
 
 def _swings(candidate: Candidate, periods: float) -> bool:
@@ -181,7 +181,7 @@ def _is_trace(found: Screen, curve: Curve, block: Block) -> bool:
     return bool(np.max(beyond) < trace)
 
 
-def _left(found: Screen, *blocks: Block) -> float:
+def _squares_left(found: Screen, *blocks: Block) -> float:
     """The squares left by a regression on some blocks together."""
     return found.evidence.regress(blocks).squares
 
@@ -221,7 +221,7 @@ def _beside(found: Screen, block: Block, drift: Block) -> float:
     The whitening filter leaves weak fluctuations of some tenths of a second, hidden below the noise of the sensors, and
     the block takes its share of them.
     """
-    rest = _left(found, block) - _left(found, block, drift)
+    rest = _squares_left(found, block) - _squares_left(found, block, drift)
     return max(rest / found.evidence.freedom(drift) / BY_CHANCE, 1.0)
 
 
