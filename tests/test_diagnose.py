@@ -29,8 +29,8 @@ from pmdc_jax.diagnose.quantisation import READINGS, readings
 from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
 from pmdc_jax.diagnose.rows import _side_by_side
-from pmdc_jax.diagnose.screen import Screen, Signal, common_to_waves, log_chance
 from pmdc_jax.diagnose.shortlist import effect_of, promising, shortlist
+from pmdc_jax.diagnose.signals import Screen, Signal, common_to_waves, log_chance
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate, Identification
 from pmdc_jax.identify.noise_model import Series, whitener

@@ -15,7 +15,7 @@ from ..effects.base import AbstractEffect
 from .effect_relations import CONTAINS, FULLER, unbalances
 from .library import Curve
 from .model import Model
-from .screen import Screen, Signal
+from .signals import Screen, Signal
 
 # False-alarm probability: that anything is called missing from a motor that lacks nothing, or, once effects were
 # added, that anything more is in all later looks together

@@ -28,7 +28,7 @@ from .model import MOST_EFFECTS, Model, final_fit
 from .periodic import Line, line_of
 from .refits import Refits
 from .rivals import chances_without, rivals_of
-from .screen import Screen, Signal, beyond_curves, screen, signals
+from .screen import beyond_curves, screen
 from .shortlist import (
     SHORTLIST,
     clear,
@@ -37,6 +37,7 @@ from .shortlist import (
     richer,
     shortlist,
 )
+from .signals import Screen, Signal, signals
 
 # Limits of `_leaves_little`, as shares of the squares that the better model takes away. LITTLE applies where an effect
 # was replaced by another form, or where the effects before cannot have left the misfit.

@@ -37,7 +37,7 @@ from .experiment import next_experiment
 from .library import Library
 from .model import model_of
 from .naming import Naming, StepwiseSelection
-from .screen import Screen, log_chance
+from .signals import Screen, log_chance
 
 # A knot of a curve with a misfit of so many standard errors is part of a region
 CLEAR = 4.0

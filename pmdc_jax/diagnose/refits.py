@@ -27,8 +27,8 @@ from .compare import Comparison
 from .effect_relations import CONTAINS, FULLER, spelt_out
 from .library import Library
 from .model import Model, model_of, refit_from
-from .screen import Screen, Signal
 from .shortlist import effect_of
+from .signals import Screen, Signal
 
 # Share of the gain promised by the evidence that a refit must realise; otherwise it is fitted in another way
 KEPT = 0.5

@@ -11,7 +11,7 @@ from .assessment import ALARM, FORMULA, MOST_OF_IT, MUCH_OF_IT, Assessment
 from .candidates import TRIALS
 from .effect_relations import CONTAINS, spelt_out
 from .model import Model
-from .screen import Signal
+from .signals import Signal
 
 # Number of effects that are refitted in full simulation for one step
 SHORTLIST = 3
