@@ -92,8 +92,8 @@ class Paper:
 
 def reproduce(progress: ReportProgress | None = None) -> Paper:
     """Reproduce all tables and figures of the paper."""
-    from .control.limit import fastest_settling
     from .control.requirements import reach
+    from .control.time_optimal import fastest_settling
     from .control.tuning import tune
 
     report = progress or silent

@@ -13,10 +13,10 @@ from ..errors import InputError
 from ..motor import Motor
 from .controllers import CONTROLLERS
 from .hardware import Hardware
-from .limit import fastest_settling
 from .loop import REMEMBERED_SAMPLES
 from .requirements import check_reachable, check_settling, reach, spare_torque
 from .steady import steady_state
+from .time_optimal import fastest_settling
 
 NOMINAL_VOLTAGE = 24.0  # V, voltage limit if neither it nor the set point is given
 VOLTAGE_RESERVE = 1.25  # default voltage limit over the voltage that holds the set point
