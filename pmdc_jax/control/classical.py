@@ -17,7 +17,7 @@ from .hardware import Hardware
 from .law import Law, SampledMotor
 from .margins import linear_loop, loop_gain
 
-RULED = ("pi", "pid")  # controllers with a Ziegler-Nichols rule
+ZIEGLER_NICHOLS_CONTROLLERS = ("pi", "pid")  # controllers with a Ziegler-Nichols rule
 
 Poles = Sequence[complex | float] | np.ndarray
 
@@ -60,7 +60,7 @@ def ziegler_nichols(motor: Motor, hardware: Hardware | None, kind: str) -> PI | 
 
     **Source**: Ziegler, Nichols, Transactions of the ASME 64 (1942).
     """
-    if kind not in RULED:
+    if kind not in ZIEGLER_NICHOLS_CONTROLLERS:
         raise InputError("Ziegler-Nichols", f"there is no rule for {kind}", "Choose pi or pid")
     gain, period = ultimate_gain(motor, hardware)
     if kind == "pi":

@@ -14,7 +14,7 @@ from .controllers import Number
 BAND = 0.02  # half-width of the settling band, over the step
 TAIL_PARTS = 20  # the steady error is averaged over the last of so many equal parts
 Samples = Float[Array | np.ndarray, " instants"]
-One = Float[Array | np.ndarray, ""]
+Scalar = Float[Array | np.ndarray, ""]
 
 
 class StepMetrics(NamedTuple):
@@ -24,13 +24,13 @@ class StepMetrics(NamedTuple):
     `Undershoot`, % of the step, never negative; `Peak`, rad/s, and `PeakTime`, s; `SteadyStateError`, rad/s.
     """
 
-    RiseTime: One
-    SettlingTime: One
-    Overshoot: One
-    Undershoot: One
-    Peak: One
-    PeakTime: One
-    SteadyStateError: One
+    RiseTime: Scalar
+    SettlingTime: Scalar
+    Overshoot: Scalar
+    Undershoot: Scalar
+    Peak: Scalar
+    PeakTime: Scalar
+    SteadyStateError: Scalar
 
 
 def step_metrics(
@@ -63,9 +63,9 @@ class LoadMetrics(NamedTuple):
     """Metrics of a load step: `Deviation`, rad/s, the largest; `RecoveryTime`, s, after which the speed stays within
     2 % of the set point; `SteadyStateError`, rad/s."""
 
-    Deviation: One
-    RecoveryTime: One
-    SteadyStateError: One
+    Deviation: Scalar
+    RecoveryTime: Scalar
+    SteadyStateError: Scalar
 
 
 def load_metrics(time: Samples, speed: Samples, reference: Number) -> LoadMetrics:
@@ -81,7 +81,7 @@ def load_metrics(time: Samples, speed: Samples, reference: Number) -> LoadMetric
 
 def smooth_settling(
     time: Samples, speed: Samples, final: Number, initial: Number, width: Number
-) -> One:
+) -> Scalar:
     """Differentiable settling time, s.
 
     The time during which the largest |error| still to come exceeds the band, with a soft maximum and a logistic edge
@@ -100,13 +100,13 @@ def _largest(so_far: Number, value: Number) -> tuple[Number, Number]:
     return largest, largest
 
 
-def smooth_overshoot(speed: Samples, final: Number, initial: Number, width: Number) -> One:
+def smooth_overshoot(speed: Samples, final: Number, initial: Number, width: Number) -> Scalar:
     """Differentiable overshoot, %: maximum and corner at zero are smoothed by `width`, %; exact in the limit of 0."""
     above = 100 * (speed - final) / (final - initial) / width
     return width * jax.nn.softplus(jax.nn.logsumexp(above))
 
 
-def _first_reached(time: Samples, share: Samples, level: float) -> One:
+def _first_reached(time: Samples, share: Samples, level: float) -> Scalar:
     """Time until `share` first reaches `level`, or NaN."""
     reached = share >= level
     k = jnp.argmax(reached)
@@ -116,7 +116,7 @@ def _first_reached(time: Samples, share: Samples, level: float) -> One:
     return jnp.where(jnp.any(reached), jnp.where(k > 0, crossing, time[0]) - time[0], jnp.nan)
 
 
-def _last_inside(time: Samples, outside: Samples) -> One:
+def _last_inside(time: Samples, outside: Samples) -> Scalar:
     """Time from the start after which `outside` stays negative, NaN if it does not."""
     count = outside.size
     out = outside > 0
@@ -128,7 +128,7 @@ def _last_inside(time: Samples, outside: Samples) -> One:
     return jnp.where(jnp.any(out), last_exit, 0.0)
 
 
-def _peak(time: Samples, values: Samples) -> tuple[One, One]:
+def _peak(time: Samples, values: Samples) -> tuple[Scalar, Scalar]:
     """Time and height of the maximum, by a parabola through the largest value and its neighbours."""
     k = jnp.argmax(values)
     inside = (k > 0) & (k < values.size - 1)

@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ..control.controller_file import gains_of, law_content
-from ..control.judge import SMALL_STEP, JudgedController, Robustness
+from ..control.evaluation import SMALL_STEP, Candidate, Robustness
 from ..control.objective import SECOND_SETPOINT
 from ..control.tuning import Tuning
 from .notation import NARROW, UNKNOWN, percent, pretty_unit, significant
@@ -55,7 +55,7 @@ def tuning_json(tuning: Tuning) -> dict[str, Any]:
     }
 
 
-def _candidate_json(one: JudgedController) -> dict[str, Any]:
+def _candidate_json(one: Candidate) -> dict[str, Any]:
     return {
         "name": one.name,
         "gains": gains_of(one.controller),
@@ -178,7 +178,7 @@ def comparison(tuning: Tuning) -> list[tuple[str, ...]]:
     return [*(_row(one, fastest) for one in tuning.candidates), last]
 
 
-def _row(one: JudgedController, fastest: float) -> tuple[str, ...]:
+def _row(one: Candidate, fastest: float) -> tuple[str, ...]:
     settling, rise, robust = one.metrics["SettlingTime"], one.metrics["RiseTime"], one.robust
     return (
         one.name,
@@ -222,9 +222,10 @@ def _tiles(tuning: Tuning) -> list[tuple[str, str, str]]:
     """Label, number and note of each tile at the top of the report."""
     settling, overshoot = tuning.metrics["SettlingTime"], tuning.metrics["Overshoot"]
     ratio = None if settling is None else settling / tuning.fastest_possible_settling
+    max_overshoot = tuning.requirements.max_overshoot
     tiles = [
         ("Settling", _time(settling), f"{significant(ratio)} times the limit"),
-        ("Overshoot", percent(overshoot), f"at most {tuning.asked.max_overshoot:g} % asked for"),
+        ("Overshoot", percent(overshoot), f"at most {max_overshoot:g} % asked for"),
         ("Largest current", f"{significant(tuning.peak_current)} A", _limits(tuning)),
     ]
     if tuning.robust is not None:

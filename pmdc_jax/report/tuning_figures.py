@@ -37,7 +37,7 @@ def loop_figure(tuning: Tuning) -> go.Figure:
         for row, trace in traces(tuning):
             figure.add_trace(trace, row=row, col=1)
     _mark(figure, tuning.fastest_possible_settling, "fastest possible")
-    _mark(figure, tuning.load_from, "load")
+    _mark(figure, tuning.load_step_time, "load")
     for row, title in AXIS_TITLES.items():
         figure.update_yaxes(title_text=title, row=row, col=1)
     figure.update_xaxes(title_text="time [ms]", row=len(HEIGHTS), col=1)
@@ -48,11 +48,11 @@ def loop_figure(tuning: Tuning) -> go.Figure:
 
 def _spread_traces(tuning: Tuning) -> Traces:
     """The band from the 5 % to the 95 % quantile of the speeds of the drawn motors."""
-    if tuning.bundle is None:
+    if tuning.validation_speeds is None:
         return
     instants = _milliseconds(tuning)
-    samples = instants[:: max(1, len(instants) // tuning.bundle.shape[1])]
-    low, high = np.quantile(tuning.bundle, [0.05, 0.95], axis=0)
+    samples = instants[:: max(1, len(instants) // tuning.validation_speeds.shape[1])]
+    low, high = np.quantile(tuning.validation_speeds, [0.05, 0.95], axis=0)
     edge = {"color": MEASURED, "width": 0}
     yield SPEED, _line("5 %", samples, low, edge)
     fill = {"fill": "tonexty", "fillcolor": SPREAD_COLOUR}
@@ -61,7 +61,7 @@ def _spread_traces(tuning: Tuning) -> Traces:
 
 def _setpoint_traces(tuning: Tuning) -> Traces:
     """The set point and the 2 % band about it; its width is a share of the set point."""
-    end, second = _milliseconds(tuning)[-1], 2e3 * tuning.load_from
+    end, second = _milliseconds(tuning)[-1], 2e3 * tuning.load_step_time
     corners = np.array([0.0, second, second, end])
     share = np.array([1.0, 1.0, SECOND_SETPOINT, SECOND_SETPOINT])
     for edge in (-BAND, BAND):
