@@ -124,9 +124,8 @@ def _descend(
 
     def iteration(descent: Descent, k: Int[Array, ""]) -> tuple[Descent, None]:
         x, state, best, lowest = descent
-        width = INITIAL_WIDTH * (FINAL_WIDTH / INITIAL_WIDTH) ** jnp.minimum(
-            2 * k / ITERATIONS, 1.0
-        )
+        narrowing = jnp.minimum(2 * k / ITERATIONS, 1.0)
+        width = INITIAL_WIDTH * (FINAL_WIDTH / INITIAL_WIDTH) ** narrowing
         (_, costs), gradient = jax.value_and_grad(summed_costs, has_aux=True)(x, width)
         # costs of different iterations are comparable only once the width no longer changes
         keep = (costs < lowest) | (2 * k <= ITERATIONS)

@@ -277,14 +277,13 @@ def _best_controller(
     """Best controller of all starts, tuned with at least `TUNING_NOISE` even if the sensor has none."""
     requirements = specification.requirements
     nominal = jax.tree.map(lambda leaf: leaf[0], motors)
-    stiffness = jnp.asarray(specification.voltage_limit / abs(specification.setpoint))
     space = GainSpace(
-        requirements.controller,
-        stiffness,
-        task.fastest_settling,
-        task.hardware.sample_time,
-        nominal,
-        task.setpoint,
+        kind=requirements.controller,
+        gain_unit=jnp.asarray(specification.voltage_limit / abs(specification.setpoint)),
+        time_unit=task.fastest_settling,
+        sample_time=task.hardware.sample_time,
+        motor=nominal,
+        setpoint=task.setpoint,
     )
     speed_noise = max(requirements.speed_noise, TUNING_NOISE * abs(specification.setpoint))
     tuning_task = eqx.tree_at(lambda t: t.noise, task, jnp.asarray(speed_noise * unit_noise))
