@@ -93,7 +93,7 @@ class Task(eqx.Module):
 
     **Fields**: `setpoint`, rad/s; `load`, N m, applied in the second and third part; `fastest_settling`, s, of any
     controller within the limits; `max_overshoot`, %; `max_sensitivity`, limit of the peak sensitivity, None for no
-    limit; `noise`, rad/s, added to the measured speed at each sample; `step_samples`, samples of each part; `substeps`,
+    limit; `noise`, rad/s, added to the measured speed at each sample; `part_samples`, samples of each part; `substeps`,
     simulation steps per sample, as the motor's effects need.
     """
 
@@ -104,19 +104,19 @@ class Task(eqx.Module):
     max_overshoot: Number
     max_sensitivity: Number | None
     noise: Float[Array, " samples"]
-    step_samples: int = eqx.field(static=True)
+    part_samples: int = eqx.field(static=True)
     substeps: int = eqx.field(static=True, default=1)
 
     def course(self) -> Course:
         """Reference, load and noise at each sample of the three parts."""
-        part = jnp.arange(PART_COUNT * self.step_samples) // self.step_samples
+        part = jnp.arange(PART_COUNT * self.part_samples) // self.part_samples
         reference = jnp.where(part < 2, self.setpoint, SECOND_SETPOINT * self.setpoint)
         load = jnp.where(part < 1, 0.0, self.load)
         return Course(reference, load, self.noise)
 
     def parts(self, response: Response, substeps: int = 1) -> list[tuple[Samples, Samples]]:
         """Time (s) and speed (rad/s) of each part."""
-        count = self.step_samples * substeps
+        count = self.part_samples * substeps
         cuts = (slice(k * count, (k + 1) * count) for k in range(PART_COUNT))
         return [(response.time[cut], response.speed[cut]) for cut in cuts]
 
@@ -200,7 +200,7 @@ def _score(
     law, course = Law(controller, task.hardware, model), task.course()
     substeps *= task.substeps
     reference = jnp.repeat(course.reference, substeps)
-    steady_instants = round(STEADY_SHARE * task.step_samples * substeps)
+    steady_instants = round(STEADY_SHARE * task.part_samples * substeps)
 
     def motor_metrics(motor: Motor) -> dict[str, Scalar]:
         response = closed_loop(motor, law, course, substeps)

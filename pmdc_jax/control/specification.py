@@ -66,13 +66,13 @@ class LoopRequirements:
         if self.delay not in (0, 1):
             message = f"{self.delay} samples are not supported"
             raise InputError("--delay", message, "Choose 0 or 1")
-        _check("setpoint", self.setpoint, "a speed to go to", lambda x: x != 0)
-        _check("load_torque", self.load_torque, "a number", lambda x: True)
+        _check_number("setpoint", self.setpoint, "a speed to go to", lambda x: x != 0)
+        _check_number("load_torque", self.load_torque, "a number", lambda x: True)
         for name in ("max_overshoot", "speed_noise", "spread"):
-            _check(name, getattr(self, name), "a number from 0 up", lambda x: x >= 0)
+            _check_number(name, getattr(self, name), "a number from 0 up", lambda x: x >= 0)
         for name in ("voltage_limit", "current_limit", "sample_time", "max_settling", "speed_step"):
-            _check(name, getattr(self, name), "a positive number", lambda x: x > 0)
-        _check("max_sensitivity", self.max_sensitivity, "a positive number", lambda x: x > 0)
+            _check_number(name, getattr(self, name), "a positive number", lambda x: x > 0)
+        _check_number("max_sensitivity", self.max_sensitivity, "a positive number", lambda x: x > 0)
 
     def completed(self, motor: Motor) -> Specification:
         """The specification for a motor, with defaults for what is left open.
@@ -96,7 +96,7 @@ class LoopRequirements:
             if self.load_torque is None
             else self.load_torque,
             fastest_settling=fastest,
-            samples=_samples(motor, fastest, sample_time, self.delay),
+            part_samples=_part_samples(motor, fastest, sample_time, self.delay),
             notes=(*limit_notes, *sampling_notes),
         )
 
@@ -120,7 +120,7 @@ class LoopRequirements:
 
     def _sampling(self, fastest: float) -> tuple[float, list[str]]:
         """Sample time (s) for a fastest settling of `fastest` (s), and a note if it is a default or rather long."""
-        suitable = min(MAX_DEFAULT_SAMPLE_TIME, _round_number(fastest / SAMPLES_PER_SETTLING))
+        suitable = min(MAX_DEFAULT_SAMPLE_TIME, _rounded_down(fastest / SAMPLES_PER_SETTLING))
         if self.sample_time is None:
             return suitable, [f"no sample time given: {suitable:g} s"]
         if self.sample_time <= fastest / SUFFICIENT_SAMPLES:
@@ -145,8 +145,8 @@ class Specification:
     """Complete specification of a loop.
 
     **Fields**: `requirements`, the user's; `setpoint`, rad/s; `voltage_limit`, V; `sample_time`, s;
-    `load_torque`, N m; `fastest_settling`, s, of any controller within the limits; `samples` in each part of the task;
-    `notes`, on the defaults chosen.
+    `load_torque`, N m; `fastest_settling`, s, of any controller within the limits; `part_samples`, in each part of
+    the task; `notes`, on the defaults chosen.
     """
 
     requirements: LoopRequirements
@@ -155,7 +155,7 @@ class Specification:
     sample_time: float
     load_torque: float
     fastest_settling: float
-    samples: int
+    part_samples: int
     notes: tuple[str, ...]
 
     def hardware(self) -> Hardware:
@@ -172,13 +172,15 @@ class Specification:
         return jax.tree.map(lambda x: jnp.asarray(x, float), hardware)
 
 
-def _check(name: str, value: float | None, wanted: str, is_valid: Callable[[float], bool]) -> None:
+def _check_number(
+    name: str, value: float | None, wanted: str, is_valid: Callable[[float], bool]
+) -> None:
     if value is not None and not (math.isfinite(value) and is_valid(value)):
         option = "--" + name.replace("_", "-")
         raise InputError(option, f"{value:g} is not {wanted}", "Give it in SI units")
 
 
-def _samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> int:
+def _part_samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> int:
     """Samples in one part of the task, rounded up to 2^k or 1.5 2^k so that few shapes are compiled."""
     # no loop is much faster than its hold, its delay and a quarter of the electrical time constant together
     dead_time = float(motor.L / motor.R) / 4 + (1 + delay) * sample_time
@@ -209,7 +211,7 @@ def _three_digits(value: float) -> float:
     return float(f"{value:.3g}")
 
 
-def _round_number(value: float) -> float:
+def _rounded_down(value: float) -> float:
     """Largest of 1, 2 or 5 times a power of ten that does not exceed `value`."""
     power = 10.0 ** math.floor(math.log10(value))
     return _three_digits(max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power)

@@ -96,7 +96,7 @@ class Tuning:
     @property
     def load_step_time(self) -> float:
         """Time of the load step, s."""
-        return self.task.step_samples * float(self.hardware.sample_time)
+        return self.task.part_samples * float(self.hardware.sample_time)
 
     @property
     def fastest_possible_settling(self) -> float:
@@ -211,7 +211,8 @@ def design(
     spread = requirements.spread
     variation = uncertainty if spread is None else even_spread(spread)
     report("tuning from many starts")
-    unit_noise = np.random.default_rng(seed).standard_normal(PART_COUNT * specification.samples)
+    task_samples = PART_COUNT * specification.part_samples
+    unit_noise = np.random.default_rng(seed).standard_normal(task_samples)
     task = _task(specification, motor, unit_noise)
     tuning_motors = _tuning_motors(motor, variation, seed)
     controller = _best_controller(specification, task, tuning_motors, unit_noise, seed, starts)
@@ -247,7 +248,7 @@ def _task(specification: Specification, motor: Motor, unit_noise: np.ndarray) ->
         if requirements.max_sensitivity is None
         else jnp.asarray(requirements.max_sensitivity),
         noise=jnp.asarray(requirements.speed_noise * unit_noise),
-        step_samples=specification.samples,
+        part_samples=specification.part_samples,
         substeps=int(steps_within(motor, specification.sample_time, jnp.asarray(max_current))),
     )
 
