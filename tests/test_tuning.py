@@ -15,7 +15,7 @@ from attrs import evolve
 from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, cli, load_controller, load_uncertainty, save_motor, tune
 from pmdc_jax.control.specification import LoopRequirements
-from pmdc_jax.control.tuning import Tuning
+from pmdc_jax.control.tuning import Tuning, robustness
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.report.tuning import summary, tuning_json, write_tuning_report
 
@@ -56,6 +56,8 @@ def test_most_of_the_drawn_motors_do_as_well():
     assert ours.robust.Overshoot_p95 <= 1.0
     assert ours.robust.Overshoot_p95 < textbook.robust.Overshoot_p95
     assert ours.robust.SettlingTime_p95 < textbook.robust.SettlingTime_p95
+    again = robustness(example(), spread=0.05, seed=0)  # the same motors, later
+    assert again.overshoot.tolist() == ours.robust.overshoot.tolist()
 
 
 @pytest.mark.slow
