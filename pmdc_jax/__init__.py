@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .control.controller_file import load_controller, save_controller
     from .control.export import export
-    from .control.limit import fastest_settling
+    from .control.time_optimal import fastest_settling
     from .control.tuning import Tuning, tune
     from .demo import demo
     from .diagnose.diagnosis import Diagnosis
@@ -36,7 +36,7 @@ _HOME = {
     "demo": "demo",
     "diagnose": "diagnose.pipeline",
     "export": "control.export",
-    "fastest_settling": "control.limit",
+    "fastest_settling": "control.time_optimal",
     "identify": "identify.pipeline",
     "load_controller": "control.controller_file",
     "load_motor": "motor_file",

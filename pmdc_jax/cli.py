@@ -26,7 +26,7 @@ from .options import (
     CurrentLimit,
     CurrentSensor,
     Delay,
-    Effects,
+    Effect,
     Experiment,
     Folder,
     HeaderFile,
@@ -78,11 +78,6 @@ app = typer.Typer(
 )
 
 
-@app.callback()
-def _commands() -> None:
-    """Keeps `pmdc COMMAND` even while there is a single command."""
-
-
 @app.command(
     epilog="Example: pmdc identify step.csv chirp.csv --holdout drive.csv --report motor.html"
 )
@@ -97,7 +92,7 @@ def identify(
     tie: Tie = [],
     known: Known = [],
     unloaded: Unloaded = False,
-    effect: Effects = [],
+    effect: Effect = [],
     search: Search = "cma_es",
 ) -> None:
     """Find the parameters of a motor from recordings.
@@ -113,7 +108,7 @@ def identify(
     options = fit_options(tie, known, unloaded, search, seed) | {"effects": tuple(effect)}
     from .identify import identify
 
-    identification = _read_and_work(identify, runs, holdout, columns, options)
+    identification = _read_and_fit(identify, runs, holdout, columns, options)
     from .report.json import identification_json
     from .report.terminal import print_identification
 
@@ -156,7 +151,7 @@ def diagnose(
     options = fit_options(tie, known, unloaded, search, seed)
     from .diagnose import diagnose
 
-    diagnosis = _read_and_work(diagnose, runs, holdout, columns, options)
+    diagnosis = _read_and_fit(diagnose, runs, holdout, columns, options)
     from .report.diagnosis_tables import print_diagnosis
     from .report.json import diagnosis_json
 
@@ -315,21 +310,21 @@ def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
         typer.echo(out / name)
 
 
-def _read_and_work(
-    work: Callable[..., Result],
+def _read_and_fit(
+    fit: Callable[..., Result],
     runs: list[Path],
     holdout: list[Path],
     columns: dict[str, str],
     options: dict[str, Any],
 ) -> Result:
-    """Read the runs and call `work` on them, showing progress."""
+    """Read the runs and call `fit`, which is `identify` or `diagnose`, on them, showing progress."""
     from .recording_file import read_recording
     from .report.terminal import progress
 
     with progress() as on_progress:
         recordings = [read_recording(run, columns) for run in runs]
         held_out = [read_recording(run, columns) for run in holdout]
-        return work(recordings, holdout=held_out, progress=on_progress, **options)
+        return fit(recordings, holdout=held_out, progress=on_progress, **options)
 
 
 def _print_findings_and_save(identification: Identification, path: Path | None) -> None:
@@ -375,12 +370,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         status = app(args=arguments, prog_name="pmdc", standalone_mode=False) or DONE
     except typer.TyperException as error:
-        return _refuse(_usage_message(error))
+        return _print_bad_input(_usage_message(error))
     except InputError as error:
-        return _refuse(str(error))
+        return _print_bad_input(str(error))
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
-        return _refuse(f"{place}{error.strerror or error}")
+        return _print_bad_input(f"{place}{error.strerror or error}")
     except typer.Abort:
         status = INTERRUPTED
     if status == INTERRUPTED:
@@ -395,7 +390,7 @@ def _collect_garbage_rarely() -> None:
     atexit.register(gc.freeze)
 
 
-def _refuse(message: str) -> int:
+def _print_bad_input(message: str) -> int:
     print(f"pmdc: {message}", file=sys.stderr)
     return BAD_INPUT
 

@@ -53,7 +53,7 @@ Known = Annotated[
 Unloaded = Annotated[
     bool, typer.Option("--unloaded", help="Runs without a load column have no load at all.")
 ]
-Effects = Annotated[
+Effect = Annotated[
     list[str],
     typer.Option(
         metavar="NAME", help="An effect to identify too, such as coulomb_friction. Repeatable."
@@ -129,6 +129,7 @@ def fit_options(
 
 
 def pairs(option: str, texts: list[str]) -> list[tuple[str, str]]:
+    """The two sides of every value of an option such as `--tie Kt=Kb`."""
     return [_pair(option, text) for text in texts]
 
 

@@ -92,8 +92,8 @@ class Paper:
 
 def reproduce(progress: ReportProgress | None = None) -> Paper:
     """Reproduce all tables and figures of the paper."""
-    from .control.limit import fastest_settling
-    from .control.requirements import reach
+    from .control.feasibility import steady_speed
+    from .control.time_optimal import fastest_settling
     from .control.tuning import tune
 
     report = progress or silent
@@ -118,7 +118,7 @@ def reproduce(progress: ReportProgress | None = None) -> Paper:
     steps = {kind: step_up_and_down(tuning) for kind, tuning in tunings.items()}
     gains = {kind: row.gains for kind, row in TABLE_2.items() if row.gains}
     as_printed = {kind: simulated_as_printed(*found) for kind, found in gains.items()}
-    return Paper(recovered, reach(PRINTED, VOLTAGE), tunings, fastest, steps, as_printed)
+    return Paper(recovered, steady_speed(PRINTED, VOLTAGE), tunings, fastest, steps, as_printed)
 
 
 def load_test(seed: int = 0) -> Recording:
@@ -174,10 +174,13 @@ def recovered_by_identify(seed: int = 0) -> Recovered:
     return Recovered("ours", motor, search.evaluations, seconds, best)
 
 
-def load_errors(motor: Motor) -> tuple[np.ndarray, np.ndarray]:
+def load_errors(motor: Motor) -> dict[str, np.ndarray]:
     """Figs 5 and 6: error (%) of steady speed and current on 24 V at each load torque in `LOADS`."""
     (speed, current), (found_speed, found_current) = _steady_state(PRINTED), _steady_state(motor)
-    return 100 * (found_speed / speed - 1), 100 * (found_current / current - 1)
+    return {
+        "speed": 100 * (found_speed / speed - 1),
+        "current": 100 * (found_current / current - 1),
+    }
 
 
 def _steady_state(motor: Motor) -> tuple[np.ndarray, np.ndarray]:
@@ -205,18 +208,20 @@ def simulated_as_printed(proportional: float, integral: float, derivative: float
     from .control.metrics import step_metrics
 
     s, lag = np.poly1d([1.0, 0.0]), FILTER_RATIO * derivative / proportional
-    above = (proportional * s + integral) * (lag * s + 1) + derivative * s * s
-    below = s * (lag * s + 1)
+    controller_numerator = (proportional * s + integral) * (lag * s + 1) + derivative * s * s
+    controller_denominator = s * (lag * s + 1)
     with jax.enable_x64(True):
         numerators, denominator = jax.tree.map(jax.numpy.asarray, PRINTED).transfer_function()
-        plant = np.poly1d(np.asarray(numerators["voltage -> speed"]))
-        poles = np.poly1d(np.asarray(denominator))
-    closed = below * poles + above * plant
+        motor_numerator = np.poly1d(np.asarray(numerators["voltage -> speed"]))
+        motor_denominator = np.poly1d(np.asarray(denominator))
+    closed = controller_denominator * motor_denominator + controller_numerator * motor_numerator
     samples, step = 4000, 1e-4
     time = step * np.arange(samples)
     reference = np.where(time < 0.5 * samples * step, SETPOINT, LOWER_SETPOINT)
-    _, speed, _ = lsim(((above * plant).coeffs, closed.coeffs), reference, time, interp=False)
-    _, voltage, _ = lsim(((above * poles).coeffs, closed.coeffs), reference, time, interp=False)
+    to_speed = controller_numerator * motor_numerator
+    to_voltage = controller_numerator * motor_denominator
+    _, speed, _ = lsim((to_speed.coeffs, closed.coeffs), reference, time, interp=False)
+    _, voltage, _ = lsim((to_voltage.coeffs, closed.coeffs), reference, time, interp=False)
     first = slice(0, samples // 2)
     with jax.enable_x64(True):
         t, w = (jax.numpy.asarray(x[first]) for x in (time, speed))

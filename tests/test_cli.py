@@ -337,7 +337,7 @@ def test_short_work_is_silent_without_a_terminal(faked, capsys):
 
 def test_long_work_speaks_now_and_then_without_a_terminal(monkeypatch, capsys):
     seconds = iter([0.0, 14.0, 16.0, 16.0, 17.0])
-    monkeypatch.setattr(terminal, "SILENCE", 15.0)
+    monkeypatch.setattr(terminal, "SECONDS_BETWEEN_LINES", 15.0)
     monkeypatch.setattr(terminal, "monotonic", lambda: next(seconds))
     with terminal.progress() as report:
         for doing in ("checking", "searching", "refining"):

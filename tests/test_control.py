@@ -137,6 +137,8 @@ def test_the_fastest_settling_brakes_in_time():
 
 def test_what_is_out_of_reach_has_no_fastest_settling():
     assert fastest_settling(MOTOR, 600.0, 24.0) is None
+    # a torque that drives the motor through the band, whatever the voltage
+    assert fastest_settling(MOTOR, SETPOINT, 30.0, load=-300.0) is None
 
 
 def test_braking_has_a_limit_too():

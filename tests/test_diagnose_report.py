@@ -113,7 +113,7 @@ CASES = {one.__name__: one for one in (named, none_detected, ambiguous, not_in_l
 
 
 def words(diagnosis: Diagnosis) -> str:
-    return " ".join(verdict_sentences(diagnosis)).replace(notation.NARROW, " ")
+    return " ".join(verdict_sentences(diagnosis)).replace(notation.NARROW_SPACE, " ")
 
 
 def test_more_than_noise_is_said_to_be_left():
@@ -254,7 +254,9 @@ def test_hold_outs_tell_what_fitted_runs_do_not(after, beyond):
     ],
 )
 def test_stretches_in_words(variable, intervals, reach, told):
-    assert intervals_in_words(variable, intervals, reach).replace(notation.NARROW, " ") == told
+    assert (
+        intervals_in_words(variable, intervals, reach).replace(notation.NARROW_SPACE, " ") == told
+    )
 
 
 @pytest.mark.parametrize("effect", EFFECTS)

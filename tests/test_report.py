@@ -437,7 +437,7 @@ def test_engineering_notation(estimate, expected):
     [(99.412, "99.41 %"), (12.34, "12.3 %"), (0.04, "0.040 %"), (-250.0, "−250 %"), (None, "–")],
 )
 def test_percent(value, text):
-    assert notation.percent(value).replace(notation.NARROW, " ") == text
+    assert notation.percent(value).replace(notation.NARROW_SPACE, " ") == text
 
 
 def test_tables_render_without_a_terminal(capsys):

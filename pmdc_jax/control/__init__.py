@@ -3,10 +3,10 @@
 from .controllers import CONTROLLERS, PI, PID, StateFeedback, StateFeedbackIntegral
 from .hardware import Hardware
 from .law import Law
-from .limit import fastest_settling
 from .loop import Course, Response, closed_loop
 from .metrics import LoadMetrics, StepMetrics, load_metrics, step_metrics
 from .steady import steady_state
+from .time_optimal import fastest_settling
 
 __all__ = [
     "CONTROLLERS",

@@ -17,7 +17,7 @@ from .hardware import Hardware
 from .law import Law, SampledMotor
 from .margins import linear_loop, loop_gain
 
-RULED = ("pi", "pid")  # controllers with a Ziegler-Nichols rule
+ZIEGLER_NICHOLS_CONTROLLERS = ("pi", "pid")  # controllers with a Ziegler-Nichols rule
 
 Poles = Sequence[complex | float] | np.ndarray
 
@@ -60,14 +60,26 @@ def ziegler_nichols(motor: Motor, hardware: Hardware | None, kind: str) -> PI | 
 
     **Source**: Ziegler, Nichols, Transactions of the ASME 64 (1942).
     """
-    if kind not in RULED:
+    if kind not in ZIEGLER_NICHOLS_CONTROLLERS:
         raise InputError("Ziegler-Nichols", f"there is no rule for {kind}", "Choose pi or pid")
     gain, period = ultimate_gain(motor, hardware)
     if kind == "pi":
-        reset = period / 1.2
-        return PI(0.45 * gain, 0.45 * gain / reset, 1.0, reset)
-    reset, lead = period / 2, period / 8
-    return PID(0.6 * gain, 0.6 * gain / reset, 0.6 * gain * lead, lead / 10, 1.0, reset)
+        integral_time = period / 1.2
+        return PI(
+            proportional=0.45 * gain,
+            integral=0.45 * gain / integral_time,
+            setpoint_weight=1.0,
+            tracking_time=integral_time,
+        )
+    integral_time, derivative_time = period / 2, period / 8
+    return PID(
+        proportional=0.6 * gain,
+        integral=0.6 * gain / integral_time,
+        derivative=0.6 * gain * derivative_time,
+        filter_time=derivative_time / 10,
+        setpoint_weight=1.0,
+        tracking_time=integral_time,
+    )
 
 
 def ackermann(A: np.ndarray, B: np.ndarray, poles: Poles) -> np.ndarray:
@@ -78,11 +90,11 @@ def ackermann(A: np.ndarray, B: np.ndarray, poles: Poles) -> np.ndarray:
     **Source**: Ackermann, at - Automatisierungstechnik 20 (1972).
     """
     size = len(A)
-    reachable = np.stack([np.linalg.matrix_power(A, k) @ B for k in range(size)], axis=1)
-    wanted = np.zeros_like(A)
+    controllability = np.stack([np.linalg.matrix_power(A, k) @ B for k in range(size)], axis=1)
+    polynomial_of_A = np.zeros_like(A)  # by Horner's scheme
     for coefficient in np.poly(np.asarray(poles)):
-        wanted = wanted @ A + np.real(coefficient) * np.eye(size)
-    return np.linalg.solve(reachable.T, np.eye(size)[-1]) @ wanted
+        polynomial_of_A = polynomial_of_A @ A + np.real(coefficient) * np.eye(size)
+    return np.linalg.solve(controllability.T, np.eye(size)[-1]) @ polynomial_of_A
 
 
 @double_precision
@@ -96,22 +108,24 @@ def state_feedback(
     continuous time.
     """
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
-    wanted = np.asarray(poles)
+    loop_poles = np.asarray(poles)
     if sample_time is not None:
-        wanted = np.exp(wanted * sample_time)
+        loop_poles = np.exp(loop_poles * sample_time)
     A, B = _state_space(motor, sample_time)
-    if len(wanted) == 3:
+    if len(loop_poles) == 3:
         A, B = _with_error_integral(A, B, sample_time)
-    K = ackermann(A, B, wanted)
-    shared = {
+    K = ackermann(A, B, loop_poles)
+    gains = {
         "reference_gain": float(reference_gain(motor, setpoint, K[0], K[1])),
         "current_gain": float(K[0]),
         "speed_gain": float(K[1]),
     }
-    if len(wanted) == 2:
-        return StateFeedback(**shared)
-    slowest = float(1 / np.min(np.abs(np.real(np.asarray(poles)))))
-    return StateFeedbackIntegral(**shared, integral=float(-K[2]), tracking_time=slowest)
+    if len(loop_poles) == 2:
+        return StateFeedback(**gains)
+    slowest_time_constant = float(1 / np.min(np.abs(np.real(np.asarray(poles)))))
+    return StateFeedbackIntegral(
+        **gains, integral=float(-K[2]), tracking_time=slowest_time_constant
+    )
 
 
 def _state_space(motor: Motor, sample_time: float | None) -> tuple[np.ndarray, np.ndarray]:
@@ -128,6 +142,7 @@ def _with_error_integral(
     A: np.ndarray, B: np.ndarray, sample_time: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """A and B with a third state, the integral of set point minus speed."""
-    step, kept = (1.0, 0.0) if sample_time is None else (sample_time, 1.0)
-    A = np.block([[A, np.zeros((2, 1))], [np.array([[0.0, -step, kept]])]])
+    # row of d(integral)/dt = -w, or of integral[k+1] = integral[k] - step w[k]
+    row = [0.0, -1.0, 0.0] if sample_time is None else [0.0, -sample_time, 1.0]
+    A = np.block([[A, np.zeros((2, 1))], [np.array([row])]])
     return A, np.append(B, 0.0)

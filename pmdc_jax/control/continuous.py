@@ -40,37 +40,39 @@ def continuous_loop(
     """
 
     def voltages(state: State, memory: Memory) -> tuple[Number, Number]:
+        """Commanded and applied."""
         current, speed = motor.sensors(state)
-        asked = controller.command(memory, reference, speed, current, 0.0)
-        return asked, _within_limits(motor, state, asked, voltage_limit, current_limit)
+        commanded = controller.command(memory, reference, speed, current, 0.0)
+        return commanded, _limited(motor, state, commanded, voltage_limit, current_limit)
 
     def rate(t: Number, y: tuple[State, Memory], args: None) -> tuple[State, Memory]:
         state, memory = y
-        asked, applied = voltages(state, memory)
+        commanded, applied = voltages(state, memory)
         _, speed = motor.sensors(state)
-        moved = controller.rates(memory, reference, speed, applied - asked, 0.0)
-        return motor.derivative(state, jnp.asarray(applied), jnp.asarray(load, float)), moved
+        memory_rates = controller.rates(memory, reference, speed, applied - commanded, 0.0)
+        motor_rates = motor.derivative(state, jnp.asarray(applied), jnp.asarray(load, float))
+        return motor_rates, memory_rates
 
-    at, held_by = steady_state(motor, initial)
-    memory = controller.equilibrium(initial, at.speed, at.current, held_by, 0.0)
+    state, voltage = steady_state(motor, initial)
+    memory = controller.equilibrium(initial, state.speed, state.current, voltage, 0.0)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(rate),
         diffrax.Tsit5(),
         t0=times[0],
         t1=times[-1],
         dt0=None,
-        y0=(at, Memory(*(jnp.asarray(m, float) for m in memory))),
+        y0=(state, Memory(*(jnp.asarray(m, float) for m in memory))),
         saveat=diffrax.SaveAt(ts=times),
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
         max_steps=200_000,
     )
     assert solution.ys is not None
     states, memories = solution.ys
-    voltage = jnp.asarray(voltages(states, memories)[1])
-    return Response(times, states.current, states.speed, voltage)
+    _, applied = voltages(states, memories)
+    return Response(times, states.current, states.speed, jnp.asarray(applied))
 
 
-def _within_limits(
+def _limited(
     motor: Motor,
     state: State,
     voltage: Number,
@@ -79,9 +81,9 @@ def _within_limits(
 ) -> Number:
     """The voltage limited by the current loop, then by the voltage limit."""
     if current_limit is not None:
-        holding = motor.R * state.current + motor.Kb * state.speed
+        holding_voltage = motor.R * state.current + motor.Kb * state.speed
         lowest, highest = (
-            holding + CURRENT_LOOP_GAIN * motor.R * (sign * current_limit - state.current)
+            holding_voltage + CURRENT_LOOP_GAIN * motor.R * (sign * current_limit - state.current)
             for sign in (-1, 1)
         )
         voltage = jnp.clip(voltage, lowest, highest)

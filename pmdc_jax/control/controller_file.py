@@ -67,8 +67,10 @@ def load_controller(path: str | Path) -> Law:
         Hardware(
             sample_time=_positive(where, "sample_time_s", content.get("sample_time_s")),
             voltage_limit=_positive(where, "voltage_V", limits.get("voltage_V")),
-            current_limit=_optional(where, "current_A", limits.get("current_A")),
-            speed_step=_optional(where, "speed_step_rad_s", content.get("speed_step_rad_s")),
+            current_limit=_positive_or_none(where, "current_A", limits.get("current_A")),
+            speed_step=_positive_or_none(
+                where, "speed_step_rad_s", content.get("speed_step_rad_s")
+            ),
             delay=int(delay),
             measures_current=bool(content.get("measures_current", True)),
         ),
@@ -88,7 +90,7 @@ def _positive(where: str, name: str, value: Any) -> float:
     return number
 
 
-def _optional(where: str, name: str, value: Any) -> float | None:
+def _positive_or_none(where: str, name: str, value: Any) -> float | None:
     return None if value is None else _positive(where, name, value)
 
 

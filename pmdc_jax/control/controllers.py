@@ -64,8 +64,8 @@ class AbstractController(eqx.Module):
         memory = Memory(jnp.zeros_like(jnp.asarray(speed, float)), speed)
         if not self.integrates:
             return memory
-        short = voltage - self.command(memory, reference, speed, current, step)
-        return memory._replace(integral=short)
+        integral = voltage - self.command(memory, reference, speed, current, step)
+        return memory._replace(integral=integral)
 
 
 def _integral_rate(
@@ -154,8 +154,8 @@ class PID(AbstractController):
     ) -> Number:
         del current
         slope = (speed - memory.filtered) / (self.filter_time + step)
-        wanted = self.proportional * (self.setpoint_weight * reference - speed)
-        return wanted + memory.integral - self.derivative * slope
+        proportional = self.proportional * (self.setpoint_weight * reference - speed)
+        return proportional + memory.integral - self.derivative * slope
 
     def rates(
         self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
@@ -196,8 +196,8 @@ class StateFeedback(AbstractController):
         self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
     ) -> Number:
         del memory, step
-        state = self.current_gain * current + self.speed_gain * speed
-        return self.reference_gain * reference - state
+        feedback = self.current_gain * current + self.speed_gain * speed
+        return self.reference_gain * reference - feedback
 
     def rates(
         self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
@@ -232,8 +232,8 @@ class StateFeedbackIntegral(AbstractController):
         self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
     ) -> Number:
         del step
-        state = self.current_gain * current + self.speed_gain * speed
-        return self.reference_gain * reference - state + memory.integral
+        feedback = self.current_gain * current + self.speed_gain * speed
+        return self.reference_gain * reference - feedback + memory.integral
 
     def rates(
         self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number

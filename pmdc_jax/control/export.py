@@ -102,17 +102,17 @@ def _constants(law: Law) -> dict[str, float]:
 def _body(law: Law) -> list[str]:
     """The statements of one step, in the order of `Law.step`."""
     return [
-        *_state_ahead(law),
+        *_predicted_state(law),
         *_command(law),
-        *_within_limits(law),
-        *_memory(law),
+        *_limited_voltage(law),
+        *_memory_update(law),
         *_estimated_current(law),
         "state->voltage = applied;",
         "return applied;",
     ]
 
 
-def _state_ahead(law: Law) -> list[str]:
+def _predicted_state(law: Law) -> list[str]:
     """Statements that predict current and speed to when the voltage takes effect; `here` is the present current."""
     lines = []
     if not law.hardware.measures_current:
@@ -144,7 +144,7 @@ def _command(law: Law) -> list[str]:
     return [*lines, f"const pmdc_real asked = {law.controller.c_command};"]
 
 
-def _within_limits(law: Law) -> list[str]:
+def _limited_voltage(law: Law) -> list[str]:
     """Statements that limit the voltage."""
     lines = ["pmdc_real applied = asked;"]
     if law.hardware.current_limit is not None:
@@ -157,7 +157,7 @@ def _within_limits(law: Law) -> list[str]:
     return [*lines, "applied = pmdc_clip(applied, -PMDC_VOLTAGE_LIMIT, PMDC_VOLTAGE_LIMIT);"]
 
 
-def _memory(law: Law) -> list[str]:
+def _memory_update(law: Law) -> list[str]:
     """Statements that update the controller's memory."""
     lines = []
     if law.controller.integrates:

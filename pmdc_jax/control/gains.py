@@ -30,8 +30,8 @@ class GainSpace(NamedTuple):
     """Search space for the gains of a controller; coordinates are natural logarithms."""
 
     kind: str
-    stiffness: Number  # V s/rad, the unit of proportional gains
-    duration: Number  # s, the unit of times
+    gain_unit: Number  # V s/rad, of proportional gains
+    time_unit: Number  # s
     sample_time: Number  # s
     motor: Motor
     setpoint: Number  # rad/s
@@ -49,9 +49,13 @@ class GainSpace(NamedTuple):
     def controller(self, coordinates: Float[Array, " gains"]) -> AbstractController:
         """The controller at these coordinates."""
         kind = CONTROLLERS[self.kind]
-        at = {name: jnp.exp(x) for name, x in zip(self.names, coordinates, strict=True)}
-        times = {name: self.duration * at[name] for name in at if name.endswith("_time")}
-        stiffness, gains = self.stiffness * at["stiffness"], {}
+        relative = {name: jnp.exp(x) for name, x in zip(self.names, coordinates, strict=True)}
+        times = {
+            name: self.time_unit * value
+            for name, value in relative.items()
+            if name.endswith("_time")
+        }
+        stiffness, gains = self.gain_unit * relative["stiffness"], {}
         if kind.feeds_back_current:
             # K1 i equals K2 times the change of speed that the torque Kt i produces in derivative_time
             current_gain = stiffness * times["derivative_time"] * self.motor.Kt / self.motor.J
@@ -60,7 +64,7 @@ class GainSpace(NamedTuple):
             )
             gains |= {"current_gain": current_gain, "speed_gain": stiffness}
         else:
-            gains |= {"proportional": stiffness, "setpoint_weight": at["setpoint_weight"]}
+            gains |= {"proportional": stiffness, "setpoint_weight": relative["setpoint_weight"]}
         if kind.integrates:
             gains["integral"] = stiffness / times["integral_time"]
             gains["tracking_time"] = jnp.maximum(times["tracking_time"], self.sample_time)

@@ -27,10 +27,8 @@ class SampledMotor(NamedTuple):
     @classmethod
     def of(cls, motor: Motor, sample_time: Number) -> SampledMotor:
         """Exact discretisation, with held voltage and no load, of the motor without its effects."""
-        whole, inputs, *_ = propagator(
-            motor.with_effects(()), jnp.asarray(sample_time, float), Drive()
-        )
-        return cls(whole[0, 0], whole[0, 1], inputs[0, 0], whole[1, 0], whole[1, 1], inputs[1, 0])
+        A, B, *_ = propagator(motor.with_effects(()), jnp.asarray(sample_time, float), Drive())
+        return cls(ii=A[0, 0], iw=A[0, 1], iv=B[0, 0], wi=A[1, 0], ww=A[1, 1], wv=B[1, 0])
 
     def next(self, current: Number, speed: Number, voltage: Number) -> tuple[Number, Number]:
         """Current and speed one sample later."""
@@ -80,29 +78,33 @@ class Law(eqx.Module):
         delay.
         """
         hardware, model = self.hardware, self.model
-        here = current if hardware.measures_current else state.current
-        ahead = (here, speed)
+        if not hardware.measures_current:
+            current = state.current
+        predicted_current, predicted_speed = current, speed  # when the voltage takes effect
         if hardware.delay:  # meanwhile the previous voltage acts
-            ahead = model.next(here, speed, state.voltage)
-        seen = ahead[1] if self.controller.feeds_back_current else speed
+            predicted_current, predicted_speed = model.next(current, speed, state.voltage)
+        fed_back_speed = predicted_speed if self.controller.feeds_back_current else speed
         period = hardware.sample_time
-        asked = self.controller.command(state.memory, reference, seen, ahead[0], period)
-        applied = self._limited(asked, *ahead)
-        rates = self.controller.rates(state.memory, reference, speed, applied - asked, period)
+        commanded = self.controller.command(
+            state.memory, reference, fed_back_speed, predicted_current, period
+        )
+        limited = self._limited(commanded, predicted_current, predicted_speed)
+        rates = self.controller.rates(state.memory, reference, speed, limited - commanded, period)
         memory = Memory(*(m + period * r for m, r in zip(state.memory, rates, strict=True)))
         # The current is estimated from the winding's equation alone, with the measured speed at every sample. The load
         # does not enter: the error decays with L / R, and an unknown torque causes no bias, as it would in a full-order
         # observer.
-        acting = state.voltage if hardware.delay else applied
-        return LawState(memory, model.next(here, speed, acting)[0], applied), applied
+        acting = state.voltage if hardware.delay else limited
+        next_current, _ = model.next(current, speed, acting)
+        return LawState(memory, next_current, limited), limited
 
     def _limited(self, voltage: Number, current: Number, speed: Number) -> Number:
         """The voltage limited so that the current at the end of the sample keeps its limit, then to the voltage
         limit."""
         hardware, model = self.hardware, self.model
         if hardware.current_limit is not None:
-            free = model.ii * current + model.iw * speed
-            lowest = (-hardware.current_limit - free) / model.iv
-            highest = (hardware.current_limit - free) / model.iv
+            unforced_current = model.ii * current + model.iw * speed
+            lowest = (-hardware.current_limit - unforced_current) / model.iv
+            highest = (hardware.current_limit - unforced_current) / model.iv
             voltage = jnp.clip(voltage, lowest, highest)
         return jnp.clip(voltage, -hardware.voltage_limit, hardware.voltage_limit)

@@ -20,10 +20,17 @@ from .steady import steady_state
 
 REMEMBERED_SAMPLES = 32  # of the speed, for a sensor with delay
 
-# States of motor and law, voltage computed at the previous sample (V), and past speeds (rad/s), latest first
-LoopState = tuple[State, LawState, Number, Float[Array, " remembered"]]
 # Current, speed and voltage at one instant, or at all instants of a sample
 Instants = tuple[Scalars, Scalars, Scalars]
+
+
+class LoopState(NamedTuple):
+    """States of motor and law, voltage computed at the previous sample (V), and past speeds (rad/s), latest first."""
+
+    motor: State
+    law: LawState
+    voltage: Number
+    past_speeds: Float[Array, " remembered"]
 
 
 class Course(NamedTuple):
@@ -58,32 +65,33 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
     `jax.vmap` over any of them.
     """
     drive, hardware = Drive(), law.hardware
-    along = propagator(motor, jnp.asarray(hardware.sample_time / substeps), drive)
-    at, voltage = steady_state(motor, course.initial)
-    late = motor.speed_delay()
-    memory = law.start(course.initial, at, voltage)
-    start = (at, memory, voltage, jnp.full(REMEMBERED_SAMPLES, motor.sensors(at)[1]))
+    step_matrices = propagator(motor, jnp.asarray(hardware.sample_time / substeps), drive)
+    sensor_delay = motor.speed_delay()
+    state, voltage = steady_state(motor, course.initial)
+    law_state = law.start(course.initial, state, voltage)
+    past_speeds = jnp.full(REMEMBERED_SAMPLES, motor.sensors(state)[1])
+    start = LoopState(state, law_state, voltage, past_speeds)
 
     def sample(
-        carry: LoopState, now: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]
+        loop: LoopState, inputs: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]
     ) -> tuple[LoopState, Instants]:
-        state, memory, acting, past = carry
-        reference, load, noise = now
+        state, law_state, previous_voltage, past_speeds = loop
+        reference, load, noise = inputs
         current, speed = motor.sensors(state)
-        past = jnp.concatenate([speed[None], past[:-1]])
-        if late is not None:
-            speed = _earlier(past, late / hardware.sample_time)
+        past_speeds = jnp.concatenate([speed[None], past_speeds[:-1]])
+        if sensor_delay is not None:
+            speed = _delayed(past_speeds, sensor_delay / hardware.sample_time)
         speed = _quantised(speed + noise, hardware.speed_step)
-        memory, decided = law.step(memory, reference, speed, current)
-        applied = jnp.asarray(acting if hardware.delay else decided)
+        law_state, voltage = law.step(law_state, reference, speed, current)
+        applied = jnp.asarray(previous_voltage if hardware.delay else voltage)
 
-        def between(state: State, _: None) -> tuple[State, Instants]:
-            seen = (state.current, state.speed, applied)
-            return held_step(motor, along, Input(drive, applied, load), state), seen
+        def substep(state: State, _: None) -> tuple[State, Instants]:
+            before = (state.current, state.speed, applied)
+            return held_step(motor, step_matrices, Input(drive, applied, load), state), before
 
         # not unrolled: a step with effects is a long program, and a sample may have dozens
-        state, instants = jax.lax.scan(between, state, length=substeps, unroll=substeps == 1)
-        return (state, memory, decided, past), instants
+        state, instants = jax.lax.scan(substep, state, length=substeps, unroll=substeps == 1)
+        return LoopState(state, law_state, voltage, past_speeds), instants
 
     _, (current, speed, voltage) = jax.lax.scan(
         sample, start, (course.reference, course.load, course.speed_noise)
@@ -96,11 +104,11 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
 closed_loop_jit = compiled(closed_loop)
 
 
-def _earlier(past: Float[Array, " remembered"], samples: Number) -> Float[Array, ""]:
-    """The value `samples` ago, linearly interpolated; `past` is latest first."""
+def _delayed(past_speeds: Float[Array, " remembered"], samples: Number) -> Float[Array, ""]:
+    """The speed `samples` ago, linearly interpolated."""
     place = jnp.clip(samples, 0.0, REMEMBERED_SAMPLES - 1.001)
     k = jnp.floor(place).astype(int)
-    return past[k] + (place - k) * (past[k + 1] - past[k])
+    return past_speeds[k] + (place - k) * (past_speeds[k + 1] - past_speeds[k])
 
 
 def _quantised(speed: Number, step: Number | None) -> Number:

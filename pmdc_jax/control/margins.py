@@ -40,17 +40,17 @@ def linear_loop(motor: Motor, law: Law) -> Loop:
     """The loop linearised at rest, with the motor's linear part. The law itself is linear until its limits bind, so
     its derivatives describe it exactly."""
     model = SampledMotor.of(motor, law.hardware.sample_time)
-    zero = State(jnp.zeros(()), jnp.zeros(()), {})
-    start = law.start(0.0, zero, jnp.zeros(()))
-    leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, start))
+    at_rest = State(jnp.zeros(()), jnp.zeros(()), {})
+    law_state = law.start(0.0, at_rest, jnp.zeros(()))
+    leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, law_state))
 
     def sample(inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
-        current, speed, *memory, voltage, error = inputs
-        state: LawState = jax.tree.unflatten(tree, memory)
-        after, decided = law.step(state, 0.0, speed + error, current)
+        current, speed, *law_leaves, voltage, error = inputs
+        state: LawState = jax.tree.unflatten(tree, law_leaves)
+        next_state, decided = law.step(state, 0.0, speed + error, current)
         acting = state.voltage if law.hardware.delay else decided
         motion = model.next(current, speed, voltage)
-        return jnp.stack([*motion, *jax.tree.leaves(after), acting])
+        return jnp.stack([*motion, *jax.tree.leaves(next_state), acting])
 
     size = 2 + len(leaves)
     jacobian = jax.jacfwd(sample)(jnp.zeros(size + 2))
@@ -65,15 +65,15 @@ def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
     """
     eye = jnp.eye(loop.A.shape[0])
     angle = jnp.asarray(np.geomspace(1e-3, np.pi, FREQUENCIES))
-    shift = jnp.exp(1j * angle) - 1
+    z_minus_1 = jnp.exp(1j * angle) - 1
     opened, closed = (
-        jnp.polyval(_characteristic(matrix - eye).astype(shift.dtype), shift)
+        jnp.polyval(_characteristic_polynomial(matrix - eye).astype(z_minus_1.dtype), z_minus_1)
         for matrix in (loop.A, loop.closed)
     )
     return jnp.max(jnp.abs(opened) / jnp.maximum(jnp.abs(closed), 1e-300))
 
 
-def _characteristic(matrix: Matrix) -> Float[Array, " n+1"]:
+def _characteristic_polynomial(matrix: Matrix) -> Float[Array, " n+1"]:
     """Coefficients of det(x - matrix), highest power first, by the Faddeev-LeVerrier algorithm."""
     size = matrix.shape[0]
     eye = jnp.eye(size)
@@ -103,16 +103,15 @@ class Margins:
 
 def margins(motor: Motor, law: Law) -> Margins:
     """Margins of the loop within its limits, and its amplification of white noise on the measured speed."""
-    loop = Loop(*map(np.asarray, linear_loop(motor, law)))
-    loop = _connected(loop)
+    loop = _without_unused_states(Loop(*map(np.asarray, linear_loop(motor, law))))
     step = float(law.hardware.sample_time)
     closed = np.asarray(loop.closed)
     if np.abs(np.linalg.eigvals(closed)).max() >= 1 - 1e-12:
         return Margins(False, None, None, None, None, None, None)
     angle = np.geomspace(1e-5, np.pi, 20_000)
     gain = loop_gain(loop, angle)
-    covariance = _stationary(closed, np.asarray(loop.N + loop.B * loop.D))
-    phase, delay = _phase_margin(angle, gain, step)
+    covariance = _stationary_covariance(closed, np.asarray(loop.N + loop.B * loop.D))
+    phase, delay = _phase_and_delay_margin(angle, gain, step)
     return Margins(
         stable=True,
         gain_margin=_gain_margin(gain),
@@ -124,15 +123,16 @@ def margins(motor: Motor, law: Law) -> Margins:
     )
 
 
-def _connected(loop: Loop) -> Loop:
+def _without_unused_states(loop: Loop) -> Loop:
     """The loop without the law's unused states, such as the filter of a PI controller: no voltage depends on them."""
-    link = (
+    # in one sample, and in any number of samples: entry (i, j) is positive if state i depends on state j
+    direct = (
         (loop.A != 0).astype(int)
         + np.outer(loop.B != 0, loop.C != 0)
         + np.eye(len(loop.A), dtype=int)
     )
-    reaches = np.linalg.matrix_power(link, len(link))
-    needed = (reaches[:2] > 0).any(axis=0) | ((loop.C != 0) @ reaches > 0)
+    depends = np.linalg.matrix_power(direct, len(direct))
+    needed = (depends[:2] > 0).any(axis=0) | ((loop.C != 0) @ depends > 0)
     A, B, C, N, D = loop
     return Loop(A[np.ix_(needed, needed)], B[needed], C[needed], N[needed], D)
 
@@ -148,30 +148,30 @@ def loop_gain(loop: Loop, angle: np.ndarray) -> np.ndarray:
 def _gain_margin(gain: np.ndarray) -> float | None:
     """The smallest factor above 1 that brings the loop gain to -1."""
     x, y = np.real(gain), np.imag(gain)
-    crossing = np.flatnonzero((y[:-1] * y[1:] <= 0) & (x[:-1] < 0))
-    share = y[crossing] / (y[crossing] - y[crossing + 1] + 1e-300)
-    real = x[crossing] + share * (x[crossing + 1] - x[crossing])
-    factors = -1 / real[(real > -1) & (real < 0)]
+    k = np.flatnonzero((y[:-1] * y[1:] <= 0) & (x[:-1] < 0))
+    share = y[k] / (y[k] - y[k + 1] + 1e-300)
+    crossing = x[k] + share * (x[k + 1] - x[k])  # of the real axis
+    factors = -1 / crossing[(crossing > -1) & (crossing < 0)]
     return float(factors.min()) if factors.size else None
 
 
-def _phase_margin(
+def _phase_and_delay_margin(
     angle: np.ndarray, gain: np.ndarray, step: float
 ) -> tuple[float | None, float | None]:
     """The smallest phase shift (degrees) and the smallest delay (s) that bring the loop gain to -1."""
-    size = np.log(np.abs(gain))
-    crossing = np.flatnonzero(size[:-1] * size[1:] <= 0)
-    if not crossing.size:
+    magnitude = np.log(np.abs(gain))
+    k = np.flatnonzero(magnitude[:-1] * magnitude[1:] <= 0)
+    if not k.size:
         return None, None
-    share = size[crossing] / (size[crossing] - size[crossing + 1])
-    at = angle[crossing] + share * (angle[crossing + 1] - angle[crossing])
-    turned = gain[crossing] + share * (gain[crossing + 1] - gain[crossing])
-    phase = np.mod(np.angle(-turned), 2 * np.pi)  # remaining lag to -1
-    lead = np.minimum(phase, 2 * np.pi - phase)
-    return float(np.degrees(lead.min())), float((phase / at).min() * step)
+    share = magnitude[k] / (magnitude[k] - magnitude[k + 1])
+    crossover_angle = angle[k] + share * (angle[k + 1] - angle[k])
+    crossover_gain = gain[k] + share * (gain[k + 1] - gain[k])
+    lag = np.mod(np.angle(-crossover_gain), 2 * np.pi)  # that brings the gain to -1
+    shift = np.minimum(lag, 2 * np.pi - lag)
+    return float(np.degrees(shift.min())), float((lag / crossover_angle).min() * step)
 
 
-def _stationary(closed: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def _stationary_covariance(closed: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Covariance of the states under white noise of variance 1."""
     from scipy.linalg import solve_discrete_lyapunov
 

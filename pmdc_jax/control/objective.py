@@ -19,19 +19,21 @@ from .loop import Course, Response, closed_loop
 from .margins import linear_loop, sensitivity_peak
 from .metrics import (
     BAND,
-    One,
     Samples,
+    Scalar,
     load_metrics,
     smooth_overshoot,
     smooth_settling,
     step_metrics,
 )
 
-PARTS = 3  # equally long parts of the task: the step, the load step, and the second step under load
+PART_COUNT = (
+    3  # equally long parts of the task: the step, the load step, and the second step under load
+)
 SECOND_SETPOINT = 0.5  # set point of the second step, over that of the first
 EXACT_SUBSTEPS = 4  # simulated instants per sample; exact metrics interpolate between them
 # Width of the smooth overshoot (%) for an allowed overshoot of 1 %, over the width of the smooth settling (bands).
-SMOOTH_OVERSHOOT = 0.3
+OVERSHOOT_WIDTH = 0.3
 # Last share of each part, over which the steady error is averaged.
 STEADY_SHARE = 0.25
 
@@ -39,23 +41,23 @@ STEADY_SHARE = 0.25
 # voltage from sample to sample over the voltage limit.
 
 # Weight of the recovery from the load, over the fastest settling: less than that of the step, which comes first.
-RECOVERY = 0.1
+RECOVERY_WEIGHT = 0.1
 # Weight of the relative steady error: an error as large as the 2 % band costs as much as half the fastest settling.
-STEADY_ERROR = 25.0
+STEADY_ERROR_WEIGHT = 25.0
 # Weights of the second step's settling, over the fastest settling, and of its overshoot beyond the band. That step has
 # no specification of its own, so an overshoot within the band is free.
-SECOND_SETTLING = 0.05
-SECOND_OVERSHOOT = 0.15
-# Excess overshoot costs its ratio to the allowed overshoot, up to MOST_BY_RATIO, plus EACH_PER_CENT for each per cent:
-# steep at the limit, but the gradient stays moderate for a loop that starts far beyond it.
-MOST_BY_RATIO = 0.3
-EACH_PER_CENT = 0.3
+SECOND_SETTLING_WEIGHT = 0.05
+SECOND_OVERSHOOT_WEIGHT = 0.15
+# Excess overshoot costs its ratio to the allowed overshoot, up to RATIO_COST_LIMIT, plus COST_PER_PERCENT for each per
+# cent: steep at the limit, but the gradient stays moderate for a loop that starts far beyond it.
+RATIO_COST_LIMIT = 0.3
+COST_PER_PERCENT = 0.3
 
 # Settling time assigned to a loop that never settles, over the fastest settling.
-NEVER_SETTLES = 10.0
+UNSETTLED_TIME = 10.0
 # Share of the motors, those of highest cost, whose mean makes half of the cost: covers the tail beyond the 95th
 # percentile with some margin.
-TAIL = 0.1
+TAIL_SHARE = 0.1
 
 
 class Strictness(NamedTuple):
@@ -78,7 +80,7 @@ DESCENT = Strictness(
 )
 # The choice uses exact metrics. Nearly all the allowed overshoot may be used, but exceeding it costs more than it can
 # gain. The tolerance on the sensitivity spares loops that the descent has left right at the limit.
-CHOICE = Strictness(
+SELECTION = Strictness(
     overshoot=3.0, allowed_overshoot=0.97, allowed_sensitivity=1.01, tracking_error=0.0
 )
 
@@ -91,7 +93,7 @@ class Task(eqx.Module):
 
     **Fields**: `setpoint`, rad/s; `load`, N m, applied in the second and third part; `fastest_settling`, s, of any
     controller within the limits; `max_overshoot`, %; `max_sensitivity`, limit of the peak sensitivity, None for no
-    limit; `noise`, rad/s, added to the measured speed at each sample; `step_samples`, samples of each part; `substeps`,
+    limit; `noise`, rad/s, added to the measured speed at each sample; `part_samples`, samples of each part; `substeps`,
     simulation steps per sample, as the motor's effects need.
     """
 
@@ -102,24 +104,24 @@ class Task(eqx.Module):
     max_overshoot: Number
     max_sensitivity: Number | None
     noise: Float[Array, " samples"]
-    step_samples: int = eqx.field(static=True)
+    part_samples: int = eqx.field(static=True)
     substeps: int = eqx.field(static=True, default=1)
 
     def course(self) -> Course:
         """Reference, load and noise at each sample of the three parts."""
-        part = jnp.arange(PARTS * self.step_samples) // self.step_samples
+        part = jnp.arange(PART_COUNT * self.part_samples) // self.part_samples
         reference = jnp.where(part < 2, self.setpoint, SECOND_SETPOINT * self.setpoint)
         load = jnp.where(part < 1, 0.0, self.load)
         return Course(reference, load, self.noise)
 
     def parts(self, response: Response, substeps: int = 1) -> list[tuple[Samples, Samples]]:
         """Time (s) and speed (rad/s) of each part."""
-        count = self.step_samples * substeps
-        cuts = (slice(k * count, (k + 1) * count) for k in range(PARTS))
+        count = self.part_samples * substeps
+        cuts = (slice(k * count, (k + 1) * count) for k in range(PART_COUNT))
         return [(response.time[cut], response.speed[cut]) for cut in cuts]
 
 
-Each = Float[Array | np.ndarray, " motors"]
+PerMotor = Float[Array | np.ndarray, " motors"]
 Part = tuple[Samples, Samples]
 
 
@@ -132,31 +134,32 @@ class Score(NamedTuple):
     sample, over the voltage limit; `sensitivity`, peak over frequency, with the first motor.
     """
 
-    settling: Each
-    overshoot: Each
-    recovery: Each
-    second_settling: Each
-    second_overshoot: Each
-    tracking_error: Each
-    steady_error: Each
-    effort: Each
-    sensitivity: One
+    settling: PerMotor
+    overshoot: PerMotor
+    recovery: PerMotor
+    second_settling: PerMotor
+    second_overshoot: PerMotor
+    tracking_error: PerMotor
+    steady_error: PerMotor
+    effort: PerMotor
+    sensitivity: Scalar
 
 
 def exact_score(
     task: Task, model: SampledMotor, motors: Motor, controller: AbstractController
 ) -> Score:
     """Exact metrics of a controller on every motor, resolved between samples too. `motors` has a leading axis."""
-    setpoint, lower = task.setpoint, SECOND_SETPOINT * task.setpoint
+    setpoint, lower_setpoint = task.setpoint, SECOND_SETPOINT * task.setpoint
 
-    def metrics(step: Part, loaded: Part, second: Part) -> dict[str, One]:
-        first, last = step_metrics(*step, setpoint), step_metrics(*second, lower, setpoint)
+    def metrics(step: Part, loaded: Part, second: Part) -> dict[str, Scalar]:
+        first = step_metrics(*step, setpoint)
+        down = step_metrics(*second, lower_setpoint, setpoint)
         return {
             "settling": first.SettlingTime,
             "overshoot": first.Overshoot,
             "recovery": load_metrics(*loaded, setpoint).RecoveryTime,
-            "second_settling": last.SettlingTime,
-            "second_overshoot": last.Overshoot,
+            "second_settling": down.SettlingTime,
+            "second_overshoot": down.Overshoot,
         }
 
     return _score(task, model, motors, controller, EXACT_SUBSTEPS, metrics)
@@ -166,16 +169,20 @@ def smooth_score(
     task: Task, model: SampledMotor, motors: Motor, controller: AbstractController, width: Number
 ) -> Score:
     """Differentiable approximations of the metrics, from the samples alone; `width`, in bands, sets the smoothing."""
-    setpoint, lower = task.setpoint, SECOND_SETPOINT * task.setpoint
-    soft = SMOOTH_OVERSHOOT * width
+    setpoint, lower_setpoint = task.setpoint, SECOND_SETPOINT * task.setpoint
+    overshoot_width = OVERSHOOT_WIDTH * width
 
-    def metrics(step: Part, loaded: Part, second: Part) -> dict[str, One]:
+    def metrics(step: Part, loaded: Part, second: Part) -> dict[str, Scalar]:
         return {
             "settling": smooth_settling(*step, setpoint, 0.0, width),
-            "overshoot": smooth_overshoot(step[1], setpoint, 0.0, soft * task.max_overshoot),
+            "overshoot": smooth_overshoot(
+                step[1], setpoint, 0.0, overshoot_width * task.max_overshoot
+            ),
             "recovery": smooth_settling(*loaded, setpoint, 0.0, width),
-            "second_settling": smooth_settling(*second, lower, setpoint, width),
-            "second_overshoot": smooth_overshoot(second[1], lower, setpoint, soft),
+            "second_settling": smooth_settling(*second, lower_setpoint, setpoint, width),
+            "second_overshoot": smooth_overshoot(
+                second[1], lower_setpoint, setpoint, overshoot_width
+            ),
         }
 
     return _score(task, model, motors, controller, 1, metrics)
@@ -187,45 +194,45 @@ def _score(
     motors: Motor,
     controller: AbstractController,
     substeps: int,
-    metrics: Callable[[Part, Part, Part], dict[str, One]],
+    metrics: Callable[[Part, Part, Part], dict[str, Scalar]],
 ) -> Score:
     """The given metrics, exact or smooth, with the errors, effort and sensitivity that both share."""
     law, course = Law(controller, task.hardware, model), task.course()
     substeps *= task.substeps
     reference = jnp.repeat(course.reference, substeps)
-    end = round(STEADY_SHARE * task.step_samples * substeps)
+    steady_instants = round(STEADY_SHARE * task.part_samples * substeps)
 
-    def figures(motor: Motor) -> dict[str, One]:
+    def motor_metrics(motor: Motor) -> dict[str, Scalar]:
         response = closed_loop(motor, law, course, substeps)
-        errors = jnp.abs(response.speed / reference - 1).reshape(PARTS, -1)
+        errors = jnp.abs(response.speed / reference - 1).reshape(PART_COUNT, -1)
         changes = jnp.abs(jnp.diff(response.voltage[::substeps]))
         return {
             **metrics(*task.parts(response, substeps)),
             "tracking_error": jnp.mean(errors),
-            "steady_error": jnp.sum(jnp.mean(errors[:2, -end:], axis=1)),
+            "steady_error": jnp.sum(jnp.mean(errors[:2, -steady_instants:], axis=1)),
             "effort": jnp.mean(changes) / task.hardware.voltage_limit,
         }
 
-    first = jax.tree.map(lambda leaf: leaf[0], motors)
-    peak = sensitivity_peak(linear_loop(first, law))
-    return Score(**jax.vmap(figures)(motors), sensitivity=peak)
+    nominal = jax.tree.map(lambda leaf: leaf[0], motors)
+    peak = sensitivity_peak(linear_loop(nominal, law))
+    return Score(**jax.vmap(motor_metrics)(motors), sensitivity=peak)
 
 
 def cost(task: Task, score: Score, strictness: Strictness) -> Float[Array, ""]:
     """Cost to minimise, over all motors: settling over the fastest settling, plus the weighted penalties."""
 
-    def over_fastest(time: Each) -> Each:
-        return jnp.nan_to_num(time / task.fastest_settling, nan=NEVER_SETTLES)
+    def over_fastest(time: PerMotor) -> PerMotor:
+        return jnp.nan_to_num(time / task.fastest_settling, nan=UNSETTLED_TIME)
 
     allowed = strictness.allowed_overshoot * task.max_overshoot
     costs = (
         over_fastest(score.settling)
         + strictness.overshoot * overshoot_cost(score.overshoot, allowed)
-        + RECOVERY * over_fastest(score.recovery)
+        + RECOVERY_WEIGHT * over_fastest(score.recovery)
         + strictness.tracking_error * score.tracking_error
-        + SECOND_SETTLING * over_fastest(score.second_settling)
-        + SECOND_OVERSHOOT * overshoot_cost(score.second_overshoot, 100 * BAND)
-        + STEADY_ERROR * score.steady_error
+        + SECOND_SETTLING_WEIGHT * over_fastest(score.second_settling)
+        + SECOND_OVERSHOOT_WEIGHT * overshoot_cost(score.second_overshoot, 100 * BAND)
+        + STEADY_ERROR_WEIGHT * score.steady_error
         + score.effort
     )
     if task.max_sensitivity is None:
@@ -237,10 +244,10 @@ def cost(task: Task, score: Score, strictness: Strictness) -> Float[Array, ""]:
 def overshoot_cost(overshoot: Number, allowed: Number) -> Number:
     """Penalty on overshoot, %: 0 up to `allowed`; with the excess e, min(e / allowed, 0.3) + 0.3 e beyond."""
     excess = jax.nn.relu(overshoot - allowed)
-    return jnp.minimum(excess / allowed, MOST_BY_RATIO) + EACH_PER_CENT * excess
+    return jnp.minimum(excess / allowed, RATIO_COST_LIMIT) + COST_PER_PERCENT * excess
 
 
-def _mean_and_tail(costs: Each) -> Float[Array, ""]:
+def _mean_and_tail(costs: PerMotor) -> Float[Array, ""]:
     """Half the mean over the motors plus half the mean of the worst tenth."""
-    worst = max(1, round(TAIL * costs.size))
-    return 0.5 * jnp.mean(costs) + 0.5 * jnp.mean(jax.lax.top_k(costs, worst)[0])
+    tail = max(1, round(TAIL_SHARE * costs.size))
+    return 0.5 * jnp.mean(costs) + 0.5 * jnp.mean(jax.lax.top_k(costs, tail)[0])

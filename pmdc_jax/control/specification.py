@@ -12,26 +12,28 @@ from attrs import frozen
 from ..errors import InputError
 from ..motor import Motor
 from .controllers import CONTROLLERS
+from .feasibility import check_reachable, check_settling, default_load_torque, steady_speed
 from .hardware import Hardware
-from .limit import fastest_settling
 from .loop import REMEMBERED_SAMPLES
-from .requirements import check_reachable, check_settling, reach, spare_torque
 from .steady import steady_state
+from .time_optimal import fastest_settling
 
 NOMINAL_VOLTAGE = 24.0  # V, voltage limit if neither it nor the set point is given
 VOLTAGE_RESERVE = 1.25  # default voltage limit over the voltage that holds the set point
 SETPOINT_SHARE = 0.8  # default set point over the speed that the voltage limit reaches
 MAX_SENSITIVITY = 2.0  # default limit of the peak sensitivity
-LONGEST_SAMPLE_TIME = 1e-3  # s, longest default sample time
-SAMPLES_PER_SETTLING = 40  # at least so many default sample times in the fastest settling
-FEW_SAMPLES = 10  # samples in the fastest settling; with fewer the loop loses much performance
-TOO_LONG = 10  # sample time over the fastest settling, above which it must be a mistake
+MAX_DEFAULT_SAMPLE_TIME = 1e-3  # s
+SAMPLES_PER_SETTLING = 40  # least number of default sample times in the fastest settling
+SUFFICIENT_SAMPLES = 10  # in the fastest settling; with fewer the loop loses much performance
+MAX_SAMPLE_TIME_RATIO = (
+    10  # sample time over the fastest settling, above which it must be a mistake
+)
 # Duration of each part of the task: at least 2.5 times the fastest settling, and at least the fastest settling plus 20
 # dead times of the loop.
 PART_SETTLINGS = 2.5
 PART_DEAD_TIMES = 20
-LEAST_SAMPLES = 32  # in each part of the task
-MOST_SAMPLES = 20_000  # in each part of the task
+MIN_SAMPLES = 32  # in each part of the task
+MAX_SAMPLES = 20_000  # in each part of the task
 
 
 @frozen
@@ -64,36 +66,38 @@ class LoopRequirements:
         if self.delay not in (0, 1):
             message = f"{self.delay} samples are not supported"
             raise InputError("--delay", message, "Choose 0 or 1")
-        _check("setpoint", self.setpoint, "a speed to go to", lambda x: x != 0)
-        _check("load_torque", self.load_torque, "a number", lambda x: True)
+        _check_number("setpoint", self.setpoint, "a speed to go to", lambda x: x != 0)
+        _check_number("load_torque", self.load_torque, "a number", lambda x: True)
         for name in ("max_overshoot", "speed_noise", "spread"):
-            _check(name, getattr(self, name), "a number from 0 up", lambda x: x >= 0)
+            _check_number(name, getattr(self, name), "a number from 0 up", lambda x: x >= 0)
         for name in ("voltage_limit", "current_limit", "sample_time", "max_settling", "speed_step"):
-            _check(name, getattr(self, name), "a positive number", lambda x: x > 0)
-        _check("max_sensitivity", self.max_sensitivity, "a positive number", lambda x: x > 0)
+            _check_number(name, getattr(self, name), "a positive number", lambda x: x > 0)
+        _check_number("max_sensitivity", self.max_sensitivity, "a positive number", lambda x: x > 0)
 
     def completed(self, motor: Motor) -> Specification:
         """The specification for a motor, with defaults for what is left open.
 
         **Raises**: `InputError`, stating the limit, where no controller can meet it.
         """
-        setpoint, voltage_limit, chosen_limits = self._operating_point(motor)
-        limits = motor, setpoint, voltage_limit, self.current_limit
-        check_reachable(*limits, 0.0)
+        setpoint, voltage_limit, limit_notes = self._operating_point(motor)
+        operation = motor, setpoint, voltage_limit, self.current_limit
+        check_reachable(*operation, 0.0)
         if self.load_torque:
-            check_reachable(*limits, self.load_torque, "--load-torque")
-        fastest = check_settling(self.max_settling, fastest_settling(*limits), setpoint)
-        sample_time, chosen_sampling = self._sampling(fastest)
+            check_reachable(*operation, self.load_torque, "--load-torque")
+        fastest = check_settling(self.max_settling, fastest_settling(*operation), setpoint)
+        sample_time, sampling_notes = self._sampling(fastest)
         _check_sensor(motor, sample_time)
         return Specification(
-            asked=self,
+            requirements=self,
             setpoint=setpoint,
             voltage_limit=voltage_limit,
             sample_time=sample_time,
-            load_torque=spare_torque(*limits) if self.load_torque is None else self.load_torque,
+            load_torque=default_load_torque(*operation)
+            if self.load_torque is None
+            else self.load_torque,
             fastest_settling=fastest,
-            samples=_samples(motor, fastest, sample_time, self.delay),
-            notes=(*chosen_limits, *chosen_sampling),
+            part_samples=_part_samples(motor, fastest, sample_time, self.delay),
+            notes=(*limit_notes, *sampling_notes),
         )
 
     def _operating_point(self, motor: Motor) -> tuple[float, float, list[str]]:
@@ -103,33 +107,34 @@ class LoopRequirements:
         if voltage_limit is None:
             voltage_limit = NOMINAL_VOLTAGE
             if setpoint is not None:
-                held_by = abs(float(steady_state(motor, setpoint)[1]))
-                voltage_limit = _three_digits(VOLTAGE_RESERVE * held_by)
+                holding_voltage = abs(float(steady_state(motor, setpoint)[1]))
+                voltage_limit = _three_digits(VOLTAGE_RESERVE * holding_voltage)
             notes.append(f"no voltage limit given: {voltage_limit:g} V")
         if setpoint is None:
-            setpoint = _three_digits(SETPOINT_SHARE * reach(motor, voltage_limit))
+            setpoint = _three_digits(SETPOINT_SHARE * steady_speed(motor, voltage_limit))
             notes.append(
-                f"no set point given: {setpoint:g} rad/s, 80 % of what the voltage reaches"
+                f"no set point given: {setpoint:g} rad/s,"
+                f" {100 * SETPOINT_SHARE:g} % of what the voltage reaches"
             )
         return setpoint, voltage_limit, notes
 
     def _sampling(self, fastest: float) -> tuple[float, list[str]]:
         """Sample time (s) for a fastest settling of `fastest` (s), and a note if it is a default or rather long."""
-        suitable = min(LONGEST_SAMPLE_TIME, _round_number(fastest / SAMPLES_PER_SETTLING))
+        suitable = min(MAX_DEFAULT_SAMPLE_TIME, _rounded_down(fastest / SAMPLES_PER_SETTLING))
         if self.sample_time is None:
             return suitable, [f"no sample time given: {suitable:g} s"]
-        if self.sample_time <= fastest / FEW_SAMPLES:
+        if self.sample_time <= fastest / SUFFICIENT_SAMPLES:
             return self.sample_time, []
-        if self.sample_time > TOO_LONG * fastest:
+        if self.sample_time > MAX_SAMPLE_TIME_RATIO * fastest:
             raise InputError(
                 "--sample-time",
                 f"{self.sample_time:g} s is far longer than the fastest settling, {fastest:.3g} s:"
                 " nothing happens while a controller could see it",
                 f"It is in seconds; {suitable:g} would suit this motor",
             )
-        taken = f"{fastest / self.sample_time:.2g} samples of {self.sample_time:g} s"
+        samples = f"{fastest / self.sample_time:.2g} samples of {self.sample_time:g} s"
         remark = (
-            f"the fastest settling, {fastest:.3g} s, takes {taken}:"
+            f"the fastest settling, {fastest:.3g} s, takes {samples}:"
             f" a sample time of {suitable:g} s would lose less"
         )
         return self.sample_time, [remark]
@@ -139,47 +144,49 @@ class LoopRequirements:
 class Specification:
     """Complete specification of a loop.
 
-    **Fields**: `asked`, the user's requirements; `setpoint`, rad/s; `voltage_limit`, V; `sample_time`, s;
-    `load_torque`, N m; `fastest_settling`, s, of any controller within the limits; `samples` in each part of the task;
-    `notes`, on the defaults chosen.
+    **Fields**: `requirements`, the user's; `setpoint`, rad/s; `voltage_limit`, V; `sample_time`, s;
+    `load_torque`, N m; `fastest_settling`, s, of any controller within the limits; `part_samples`, in each part of
+    the task; `notes`, on the defaults chosen.
     """
 
-    asked: LoopRequirements
+    requirements: LoopRequirements
     setpoint: float
     voltage_limit: float
     sample_time: float
     load_torque: float
     fastest_settling: float
-    samples: int
+    part_samples: int
     notes: tuple[str, ...]
 
     def hardware(self) -> Hardware:
         """The loop's hardware. Its numbers are arrays, so that other values do not cause recompilation."""
-        asked = self.asked
+        requirements = self.requirements
         hardware = Hardware(
             self.sample_time,
             self.voltage_limit,
-            asked.current_limit,
-            asked.speed_step,
-            asked.delay,
-            asked.measures_current,
+            requirements.current_limit,
+            requirements.speed_step,
+            requirements.delay,
+            requirements.measures_current,
         )
         return jax.tree.map(lambda x: jnp.asarray(x, float), hardware)
 
 
-def _check(name: str, value: float | None, wanted: str, is_right: Callable[[float], bool]) -> None:
-    if value is not None and not (math.isfinite(value) and is_right(value)):
+def _check_number(
+    name: str, value: float | None, wanted: str, is_valid: Callable[[float], bool]
+) -> None:
+    if value is not None and not (math.isfinite(value) and is_valid(value)):
         option = "--" + name.replace("_", "-")
         raise InputError(option, f"{value:g} is not {wanted}", "Give it in SI units")
 
 
-def _samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> int:
+def _part_samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> int:
     """Samples in one part of the task, rounded up to 2^k or 1.5 2^k so that few shapes are compiled."""
     # no loop is much faster than its hold, its delay and a quarter of the electrical time constant together
     dead_time = float(motor.L / motor.R) / 4 + (1 + delay) * sample_time
     duration = max(PART_SETTLINGS * fastest, fastest + PART_DEAD_TIMES * dead_time)
-    needed = max(LEAST_SAMPLES, math.ceil(duration / sample_time))
-    if needed > MOST_SAMPLES:
+    needed = max(MIN_SAMPLES, math.ceil(duration / sample_time))
+    if needed > MAX_SAMPLES:
         raise InputError(
             "--sample-time",
             f"{sample_time:g} s makes {needed} samples of one step",
@@ -191,11 +198,11 @@ def _samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> in
 
 def _check_sensor(motor: Motor, sample_time: float) -> None:
     """Raise an `InputError` if the speed sensor's delay is longer than the simulated loop remembers."""
-    late = motor.speed_delay()
-    if late is not None and float(late) > (REMEMBERED_SAMPLES - 2) * sample_time:
+    delay = motor.speed_delay()
+    if delay is not None and float(delay) > (REMEMBERED_SAMPLES - 2) * sample_time:
         raise InputError(
             "--sample-time",
-            f"the speed sensor is {float(late):g} s late, more than {REMEMBERED_SAMPLES - 2} samples",
+            f"the speed sensor is {float(delay):g} s late, more than {REMEMBERED_SAMPLES - 2} samples",
             "Choose a longer sample time",
         )
 
@@ -204,7 +211,7 @@ def _three_digits(value: float) -> float:
     return float(f"{value:.3g}")
 
 
-def _round_number(value: float) -> float:
+def _rounded_down(value: float) -> float:
     """Largest of 1, 2 or 5 times a power of ten that does not exceed `value`."""
     power = 10.0 ** math.floor(math.log10(value))
     return _three_digits(max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power)

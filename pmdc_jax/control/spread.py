@@ -20,21 +20,21 @@ def drawn_motors(motor: Motor, uncertainty: Uncertainty, count: int, seed: int) 
     """Draw `count` motors around `motor`, stacked. The coordinates are normally distributed: logarithms of the
     parameters, or the parameters themselves where the `ranges` of an effect say linear."""
     rng = np.random.default_rng(seed)
-    deviations = _normal(rng, np.asarray(uncertainty.covariance, float), count)
+    deviations = _antithetic_normal(rng, np.asarray(uncertainty.covariance, float), count)
     stacked = jax.tree.map(lambda leaf: jnp.full(count, leaf, float), motor)
-    moved = {name: deviations[:, k] for k, name in enumerate(uncertainty.names)}
-    constants = {n: getattr(stacked, n) * np.exp(moved.get(n, 0.0)) for n in PARAMETERS}
+    deviation = {name: deviations[:, k] for k, name in enumerate(uncertainty.names)}
+    constants = {n: getattr(stacked, n) * np.exp(deviation.get(n, 0.0)) for n in PARAMETERS}
     effects = []
     for effect in stacked.effects:
         fields = {}
-        for field, r in EFFECTS[effect.name].ranges.items():
-            value, by = getattr(effect, field), moved.get(f"{effect.name}.{field}", 0.0)
-            fields[field] = value * np.exp(by) if r.scale == "log" else value + by
+        for name, allowed in EFFECTS[effect.name].ranges.items():
+            value, by = getattr(effect, name), deviation.get(f"{effect.name}.{name}", 0.0)
+            fields[name] = value * np.exp(by) if allowed.scale == "log" else value + by
         effects.append(type(effect)(**fields))
     return Motor(**constants, effects=tuple(effects))
 
 
-def _normal(rng: np.random.Generator, covariance: np.ndarray, count: int) -> np.ndarray:
+def _antithetic_normal(rng: np.random.Generator, covariance: np.ndarray, count: int) -> np.ndarray:
     """Normal draws in pairs of opposite sign, so that the mean of an even count is 0; `covariance` may be singular."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))

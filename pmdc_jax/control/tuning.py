@@ -18,16 +18,24 @@ from ..motor_file import Uncertainty
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..simulate.propagator import steps_within
-from .classical import RULED, ziegler_nichols
+from .classical import ZIEGLER_NICHOLS_CONTROLLERS, ziegler_nichols
 from .controllers import AbstractController
 from .descent import STARTS, best_coordinates
+from .evaluation import (
+    SMALL_STEP,
+    Candidate,
+    Robustness,
+    evaluate,
+    evaluate_robustness,
+    simulate_speeds,
+    simulate_task,
+)
 from .gains import GainSpace
 from .hardware import Hardware
-from .judge import SMALL_STEP, JudgedController, Robustness, judged, simulated, speeds
 from .law import Law
 from .loop import Response
 from .margins import Margins, margins
-from .objective import PARTS, Task
+from .objective import PART_COUNT, Task
 from .specification import MAX_SENSITIVITY, LoopRequirements, Specification
 from .spread import drawn_motors, even_spread
 
@@ -37,11 +45,11 @@ VALIDATION_MOTORS = 256  # motors drawn independently of these to judge the resu
 # the voltage jitter.
 TUNING_NOISE = 2e-4
 # Minimum of the allowed overshoot in the cost, %, because the excess is divided by it.
-LEAST_OVERSHOOT = 0.01
+MIN_ALLOWED_OVERSHOOT = 0.01
 # Thresholds for a message: overshoot of the small step, over the larger of the allowed overshoot and the overshoot of
 # the full step; and peak sensitivity, over its default limit.
-NOTABLE_OVERSHOOT = 1.2
-NOTABLE_SENSITIVITY = 1.1
+OVERSHOOT_TO_REPORT = 1.2
+SENSITIVITY_TO_REPORT = 1.1
 
 
 @frozen
@@ -51,11 +59,11 @@ class Tuning:
     law: Law
     motor: Motor
     task: Task
-    asked: LoopRequirements
+    requirements: LoopRequirements
     margins: Margins
-    candidates: tuple[JudgedController, ...]  # the tuned one first
+    candidates: tuple[Candidate, ...]  # the tuned one first
     response: Response = field(repr=False, converter=lambda r: Response(*map(np.asarray, r)))
-    bundle: np.ndarray | None = field(repr=False)  # (motors, samples) rad/s, of the drawn motors
+    validation_speeds: np.ndarray | None = field(repr=False)  # (motors, samples) rad/s
     seed: int
     seconds: Mapping[str, float] = field(factory=dict)
     messages: tuple[str, ...] = ()
@@ -86,9 +94,9 @@ class Tuning:
         return float(self.task.load)
 
     @property
-    def load_from(self) -> float:
+    def load_step_time(self) -> float:
         """Time of the load step, s."""
-        return self.task.step_samples * float(self.hardware.sample_time)
+        return self.task.part_samples * float(self.hardware.sample_time)
 
     @property
     def fastest_possible_settling(self) -> float:
@@ -114,9 +122,9 @@ class Tuning:
     def meets_specification(self) -> bool:
         """Whether the overshoot, and the settling time if limited, meet the specification on the nominal motor."""
         overshoot, settling = self.metrics["Overshoot"], self.metrics["SettlingTime"]
-        if overshoot is None or settling is None or overshoot > self.asked.max_overshoot:
+        if overshoot is None or settling is None or overshoot > self.requirements.max_overshoot:
             return False
-        return self.asked.max_settling is None or settling <= self.asked.max_settling
+        return self.requirements.max_settling is None or settling <= self.requirements.max_settling
 
 
 def tune(
@@ -200,50 +208,66 @@ def design(
     report = progress or silent
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
     specification = requirements.completed(motor)
-    tuning_motors, validation_motors = _tuning_and_validation_motors(
-        motor, uncertainty, requirements.spread, seed
-    )
+    spread = requirements.spread
+    variation = uncertainty if spread is None else even_spread(spread)
     report("tuning from many starts")
-    unit_noise = np.random.default_rng(seed).standard_normal(PARTS * specification.samples)
+    task_samples = PART_COUNT * specification.part_samples
+    unit_noise = np.random.default_rng(seed).standard_normal(task_samples)
     task = _task(specification, motor, unit_noise)
-    controller = _tuned(specification, task, tuning_motors, unit_noise, seed, starts)
+    tuning_motors = _tuning_motors(motor, variation, seed)
+    controller = _best_controller(specification, task, tuning_motors, unit_noise, seed, starts)
     report("judging the loop", fraction=0.8)
-    result = _judged(specification, task, motor, controller, validation_motors, seed)
+    validation_motors = None if variation is None else _validation_motors(motor, variation, seed)
+    result = _evaluated(specification, task, motor, controller, validation_motors, seed)
     return attrs.evolve(
         result,
-        messages=(*specification.notes, *_undetermined(uncertainty), *_verdicts(result)),
+        messages=(*specification.notes, *_undetermined_remark(uncertainty), *_remarks(result)),
         seconds={"total": time.perf_counter() - begin},
     )
 
 
 @double_precision
-def robustness(tuning: Tuning, spread: float, seed: int) -> Robustness | None:
+def robustness(tuning: Tuning, spread: float, seed: int) -> Robustness:
     """Metrics of a tuning over motors that it was not tuned for; `spread` as in `tune`."""
-    _, motors = _tuning_and_validation_motors(tuning.motor, None, spread, seed)
-    return judged("tuned", tuning.task, tuning.motor, tuning.controller, motors).robust
+    motors = _validation_motors(tuning.motor, even_spread(spread), seed)
+    return evaluate_robustness(tuning.task, tuning.motor, tuning.controller, motors)
 
 
 def _task(specification: Specification, motor: Motor, unit_noise: np.ndarray) -> Task:
-    """The task on which a controller is judged, with the noise of the sensor."""
-    asked = specification.asked
-    stall = float(specification.voltage_limit / motor.R)
-    most = min(stall, asked.current_limit or stall)
+    """The task on which a controller is evaluated, with the noise of the sensor."""
+    requirements = specification.requirements
+    stall_current = float(specification.voltage_limit / motor.R)
+    max_current = min(stall_current, requirements.current_limit or stall_current)
     return Task(
         hardware=specification.hardware(),
         setpoint=jnp.asarray(specification.setpoint),
         load=jnp.asarray(specification.load_torque),
         fastest_settling=jnp.asarray(specification.fastest_settling),
-        max_overshoot=jnp.asarray(max(asked.max_overshoot, LEAST_OVERSHOOT)),
+        max_overshoot=jnp.asarray(max(requirements.max_overshoot, MIN_ALLOWED_OVERSHOOT)),
         max_sensitivity=None
-        if asked.max_sensitivity is None
-        else jnp.asarray(asked.max_sensitivity),
-        noise=jnp.asarray(asked.speed_noise * unit_noise),
-        step_samples=specification.samples,
-        substeps=int(steps_within(motor, specification.sample_time, jnp.asarray(most))),
+        if requirements.max_sensitivity is None
+        else jnp.asarray(requirements.max_sensitivity),
+        noise=jnp.asarray(requirements.speed_noise * unit_noise),
+        part_samples=specification.part_samples,
+        substeps=int(steps_within(motor, specification.sample_time, jnp.asarray(max_current))),
     )
 
 
-def _tuned(
+def _tuning_motors(motor: Motor, variation: Uncertainty | None, seed: int) -> Motor:
+    """Motors to tune on, stacked: the nominal one first, then those drawn from the variation, if any."""
+    nominal = jax.tree.map(lambda leaf: leaf[None], motor)
+    if variation is None:
+        return nominal
+    drawn = drawn_motors(motor, variation, TUNING_MOTORS, seed)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), nominal, drawn)
+
+
+def _validation_motors(motor: Motor, variation: Uncertainty, seed: int) -> Motor:
+    """Motors to validate on, stacked; drawn independently of those to tune on."""
+    return drawn_motors(motor, variation, VALIDATION_MOTORS, seed + 1)
+
+
+def _best_controller(
     specification: Specification,
     task: Task,
     motors: Motor,
@@ -252,17 +276,23 @@ def _tuned(
     starts: int,
 ) -> AbstractController:
     """Best controller of all starts, tuned with at least `TUNING_NOISE` even if the sensor has none."""
+    requirements = specification.requirements
     nominal = jax.tree.map(lambda leaf: leaf[0], motors)
-    stiffness = jnp.asarray(specification.voltage_limit / abs(specification.setpoint))
-    period, kind = task.hardware.sample_time, specification.asked.controller
-    space = GainSpace(kind, stiffness, task.fastest_settling, period, nominal, task.setpoint)
-    least = TUNING_NOISE * abs(specification.setpoint)
-    shaken = jnp.asarray(max(specification.asked.speed_noise, least) * unit_noise)
-    noisy = eqx.tree_at(lambda t: t.noise, task, shaken)
-    return space.controller(jnp.asarray(best_coordinates(noisy, space, motors, seed, starts)))
+    space = GainSpace(
+        kind=requirements.controller,
+        gain_unit=jnp.asarray(specification.voltage_limit / abs(specification.setpoint)),
+        time_unit=task.fastest_settling,
+        sample_time=task.hardware.sample_time,
+        motor=nominal,
+        setpoint=task.setpoint,
+    )
+    speed_noise = max(requirements.speed_noise, TUNING_NOISE * abs(specification.setpoint))
+    tuning_task = eqx.tree_at(lambda t: t.noise, task, jnp.asarray(speed_noise * unit_noise))
+    coordinates = best_coordinates(tuning_task, space, motors, seed, starts)
+    return space.controller(jnp.asarray(coordinates))
 
 
-def _judged(
+def _evaluated(
     specification: Specification,
     task: Task,
     motor: Motor,
@@ -270,51 +300,37 @@ def _judged(
     validation_motors: Motor | None,
     seed: int,
 ) -> Tuning:
-    """Exact metrics of the tuned controller and of its textbook rivals."""
+    """The result: exact metrics of the tuned controller and of its textbook rivals."""
     law = Law.of(controller, task.hardware, motor)
-    asked = specification.asked
+    requirements = specification.requirements
     return Tuning(
         law=law,
         motor=motor,
         task=task,
-        asked=asked,
+        requirements=requirements,
         margins=margins(motor, law),
         candidates=(
-            judged("tuned", task, motor, controller, validation_motors),
-            *_rivals(task, motor, asked.controller, validation_motors),
+            evaluate("tuned", task, motor, controller, validation_motors),
+            *_textbook_candidates(task, motor, requirements.controller, validation_motors),
         ),
-        response=simulated(task, motor, law),
-        bundle=None
+        response=simulate_task(task, motor, law),
+        validation_speeds=None
         if validation_motors is None
-        else np.asarray(speeds(task, validation_motors, law)),
+        else np.asarray(simulate_speeds(task, validation_motors, law)),
         seed=seed,
     )
 
 
-def _tuning_and_validation_motors(
-    motor: Motor, uncertainty: Uncertainty | None, spread: float | None, seed: int
-) -> tuple[Motor, Motor | None]:
-    """Motors to tune on, the nominal one first, and motors to validate on (None without uncertainty), stacked."""
-    nominal = jax.tree.map(lambda leaf: leaf[None], motor)
-    if spread is not None:
-        uncertainty = even_spread(spread)
-    if uncertainty is None:
-        return nominal, None
-    others = drawn_motors(motor, uncertainty, TUNING_MOTORS, seed)
-    tuning_motors = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), nominal, others)
-    return tuning_motors, drawn_motors(motor, uncertainty, VALIDATION_MOTORS, seed + 1)
-
-
-def _rivals(
+def _textbook_candidates(
     task: Task, motor: Motor, kind: str, validation_motors: Motor | None
-) -> Iterator[JudgedController]:
+) -> Iterator[Candidate]:
     """Controllers by textbook rules, for comparison."""
-    if kind in RULED:
-        rule = ziegler_nichols(motor, task.hardware, kind)
-        yield judged("Ziegler-Nichols", task, motor, rule, validation_motors)
+    if kind in ZIEGLER_NICHOLS_CONTROLLERS:
+        controller = ziegler_nichols(motor, task.hardware, kind)
+        yield evaluate("Ziegler-Nichols", task, motor, controller, validation_motors)
 
 
-def _undetermined(uncertainty: Uncertainty | None) -> Iterator[str]:
+def _undetermined_remark(uncertainty: Uncertainty | None) -> Iterator[str]:
     """A message on the parameters that no recording determined."""
     if uncertainty is not None and uncertainty.undetermined:
         yield (
@@ -323,19 +339,20 @@ def _undetermined(uncertainty: Uncertainty | None) -> Iterator[str]:
         )
 
 
-def _verdicts(result: Tuning) -> Iterator[str]:
+def _remarks(result: Tuning) -> Iterator[str]:
     """Messages on unmet requirements, and warnings."""
-    yield from _unmet(result)
+    yield from _unmet_requirements(result)
     yield from _small_step_remark(result)
     peak = result.margins.sensitivity_peak
-    if peak is not None and peak > NOTABLE_SENSITIVITY * MAX_SENSITIVITY:
+    if peak is not None and peak > SENSITIVITY_TO_REPORT * MAX_SENSITIVITY:
         yield f"the loop has thin margins: its sensitivity reaches {peak:.2f}"
 
 
-def _unmet(result: Tuning) -> Iterator[str]:
+def _unmet_requirements(result: Tuning) -> Iterator[str]:
     """Messages where settling or overshoot miss the specification."""
     overshoot, settling = result.metrics["Overshoot"], result.metrics["SettlingTime"]
-    max_settling, max_overshoot = result.asked.max_settling, result.asked.max_overshoot
+    requirements = result.requirements
+    max_settling, max_overshoot = requirements.max_settling, requirements.max_overshoot
     if settling is None:
         yield "the loop does not settle: try another controller or a shorter sample time"
     elif max_settling is not None and settling > max_settling:
@@ -349,12 +366,12 @@ def _small_step_remark(result: Tuning) -> Iterator[str]:
     sensor's quantum."""
     overshoot = result.candidates[0].small_step["Overshoot"] or 0.0
     step = SMALL_STEP * result.setpoint
-    allowed = NOTABLE_OVERSHOOT * max(
-        result.asked.max_overshoot, result.metrics["Overshoot"] or 0.0
+    allowed = OVERSHOOT_TO_REPORT * max(
+        result.requirements.max_overshoot, result.metrics["Overshoot"] or 0.0
     )
-    quantum = result.asked.speed_step or 0.0
+    quantum = result.requirements.speed_step or 0.0
     if overshoot > allowed and overshoot / 100 * abs(step) > quantum:
         yield (
-            f"a step of {step:.3g} rad/s, which no limit slows down, overshoots by {overshoot:.3g} %: tune for a"
-            " smaller set point if such steps matter"
+            f"a small step, of {step:.3g} rad/s, overshoots by {overshoot:.3g} %, more than the step to the set point:"
+            " tune for a smaller set point if such steps matter"
         )

@@ -20,7 +20,7 @@ INPUT = "#4b5563"
 INK = "#27313f"
 GRID = "#e6e9ee"
 EDGE = "#c3cad4"
-DASHED = {"color": INK, "width": 1, "dash": "4px 3px"}
+NOISE_LINE = {"color": INK, "width": 1, "dash": "4px 3px"}
 FONT = "Inter, system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 # by channel: axis title of its residual, and key of its noise
 RESIDUALS = {
@@ -68,7 +68,7 @@ def mark_noise(figure: go.Figure, row: int, noise: float | None) -> None:
     """Draw dashed lines two standard deviations of the noise either side of zero, if it is known."""
     for level in (-2 * noise, 2 * noise) if noise else ():
         # the type annotation of `row` in plotly allows only "all"
-        figure.add_hline(y=level, line=DASHED, row=row)  # pyright: ignore[reportArgumentType]
+        figure.add_hline(y=level, line=NOISE_LINE, row=row)  # pyright: ignore[reportArgumentType]
 
 
 def search_figure(search: Search) -> go.Figure:

@@ -19,7 +19,7 @@ from .figures import (
 )
 from .notation import (
     PARAMETER_NAMES,
-    Written,
+    EstimateText,
     fixed,
     parameter_words,
     percent,
@@ -66,7 +66,7 @@ def identification_content(identification: Identification, other_traces: int = 0
 class _Parameter:
     symbol: str
     name: str
-    written: Written
+    written: EstimateText
     status: str
     status_word: str
 

@@ -11,7 +11,7 @@ from ..effects import EFFECTS
 from ..identify.identification import Estimate
 
 UNKNOWN = "–"
-NARROW = "\u202f"  # narrow no-break space
+NARROW_SPACE = "\u202f"  # narrow no-break space
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 PARAMETER_NAMES = {
     "R": "armature resistance",
@@ -25,7 +25,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @frozen
-class Written:
+class EstimateText:
     """An estimate as texts: value, standard error and interval share one scaled unit and number of decimals."""
 
     value: str
@@ -35,7 +35,7 @@ class Written:
     unit: str
 
 
-def write_estimate(estimate: Estimate) -> Written:
+def write_estimate(estimate: Estimate) -> EstimateText:
     """Write an estimate with as many decimals as give its standard error two significant digits."""
     exponent = engineering_exponent(estimate.value or 0.0, estimate.unit)
     scale = 10.0**exponent
@@ -51,7 +51,7 @@ def write_estimate(estimate: Estimate) -> Written:
     if estimate.stderr is not None and estimate.value:
         relative = percent(100 * estimate.stderr / abs(estimate.value))
     unit = scaled_unit(estimate.unit, exponent)
-    return Written(write(estimate.value), write(estimate.stderr), interval, relative, unit)
+    return EstimateText(write(estimate.value), write(estimate.stderr), interval, relative, unit)
 
 
 def significant(value: float | None, digits: int = 3) -> str:
@@ -72,7 +72,7 @@ def value_with_unit(value: float, unit: str, digits: int = 3) -> str:
 
 def thousands(count: int) -> str:
     """A count in groups of three digits, separated by narrow no-break spaces."""
-    return f"{count:,}".replace(",", NARROW)
+    return f"{count:,}".replace(",", NARROW_SPACE)
 
 
 def engineering_exponent(value: float, unit: str) -> int:
@@ -105,8 +105,8 @@ def percent(value: float | None) -> str:
     if value is None or not isfinite(value):
         return UNKNOWN
     if 90 < abs(value) <= 100:
-        return f"{fixed(value, 2)}{NARROW}%"
-    return f"{significant(value, 3 if abs(value) >= 10 else 2)}{NARROW}%"
+        return f"{fixed(value, 2)}{NARROW_SPACE}%"
+    return f"{significant(value, 3 if abs(value) >= 10 else 2)}{NARROW_SPACE}%"
 
 
 def fixed(value: float | None, decimals: int) -> str:

@@ -53,10 +53,10 @@ def table_1(paper: Paper) -> tuple[list[str], list[list[str]]]:
     return headings, rows
 
 
-def _effort_row(name: str, paper: Paper, shown: Callable[[Recovered], str]) -> list[str]:
+def _effort_row(name: str, paper: Paper, text_of: Callable[[Recovered], str]) -> list[str]:
     row = [name, ""]
     for one in paper.recovered:
-        row += [shown(one), ""]
+        row += [text_of(one), ""]
     return row
 
 
@@ -124,7 +124,7 @@ def paper_tables(paper: Paper) -> RenderableType:
     """Both tables and the remarks."""
     tables = [
         plain_table("Table 1: the motor, from a virtual load test", *table_1(paper)),
-        plain_table("Table 2: steps to 481 rad/s", *table_2(paper)),
+        plain_table(f"Table 2: steps to {SETPOINT:g} rad/s", *table_2(paper)),
     ]
     return Group(tables[0], "", tables[1], "", *(Text(one) for one in remarks(paper)))
 
@@ -144,7 +144,7 @@ def paper_json(paper: Paper) -> dict[str, Any]:
         "table_2": {
             kind: {
                 "printed": {"Overshoot": printed.overshoot, "SettlingTime": printed.settling},
-                "simulated_as_printed": _as_printed(paper, kind),
+                "simulated_as_printed": _as_printed_json(paper, kind),
                 "ours": dict(paper.tunings[kind].metrics),
             }
             for kind, printed in TABLE_2.items()
@@ -155,7 +155,7 @@ def paper_json(paper: Paper) -> dict[str, Any]:
     }
 
 
-def _as_printed(paper: Paper, kind: str) -> dict[str, float] | None:
+def _as_printed_json(paper: Paper, kind: str) -> dict[str, float] | None:
     if kind not in paper.as_printed:
         return None
     found = paper.as_printed[kind]
@@ -169,10 +169,11 @@ def _as_printed(paper: Paper, kind: str) -> dict[str, float] | None:
 def write_paper(paper: Paper, path: str | Path) -> None:
     """Write tables, figures and remarks to one self-contained HTML file."""
     steps = f"0 to {SETPOINT:g}, then to {LOWER_SETPOINT:g} rad/s"
+    load_errors_title = "Error of the steady {} against load torque"
     figures = [
         ("Fig. 4", "Best fitness against generations", fitness_figure(paper.recovered)),
-        ("Fig. 5", "Error of the steady speed against load torque", errors_figure(paper, 0)),
-        ("Fig. 6", "Error of the steady current against load torque", errors_figure(paper, 1)),
+        ("Fig. 5", load_errors_title.format("speed"), errors_figure(paper, "speed")),
+        ("Fig. 6", load_errors_title.format("current"), errors_figure(paper, "current")),
         ("Figs 7 and 8", steps, steps_figure(paper)),
     ]
     tables = [
@@ -182,6 +183,7 @@ def write_paper(paper: Paper, path: str | Path) -> None:
     write_page(
         path,
         "paper.html.jinja",
+        setpoint=f"{SETPOINT:g}",
         remarks=remarks(paper),
         tables=tables,
         figures=[(number, title, figure_json(figure)) for number, title, figure in figures],
@@ -204,15 +206,15 @@ def fitness_figure(recovered: tuple[Recovered, ...]) -> go.Figure:
     return figure
 
 
-def errors_figure(paper: Paper, row: int) -> go.Figure:
-    """Figs 5 and 6: error of the steady speed (`row` 0) or current (`row` 1) over the load torque."""
+def errors_figure(paper: Paper, quantity: str) -> go.Figure:
+    """Figs 5 and 6: error of the steady "speed" or "current" over the load torque."""
     figure = go.Figure()
     for one, colour in zip(paper.recovered, COLOURS, strict=False):
-        errors = load_errors(one.motor)[row]
+        errors = load_errors(one.motor)[quantity]
         figure.add_trace(
             go.Scatter(x=LOADS, y=errors, name=one.method, line_color=colour, mode="lines+markers")
         )
-    figure.update_yaxes(title_text=f"error of {('speed', 'current')[row]} [%]")
+    figure.update_yaxes(title_text=f"error of {quantity} [%]")
     figure.update_xaxes(title_text="load torque [N m]")
     style(figure, height=300)
     return figure

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from ..identify.identification import Estimate, Identification, Role, RunFit
-from .notation import NARROW, enumerate_words, percent, significant
+from .notation import NARROW_SPACE, enumerate_words, percent, significant
 
 STATUS_WORDS = {
     "identified": "identified",
@@ -50,8 +50,8 @@ def cautions(identification: Identification) -> list[str]:
             " the numbers hold only as far as that is harmless or mended."
         )
     directions = identification.unidentified_directions
-    told = (f"{as_sentence(one.why)} {as_sentence(one.mend)}" for one in directions)
-    sentences += dict.fromkeys(told)  # several directions may have one reason
+    reasons = (f"{as_sentence(one.why)} {as_sentence(one.mend)}" for one in directions)
+    sentences += dict.fromkeys(reasons)  # several directions may have the same
     at_bound = _with_status(identification, "at_bound")
     if at_bound:
         who = f"{enumerate_words(at_bound)} {'stand' if len(at_bound) > 1 else 'stands'}"
@@ -71,7 +71,7 @@ def runs_in_order(identification: Identification) -> list[tuple[str, RunFit]]:
 def _identified_sentence(identification: Identification) -> str:
     parameters = identification.parameters
     identified = _with_status(identification, "identified")
-    open_ones = _with_status(identification, "not_identifiable")
+    not_identifiable = _with_status(identification, "not_identifiable")
     training = sum(fit.role == "train" for fit in identification.fit.values())
     source = f"from {training} training run{'s' * (training != 1)}"
     if not identified:
@@ -82,7 +82,9 @@ def _identified_sentence(identification: Identification) -> str:
         verb = "were" if len(identified) > 1 else "was"
         found = f"{enumerate_words(identified)} {verb} identified {source}"
     found += _precision_clause({name: parameters[name] for name in identified})
-    return f"{found}; {enumerate_words(open_ones)} could not be." if open_ones else f"{found}."
+    if not_identifiable:
+        found += f"; {enumerate_words(not_identifiable)} could not be"
+    return f"{found}."
 
 
 def _precision_clause(estimates: dict[str, Estimate]) -> str:
@@ -116,7 +118,7 @@ def _holdout_sentence(identification: Identification) -> str:
         who = f"Of {len(held_out)} held-out runs the worst, {worst},"
     channels = _channels(fit, identification.noise)
     reproduced = [
-        f"{one.quantity} to {significant(one.rmse)}{NARROW}{one.unit} RMS ({percent(one.fit)} fit)"
+        f"{one.quantity} to {significant(one.rmse)}{NARROW_SPACE}{one.unit} RMS ({percent(one.fit)} fit)"
         for one in channels
     ]
     excess = [

@@ -20,8 +20,7 @@ from .summary import role_word, runs_in_order, status_word, summary
 
 STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
 SEVERITY_STYLES = {"error": "red", "warning": "yellow"}
-# Least seconds between progress lines where standard error is no terminal
-SILENCE = 15.0
+SECONDS_BETWEEN_LINES = 15.0  # at least, of progress where standard error is no terminal
 PIPE_WIDTH = 100  # without a terminal, rich would fold tables at 80 columns
 
 
@@ -65,10 +64,10 @@ def identification_tables(identification: Identification) -> RenderableType:
 
 @contextmanager
 def progress() -> Iterator[ReportProgress]:
-    """A live progress line on standard error; if that is no terminal, a line at most every `SILENCE` seconds."""
+    """A live progress line on standard error; if that is no terminal, a line every `SECONDS_BETWEEN_LINES` or more."""
     console = console_for(stderr=True)
     if not console.is_terminal:
-        yield _now_and_then(console)
+        yield _progress_lines(console)
         return
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as display:
@@ -76,25 +75,26 @@ def progress() -> Iterator[ReportProgress]:
 
         def report(doing: str, fitness: float | None = None, fraction: float | None = None) -> None:
             done, total = (None, None) if fraction is None else (fraction, 1.0)
-            display.update(task, description=_so_far(doing, fitness), completed=done, total=total)
+            text = _progress_text(doing, fitness)
+            display.update(task, description=text, completed=done, total=total)
 
         yield report
 
 
-def _now_and_then(console: Console) -> ReportProgress:
+def _progress_lines(console: Console) -> ReportProgress:
     began = last = monotonic()
 
     def report(doing: str, fitness: float | None = None, fraction: float | None = None) -> None:
         nonlocal last
         del fraction
-        if monotonic() - last > SILENCE:
+        if monotonic() - last > SECONDS_BETWEEN_LINES:
             last = monotonic()
-            console.print(Text(f"after {last - began:.0f} s: {_so_far(doing, fitness)}"))
+            console.print(Text(f"after {last - began:.0f} s: {_progress_text(doing, fitness)}"))
 
     return report
 
 
-def _so_far(doing: str, fitness: float | None) -> str:
+def _progress_text(doing: str, fitness: float | None) -> str:
     return doing if fitness is None else f"{doing}, best fitness {significant(fitness, 4)}"
 
 

@@ -10,10 +10,10 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ..control.controller_file import gains_of, law_content
-from ..control.judge import SMALL_STEP, JudgedController, Robustness
+from ..control.evaluation import SMALL_STEP, Candidate, Robustness
 from ..control.objective import SECOND_SETPOINT
 from ..control.tuning import Tuning
-from .notation import NARROW, UNKNOWN, percent, pretty_unit, significant
+from .notation import NARROW_SPACE, UNKNOWN, percent, pretty_unit, significant
 from .terminal import plain_table
 
 GAIN_HEADINGS = ("Gain", "Value", "Unit")
@@ -55,7 +55,7 @@ def tuning_json(tuning: Tuning) -> dict[str, Any]:
     }
 
 
-def _candidate_json(one: JudgedController) -> dict[str, Any]:
+def _candidate_json(one: Candidate) -> dict[str, Any]:
     return {
         "name": one.name,
         "gains": gains_of(one.controller),
@@ -92,13 +92,13 @@ def _step_sentence(tuning: Tuning) -> str:
         return f"The loop does not settle at {tuning.setpoint:g} rad/s."
     ratio = settling / tuning.fastest_possible_settling
     return (
-        f"Settles at {tuning.setpoint:g} rad/s in {_time(settling)},"
-        f" {significant(ratio)} times the fastest that {_limits(tuning)} allow"
-        f" ({_time(tuning.fastest_possible_settling)}), with {percent(overshoot)} overshoot."
+        f"Settles at {tuning.setpoint:g} rad/s in {_time_text(settling)},"
+        f" {significant(ratio)} times the fastest that {_limits_text(tuning)} allow"
+        f" ({_time_text(tuning.fastest_possible_settling)}), with {percent(overshoot)} overshoot."
     )
 
 
-def _limits(tuning: Tuning) -> str:
+def _limits_text(tuning: Tuning) -> str:
     hardware = tuning.hardware
     limits = f"{float(hardware.voltage_limit):g} V"
     if hardware.current_limit is not None:
@@ -113,7 +113,9 @@ def _load_sentence(tuning: Tuning) -> str:
     back = "never comes back into the 2 % band"
     if recovery is not None:
         back = (
-            f"is back in the 2 % band after {_time(recovery)}" if recovery else "stays within 2 %"
+            f"is back in the 2 % band after {_time_text(recovery)}"
+            if recovery
+            else "stays within 2 %"
         )
     return (
         f"A load of {tuning.load_torque:.3g} N m moves it by {significant(tuning.load['Deviation'])}"
@@ -126,7 +128,7 @@ def _robust_sentence(robust: Robustness | None) -> str:
         return ""
     slow = "do not settle"
     if robust.SettlingTime_p95 is not None:
-        slow = f"settle within {_time(robust.SettlingTime_p95)}"
+        slow = f"settle within {_time_text(robust.SettlingTime_p95)}"
     return (
         f"Of {robust.samples} motors drawn from the uncertainty, 95 % {slow}"
         f" and overshoot by at most {percent(robust.Overshoot_p95)}."
@@ -143,16 +145,16 @@ def _margin_sentence(tuning: Tuning) -> str:
     if found.phase_margin_deg is not None:
         parts.append(f"phase margin {significant(found.phase_margin_deg)}°")
     if found.delay_margin_s is not None:
-        parts.append(f"{_time(found.delay_margin_s)} of further delay")
+        parts.append(f"{_time_text(found.delay_margin_s)} of further delay")
     return f"Margins: {', '.join(parts)}." if parts else ""
 
 
-def _time(seconds: float | None) -> str:
+def _time_text(seconds: float | None) -> str:
     if seconds is None:
         return UNKNOWN
     if 0 < seconds < 1:
-        return f"{significant(1e3 * seconds)}{NARROW}ms"
-    return f"{significant(seconds)}{NARROW}s"
+        return f"{significant(1e3 * seconds)}{NARROW_SPACE}ms"
+    return f"{significant(seconds)}{NARROW_SPACE}s"
 
 
 def tuning_tables(tuning: Tuning) -> RenderableType:
@@ -175,10 +177,10 @@ def comparison(tuning: Tuning) -> list[tuple[str, ...]]:
     """A row for each candidate (tuned, and textbook rule if any), and one for the physical limit."""
     fastest = tuning.fastest_possible_settling
     last = ("fastest possible", significant(1e3 * fastest, 4), "1", *(UNKNOWN,) * 4)
-    return [*(_row(one, fastest) for one in tuning.candidates), last]
+    return [*(_candidate_row(one, fastest) for one in tuning.candidates), last]
 
 
-def _row(one: JudgedController, fastest: float) -> tuple[str, ...]:
+def _candidate_row(one: Candidate, fastest: float) -> tuple[str, ...]:
     settling, rise, robust = one.metrics["SettlingTime"], one.metrics["RiseTime"], one.robust
     return (
         one.name,
@@ -222,13 +224,14 @@ def _tiles(tuning: Tuning) -> list[tuple[str, str, str]]:
     """Label, number and note of each tile at the top of the report."""
     settling, overshoot = tuning.metrics["SettlingTime"], tuning.metrics["Overshoot"]
     ratio = None if settling is None else settling / tuning.fastest_possible_settling
+    max_overshoot = tuning.requirements.max_overshoot
     tiles = [
-        ("Settling", _time(settling), f"{significant(ratio)} times the limit"),
-        ("Overshoot", percent(overshoot), f"at most {tuning.asked.max_overshoot:g} % asked for"),
-        ("Largest current", f"{significant(tuning.peak_current)} A", _limits(tuning)),
+        ("Settling", _time_text(settling), f"{significant(ratio)} times the limit"),
+        ("Overshoot", percent(overshoot), f"at most {max_overshoot:g} % asked for"),
+        ("Largest current", f"{significant(tuning.peak_current)} A", _limits_text(tuning)),
     ]
     if tuning.robust is not None:
-        slow = _time(tuning.robust.SettlingTime_p95)
+        slow = _time_text(tuning.robust.SettlingTime_p95)
         tiles.append((f"Settling, {tuning.robust.samples} motors", slow, "95th percentile"))
     peak = tuning.margins.sensitivity_peak
     tiles.append(("Sensitivity peak", significant(peak), "below 2 is comfortable"))

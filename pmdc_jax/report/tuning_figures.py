@@ -22,8 +22,8 @@ AXIS_TITLES = {SPEED: "speed<br>[rad/s]", VOLTAGE: "voltage<br>[V]", CURRENT: "c
 HEIGHTS = [1.0, 0.6, 0.6]
 
 SPREAD_COLOUR = "rgba(163,176,192,0.35)"  # MEASURED, translucent
-DOTTED = {"color": RESIDUAL, "width": 0.8, "dash": "dot"}
-DASHED = {"color": RESIDUAL, "width": 1, "dash": "dash"}
+LIMIT_LINE = {"color": RESIDUAL, "width": 0.8, "dash": "dot"}
+EVENT_LINE = {"color": RESIDUAL, "width": 1, "dash": "dash"}
 
 Traces = Iterator[tuple[int, go.Scatter]]  # each trace with its row
 
@@ -36,8 +36,8 @@ def loop_figure(tuning: Tuning) -> go.Figure:
     for traces in (_spread_traces, _setpoint_traces, _response_traces, _limit_traces):
         for row, trace in traces(tuning):
             figure.add_trace(trace, row=row, col=1)
-    _mark(figure, tuning.fastest_possible_settling, "fastest possible")
-    _mark(figure, tuning.load_from, "load")
+    _mark_event(figure, tuning.fastest_possible_settling, "fastest possible")
+    _mark_event(figure, tuning.load_step_time, "load")
     for row, title in AXIS_TITLES.items():
         figure.update_yaxes(title_text=title, row=row, col=1)
     figure.update_xaxes(title_text="time [ms]", row=len(HEIGHTS), col=1)
@@ -48,11 +48,11 @@ def loop_figure(tuning: Tuning) -> go.Figure:
 
 def _spread_traces(tuning: Tuning) -> Traces:
     """The band from the 5 % to the 95 % quantile of the speeds of the drawn motors."""
-    if tuning.bundle is None:
+    if tuning.validation_speeds is None:
         return
     instants = _milliseconds(tuning)
-    samples = instants[:: max(1, len(instants) // tuning.bundle.shape[1])]
-    low, high = np.quantile(tuning.bundle, [0.05, 0.95], axis=0)
+    samples = instants[:: max(1, len(instants) // tuning.validation_speeds.shape[1])]
+    low, high = np.quantile(tuning.validation_speeds, [0.05, 0.95], axis=0)
     edge = {"color": MEASURED, "width": 0}
     yield SPEED, _line("5 %", samples, low, edge)
     fill = {"fill": "tonexty", "fillcolor": SPREAD_COLOUR}
@@ -61,11 +61,12 @@ def _spread_traces(tuning: Tuning) -> Traces:
 
 def _setpoint_traces(tuning: Tuning) -> Traces:
     """The set point and the 2 % band about it; its width is a share of the set point."""
-    end, second = _milliseconds(tuning)[-1], 2e3 * tuning.load_from
+    end, second = _milliseconds(tuning)[-1], 2e3 * tuning.load_step_time
     corners = np.array([0.0, second, second, end])
     share = np.array([1.0, 1.0, SECOND_SETPOINT, SECOND_SETPOINT])
     for edge in (-BAND, BAND):
-        yield SPEED, _line("2 % band", corners, tuning.setpoint * (share + edge * share), DOTTED)
+        speeds = tuning.setpoint * (share + edge * share)
+        yield SPEED, _line("2 % band", corners, speeds, LIMIT_LINE)
     dashed = {"color": INPUT, "width": 1.0, "dash": "dash"}
     yield SPEED, _line("set point", corners, tuning.setpoint * share, dashed, in_legend=True)
 
@@ -85,13 +86,13 @@ def _limit_traces(tuning: Tuning) -> Traces:
     ends, hardware = np.array([0.0, _milliseconds(tuning)[-1]]), tuning.hardware
     for row, limit in ((VOLTAGE, hardware.voltage_limit), (CURRENT, hardware.current_limit)):
         if limit is not None:
-            yield row, _line("limit", ends, np.full(2, float(limit)), DOTTED)
+            yield row, _line("limit", ends, np.full(2, float(limit)), LIMIT_LINE)
 
 
-def _mark(figure: go.Figure, moment: float, label: str) -> None:
+def _mark_event(figure: go.Figure, moment: float, label: str) -> None:
     """Draw a labelled vertical line at the time `moment`, s."""
     at = 1e3 * moment
-    figure.add_vline(x=at, line=DASHED)
+    figure.add_vline(x=at, line=EVENT_LINE)
     figure.add_annotation(
         x=at, y=0.03, yref="y domain", text=label, showarrow=False, xanchor="left", xshift=4
     )

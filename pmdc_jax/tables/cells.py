@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     import polars as pl
 
 NUMBERS_ONLY = "Recordings hold plain numbers; leave a cell empty where a sample is missing"
-# Numbers with a thousands separator, by that separator; without a decimal separator they would be ambiguous
-GROUPED = {",": r"^[+-]?\d{1,3}(,\d{3})+\.\d*$", ".": r"^[+-]?\d{1,3}(\.\d{3})+,\d*$"}
+# By thousands separator: numbers with it and with a decimal separator, without which they would be ambiguous
+THOUSANDS_PATTERNS = {",": r"^[+-]?\d{1,3}(,\d{3})+\.\d*$", ".": r"^[+-]?\d{1,3}(\.\d{3})+,\d*$"}
 
 
 def is_number(cell: str) -> bool:
@@ -21,15 +21,15 @@ def is_number(cell: str) -> bool:
     return True
 
 
-def ungrouped(text: pl.Series) -> pl.Series:
-    """Texts of numbers without thousands separators."""
-    for sign, pattern in GROUPED.items():
+def without_thousands_separators(text: pl.Series) -> pl.Series:
+    """The texts, those of numbers with thousands separators without them."""
+    for sign, pattern in THOUSANDS_PATTERNS.items():
         grouped = text.str.contains(pattern).fill_null(False)
         text = text.str.replace_all(sign, "", literal=True).zip_with(grouped, text)
     return text
 
 
-def as_dates(text: pl.Series) -> pl.Series | None:
+def parse_dates(text: pl.Series) -> pl.Series | None:
     """Texts converted to dates with times; None if one of them is not a date."""
     import polars as pl
 

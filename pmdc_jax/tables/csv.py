@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
-from .cells import NUMBERS_ONLY, as_dates, seconds_since_first, ungrouped
-from .csv_header import fields_of, find_header
+from .cells import NUMBERS_ONLY, parse_dates, seconds_since_first, without_thousands_separators
+from .csv_header import find_header, split_fields
 
 if TYPE_CHECKING:
     import polars as pl
 
-MISSING = ["NA", "N/A", "n/a", "null", "NULL", "None"]
+NULL_VALUES = ["NA", "N/A", "n/a", "null", "NULL", "None"]
 
 
 class CsvTable:
@@ -33,28 +33,28 @@ class CsvTable:
         self._raw = _text(path)
         self._header = find_header(self._raw, path)
         self.headers = self._header.names
-        self._kept: np.ndarray | None = None
+        self._kept_rows: np.ndarray | None = None
 
     def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
         """See `Table`."""
         wanted = [str(self.headers.index(header)) for header in headers]
         frame = self._frame(wanted)
         if frame[str(len(self.headers) - 1)].null_count():
-            self._refuse_ragged()  # polars silently fills short lines with nulls
+            self._refuse_unequal_lines()  # polars silently fills short lines with nulls
         if frame.height and all(frame[i].null_count() for i in wanted):
             # spreadsheets may append lines of empty cells
-            self._kept = np.array([bool(line.strip(b" \t\r,;")) for _, line in self._lines()])
-            if len(self._kept) != frame.height:
+            self._kept_rows = np.array([bool(line.strip(b" \t\r,;")) for _, line in self._lines()])
+            if len(self._kept_rows) != frame.height:
                 what = "it breaks lines inside quotes"
                 raise InputError(str(self._path), what, "Export it as plain CSV")
-            frame = frame.filter(self._kept)
+            frame = frame.filter(self._kept_rows)
         columns = (frame[i].to_numpy().astype(float) for i in wanted)
         return dict(zip(headers, columns, strict=True))
 
     def place(self, row: int) -> str:
         """See `Table`."""
-        if self._kept is not None:
-            row = int(np.flatnonzero(self._kept)[row])
+        if self._kept_rows is not None:
+            row = int(np.flatnonzero(self._kept_rows)[row])
         numbers = (number for number, _ in self._lines())
         return f"line {next(islice(numbers, row, None), row + 1)}"
 
@@ -72,7 +72,7 @@ class CsvTable:
         try:
             return self._parse(dict.fromkeys(wanted, pl.Float64), last)
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
-            self._refuse_ragged()
+            self._refuse_unequal_lines()
         try:  # padded numbers, dates and the like: slower
             text = self._parse({}, last)
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
@@ -90,7 +90,7 @@ class CsvTable:
             schema=schema,
             separator=self._header.separator,
             comment_prefix="#",
-            null_values=MISSING,
+            null_values=NULL_VALUES,
             decimal_comma=self._header.separator != "," and b"," in self._body,
         )
         return frame.select(i for i in schema if i in kinds or i == last or not kinds)
@@ -100,14 +100,14 @@ class CsvTable:
         import polars as pl
 
         text = text.str.strip_chars().replace("", None)
-        plain = ungrouped(text)
+        plain = without_thousands_separators(text)
         if self._header.separator != ",":
             plain = plain.str.replace(",", ".", literal=True)
         numbers = plain.cast(pl.Float64, strict=False)
         wrong = (numbers.is_null() & text.is_not_null()).arg_true()
         if not len(wrong):
             return numbers
-        if numbers.null_count() == len(numbers) and (dates := as_dates(text)) is not None:
+        if numbers.null_count() == len(numbers) and (dates := parse_dates(text)) is not None:
             return seconds_since_first(dates)
         row = int(wrong[0])
         where = f"{self._path}, {self.place(row)}, column {header}"
@@ -120,10 +120,12 @@ class CsvTable:
             if not line.startswith(b"#"):
                 yield number, line
 
-    def _refuse_ragged(self) -> None:
+    def _refuse_unequal_lines(self) -> None:
         for number, line in self._lines():
-            fields = len(fields_of(line.decode(), self._header.separator)) if line.strip() else None
-            if fields not in (None, len(self.headers)):
+            if not line.strip():
+                continue
+            fields = len(split_fields(line.decode(), self._header.separator))
+            if fields != len(self.headers):
                 raise InputError(
                     f"{self._path}, line {number}",
                     f"it has {fields} fields where the header (line {self._header.line}) "

@@ -13,8 +13,7 @@ from ..errors import InputError
 from .cells import is_number
 from .headers import refuse_duplicates, with_unit
 
-# Number of lines searched for the header
-PREAMBLE = 200
+MAX_PREAMBLE_LINES = 200  # before the header
 
 
 class Header(NamedTuple):
@@ -42,16 +41,16 @@ def find_header(raw: bytes, path: Path) -> Header:
 
     **Raises**: `InputError` if there is none, or if two columns have the same name.
     """
-    line = _past_preamble(raw, _first_line(raw, path))
+    line = _header_line(raw, _first_text_line(raw, path))
     separator = _separator(line.text)
-    names = [name.strip() for name in fields_of(line.text, separator)]
-    units, end = _find_units(raw, _past_empty_lines(raw, line.end), separator, len(names))
+    names = [name.strip() for name in split_fields(line.text, separator)]
+    units, end = _find_units(raw, _skip_empty_lines(raw, line.end), separator, len(names))
     headers = tuple(map(with_unit, names, units) if units else names)
     refuse_duplicates(headers, path)
-    return Header(headers, line.number, separator, _past_empty_lines(raw, end))
+    return Header(headers, line.number, separator, _skip_empty_lines(raw, end))
 
 
-def fields_of(line: str, separator: str) -> list[str]:
+def split_fields(line: str, separator: str) -> list[str]:
     """The cells of a line, without quotes."""
     line = line.rstrip("\r\n")
     try:
@@ -60,7 +59,7 @@ def fields_of(line: str, separator: str) -> list[str]:
         return line.split(separator)
 
 
-def _first_line(raw: bytes, path: Path) -> _Line:
+def _first_text_line(raw: bytes, path: Path) -> _Line:
     """The first line that is neither empty nor a comment: the header, or the first line of a preamble.
 
     A comment directly above numbers is the header if it has as many commas.
@@ -70,7 +69,7 @@ def _first_line(raw: bytes, path: Path) -> _Line:
     above = _Line("", 0, 0, 0)
     for line in _lines(raw):
         if line.text.strip() and not line.text.startswith(("#", "sep=")):
-            if not _is_numbers(line.text):
+            if not _has_only_numbers(line.text):
                 return line
             if above.text.count(",") == line.text.count(",") and "," in line.text:
                 return above  # as numpy.savetxt writes it
@@ -80,31 +79,31 @@ def _first_line(raw: bytes, path: Path) -> _Line:
     raise InputError(str(path), "it holds no header and no rows", "Export the recording again")
 
 
-def _past_preamble(raw: bytes, first: _Line) -> _Line:
+def _header_line(raw: bytes, first: _Line) -> _Line:
     """The header: the last line above the numbers with as many fields as these have, preferably without a number.
 
     It is the `first` line if that has as many fields, or if no line has.
     """
-    texts: list[_Line] = []
-    for line in islice(_lines(raw, first), PREAMBLE):
-        if not line.text.strip() or not _is_numbers(line.text):
-            texts.append(line)
+    text_lines: list[_Line] = []
+    for line in islice(_lines(raw, first), MAX_PREAMBLE_LINES):
+        if not line.text.strip() or not _has_only_numbers(line.text):
+            text_lines.append(line)
             continue
         separator = _separator(line.text)
-        count = len(fields_of(line.text, separator))
-        if count < 2 or len(fields_of(first.text, separator)) == count:
+        count = len(split_fields(line.text, separator))
+        if count < 2 or len(split_fields(first.text, separator)) == count:
             return first
-        alike = [text for text in texts if len(fields_of(text.text, separator)) == count]
+        alike = [text for text in text_lines if len(split_fields(text.text, separator)) == count]
         # a row of data with a remark is not all numbers, but not a header either
-        words = [text for text in alike if not _has_number(fields_of(text.text, separator))]
-        return (words or alike or [first])[-1]
+        all_words = [text for text in alike if not _has_number(split_fields(text.text, separator))]
+        return (all_words or alike or [first])[-1]
     return first
 
 
 def _find_units(raw: bytes, start: int, separator: str, count: int) -> tuple[list[str] | None, int]:
     """The units in the line at byte `start`, None if it is no line of units, and the byte at which the rows begin."""
     line = _line_at(raw, start, 0)
-    fields = [field.strip() for field in fields_of(line.text, separator)]
+    fields = [field.strip() for field in split_fields(line.text, separator)]
     if len(fields) != count or _has_number(fields):
         return None, start
     units = [field.strip("()[]") for field in fields]
@@ -126,7 +125,7 @@ def _line_at(raw: bytes, start: int, number: int) -> _Line:
     return _Line(raw[start:end].decode().strip("\r\n"), number, start, end)
 
 
-def _past_empty_lines(raw: bytes, start: int) -> int:
+def _skip_empty_lines(raw: bytes, start: int) -> int:
     """The next byte that is no line end; polars would misread an empty first line as a column."""
     found = re.compile(rb"[\r\n]*").match(raw, start)
     return found.end() if found else start
@@ -137,9 +136,9 @@ def _separator(line: str) -> str:
     return next((s for s in "\t;" if s in line), ",")
 
 
-def _is_numbers(line: str) -> bool:
+def _has_only_numbers(line: str) -> bool:
     """Whether a line holds nothing but numbers, quoted or not, and empty cells."""
-    cells = " ".join(fields_of(line, _separator(line))).replace(",", " ").split()
+    cells = " ".join(split_fields(line, _separator(line))).replace(",", " ").split()
     return all(map(is_number, cells))
 
 

@@ -12,8 +12,8 @@ from ..errors import InputError
 
 def with_unit(name: str, unit: str) -> str:
     """A column name with its unit in brackets; unchanged if it ends with that unit, as speed_rad_s does with rad/s."""
-    said, new = (re.sub(r"\W+|_+", "_", text).strip("_") for text in (name, unit))
-    return name if not new or said.endswith(f"_{new}") else f"{name} [{unit}]"
+    name_words, unit_words = (re.sub(r"\W+|_+", "_", text).strip("_") for text in (name, unit))
+    return name if not unit_words or name_words.endswith(f"_{unit_words}") else f"{name} [{unit}]"
 
 
 def refuse_duplicates(headers: Sequence[str], path: Path) -> None:

@@ -33,7 +33,7 @@ class MatTable:
             raise InputError(str(path), what, mend) from None
         vectors = list[tuple[str, np.ndarray]]()
         for header, vector in _vectors(content, ""):
-            if not any(_same_time(header, vector, *other) for other in vectors):
+            if not any(_is_copied_time(header, vector, *other) for other in vectors):
                 vectors.append((header, vector))
         self.headers = tuple(header for header, _ in vectors)
         refuse_duplicates(self.headers, path)
@@ -62,7 +62,9 @@ def _vectors(value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
     """Header and numbers of every vector in the `value` at this path; matrices are split into their longer vectors."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
-            yield from _vectors(inner, _signal(value, name, path) or f"{path}.{name}".strip("."))
+            yield from _vectors(
+                inner, _signal_name(value, name, path) or f"{path}.{name}".strip(".")
+            )
     elif isinstance(value, list):
         for k, inner in enumerate(value, 1):
             yield from _vectors(inner, f"{path}({k})")
@@ -75,7 +77,7 @@ def _vectors(value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
             yield from ((f"{path}({k},:)", row) for k, row in enumerate(value, 1))
 
 
-def _signal(structure: Mapping[str, Any], field: str, path: str) -> str | None:
+def _signal_name(structure: Mapping[str, Any], field: str, path: str) -> str | None:
     """The name that a structure gives to the numbers in its `field`, as Simulink's "structure with time" and files of
     ControlDesk do; None without one."""
     naming = {"values": "label", "Data": "Name"}.get(field)
@@ -87,7 +89,7 @@ def _signal(structure: Mapping[str, Any], field: str, path: str) -> str | None:
     return with_unit(name, unit) if isinstance(unit, str) else name
 
 
-def _same_time(header: str, vector: np.ndarray, other: str, found: np.ndarray) -> bool:
+def _is_copied_time(header: str, vector: np.ndarray, other: str, found: np.ndarray) -> bool:
     """Whether this is a copy of the time vector `found`: Simulink saves one with every signal."""
     leaves = {name.rpartition(".")[2] for name in (header, other)}
     return leaves == {"time"} and np.array_equal(vector, found)

@@ -37,7 +37,7 @@ class Robustness:
 
 
 @frozen
-class JudgedController:
+class Candidate:
     """A controller, named after how its gains were chosen, with its metrics; None where an event never happens."""
 
     name: str
@@ -50,30 +50,30 @@ class JudgedController:
     stable: bool
 
 
-def judged(
+def evaluate(
     name: str,
     task: Task,
     motor: Motor,
     controller: AbstractController,
     validation_motors: Motor | None,
-) -> JudgedController:
+) -> Candidate:
     """A controller with its exact metrics; `validation_motors`, along a leading axis, give the percentiles."""
     controller = jax.tree.map(jnp.asarray, controller)
     law = Law.of(controller, task.hardware, motor)
-    response = simulated(task, motor, law)
+    response = simulate_task(task, motor, law)
     step, loaded, second = task.parts(response, REPORTED_SUBSTEPS * task.substeps)
-    robust = None
-    if validation_motors is not None:
-        model = SampledMotor.of(motor, task.hardware.sample_time)
-        robust = _robustness(_exact_score(task, model, validation_motors, controller))
-    return JudgedController(
+    return Candidate(
         name=name,
         controller=controller,
-        metrics=_by_name(step_metrics(*step, task.setpoint)),
-        load=_by_name(load_metrics(*loaded, task.setpoint)),
-        second_step=_by_name(step_metrics(*second, SECOND_SETPOINT * task.setpoint, task.setpoint)),
-        small_step=_by_name(_small_step_metrics(task, motor, law)),
-        robust=robust,
+        metrics=_finite_or_none(step_metrics(*step, task.setpoint)),
+        load=_finite_or_none(load_metrics(*loaded, task.setpoint)),
+        second_step=_finite_or_none(
+            step_metrics(*second, SECOND_SETPOINT * task.setpoint, task.setpoint)
+        ),
+        small_step=_finite_or_none(_small_step_metrics(task, motor, law)),
+        robust=None
+        if validation_motors is None
+        else evaluate_robustness(task, motor, controller, validation_motors),
         stable=margins(motor, law).stable,
     )
 
@@ -86,18 +86,22 @@ def _small_step_metrics(task: Task, motor: Motor, law: Law) -> StepMetrics:
         task,
         (SMALL_STEP * task.setpoint, 0 * task.load, 0 * task.noise),
     )
-    (time, speed), *_ = small.parts(simulated(small, motor, law), REPORTED_SUBSTEPS * task.substeps)
+    (time, speed), *_ = small.parts(
+        simulate_task(small, motor, law), REPORTED_SUBSTEPS * task.substeps
+    )
     return step_metrics(time, speed, small.setpoint)
 
 
 @compiled
-def simulated(task: Task, motor: Motor, law: Law) -> Response:
+def simulate_task(task: Task, motor: Motor, law: Law) -> Response:
     """Response over the whole course, ten instants per simulation step."""
     return closed_loop(motor, law, task.course(), REPORTED_SUBSTEPS * task.substeps)
 
 
 @compiled
-def speeds(task: Task, motors: Motor, law: Law) -> Float[Array | np.ndarray, "motors samples"]:
+def simulate_speeds(
+    task: Task, motors: Motor, law: Law
+) -> Float[Array | np.ndarray, "motors samples"]:
     """Speed of every motor at every sample, rad/s."""
 
     def speed(motor: Motor) -> Float[Array | np.ndarray, " samples"]:
@@ -106,20 +110,26 @@ def speeds(task: Task, motors: Motor, law: Law) -> Float[Array | np.ndarray, "mo
     return jax.vmap(speed)(motors)
 
 
-def _by_name(metrics: StepMetrics | LoadMetrics) -> dict[str, float | None]:
+def _finite_or_none(metrics: StepMetrics | LoadMetrics) -> dict[str, float | None]:
     """Metrics by name, None where the event never happens."""
     values = {name: float(value) for name, value in metrics._asdict().items()}
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
-def _robustness(found: Score) -> Robustness:
-    settling = np.nan_to_num(np.asarray(found.settling), nan=np.inf)
-    overshoot = np.asarray(found.overshoot)
-    slow = float(np.quantile(settling, 0.95, method="higher"))
+def evaluate_robustness(
+    task: Task, motor: Motor, controller: AbstractController, motors: Motor
+) -> Robustness:
+    """Metrics over `motors`, along a leading axis, of a controller whose law is designed for `motor`."""
+    controller = jax.tree.map(jnp.asarray, controller)
+    model = SampledMotor.of(motor, task.hardware.sample_time)
+    score: Score = _exact_score(task, model, motors, controller)
+    settling = np.nan_to_num(np.asarray(score.settling), nan=np.inf)
+    overshoot = np.asarray(score.overshoot)
+    settling_p95 = float(np.quantile(settling, 0.95, method="higher"))
     return Robustness(
         samples=len(settling),
         Overshoot_p95=float(np.quantile(overshoot, 0.95, method="higher")),
-        SettlingTime_p95=slow if math.isfinite(slow) else None,
+        SettlingTime_p95=settling_p95 if math.isfinite(settling_p95) else None,
         overshoot=overshoot,
         settling=settling,
     )

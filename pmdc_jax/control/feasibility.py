@@ -9,10 +9,10 @@ from ..motor import Motor
 from .steady import steady_state
 
 
-def reach(motor: Motor, voltage_limit: float, load: float = 0.0) -> float:
+def steady_speed(motor: Motor, voltage: float, load: float = 0.0) -> float:
     """Steady speed (rad/s) at a voltage against a load (N m), of the linear part of the motor."""
     R, Kb, Kt, f = (float(getattr(motor, name)) for name in ("R", "Kb", "Kt", "f"))
-    return (Kt * voltage_limit - R * load) / (R * f + Kt * Kb)
+    return (Kt * voltage - R * load) / (R * f + Kt * Kb)
 
 
 def check_reachable(
@@ -21,22 +21,22 @@ def check_reachable(
     voltage_limit: float,
     current_limit: float | None,
     load: float,
-    named: str = "--setpoint",
+    option: str = "--setpoint",
 ) -> None:
     """Raise an `InputError` where the set point cannot be held against the load within the limits."""
     state, voltage = steady_state(motor, setpoint, load)
     current, voltage = abs(float(state.current)), abs(float(voltage))
     against = f" against {load:g} N m" if load else ""
     if voltage > voltage_limit:
-        most = _highest_speed(motor, setpoint, voltage_limit, load)
+        highest = _highest_speed(motor, setpoint, voltage_limit, load)
         raise InputError(
-            named,
-            f"{setpoint:g} rad/s{against} is beyond what {voltage_limit:g} V reaches ({most:.1f})",
+            option,
+            f"{setpoint:g} rad/s{against} is beyond what {voltage_limit:g} V reaches ({highest:.1f})",
             f"It takes {voltage:.2f} V to hold it and more to get there in time",
         )
     if current_limit is not None and current > current_limit:
         raise InputError(
-            named,
+            option,
             f"holding {setpoint:g} rad/s{against} takes {current:.2f} A,"
             f" beyond the limit of {current_limit:g} A",
             "Raise --current-limit, or lower set point or load",
@@ -46,7 +46,7 @@ def check_reachable(
 def _highest_speed(motor: Motor, setpoint: float, voltage_limit: float, load: float) -> float:
     """The highest speed (rad/s) that the voltage holds; with the motor's effects, by bisection."""
     if not motor.effects:
-        return max(0.0, reach(motor, voltage_limit, load))
+        return max(0.0, steady_speed(motor, voltage_limit, load))
     low, high = 0.0, abs(setpoint)
     for _ in range(20):
         middle = (low + high) / 2
@@ -75,12 +75,12 @@ def check_settling(
     return fastest_settling
 
 
-def spare_torque(
+def default_load_torque(
     motor: Motor, setpoint: float, voltage_limit: float, current_limit: float | None
 ) -> float:
     """Half the load torque that the limits still hold at the set point, N m: the default load step."""
     state, voltage = steady_state(motor, setpoint)
-    spare = (voltage_limit - abs(float(voltage))) / float(motor.R)
+    spare_current = (voltage_limit - abs(float(voltage))) / float(motor.R)
     if current_limit is not None:
-        spare = min(spare, current_limit - abs(float(state.current)))
-    return math.copysign(0.5 * max(0.0, spare) * float(motor.Kt), setpoint)
+        spare_current = min(spare_current, current_limit - abs(float(state.current)))
+    return math.copysign(0.5 * max(0.0, spare_current) * float(motor.Kt), setpoint)
