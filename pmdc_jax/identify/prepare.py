@@ -152,8 +152,8 @@ def _refuse(
         raise InputError("RUN", "there is no recording to fit", "Name at least one")
     for run in (*recordings, *holdout):
         if not run.tells:
-            what = f"nothing to identify from {', '.join(run.columns())}"
-            raise InputError(run.source or run.name, what, f"Needed beside time: {OUTPUTS_TOO}")
+            what = f"too few columns to identify a motor, only {', '.join(run.columns())}"
+            raise InputError(run.source or run.name, what, f"Needed besides time: {OUTPUTS_TOO}")
     names = [r.name for r in (*recordings, *holdout)]
     for name in names:
         if names.count(name) > 1:
