@@ -26,18 +26,18 @@ def shifted_channels(run: Recording) -> Iterator[Finding]:
     mechanical = {shift: _mechanical_misfit(edge, shift) for shift in SHIFTS}
     late, behind_speed = _best_shift(electrical), _best_shift(mechanical)
     if late and mechanical[0] < 0.5 * mechanical[late]:
-        column, what, shift = "voltage", "current and speed come", late
+        column, what, shift = "voltage", "current and speed are", late
     elif late and mechanical[late] < 0.5 * mechanical[0]:
-        column, what, shift = "current", "the current comes", late
+        column, what, shift = "current", "the current is", late
     elif late:
-        column, what, shift = "current", "the current, and perhaps the speed, comes", late
+        column, what, shift = "current", "the current, and perhaps the speed, is", late
     elif behind_speed:
-        column, what, shift = "speed", "the speed comes", -behind_speed
+        column, what, shift = "speed", "the speed is", -behind_speed
     else:
         return
     when = "late" if shift > 0 else "early"
     what += f" about {abs(shift)} samples ({abs(shift) * run.sample_time:.3g} s) {when}"
-    mend = "Undo it in the data, or record all channels with one clock and one filter"
+    mend = "Shift the data back, or record all channels with the same clock and filter"
     yield Finding(run.name, column, "warning", what, "at voltage edges", mend)
 
 
@@ -48,7 +48,7 @@ def slow_sampling(run: Recording) -> Iterator[Finding]:
         return
     current = edge.current[BEFORE_EDGE:] - edge.current[BEFORE_EDGE]
     if abs(current[1]) > 0.9 * np.max(np.abs(current)):
-        what = f"the current settles within one sample ({run.sample_time:.3g} s): L may hardly show"
+        what = f"the current settles within one sample ({run.sample_time:.3g} s): L may be poorly determined"
         mend = "Sample faster than L / R if the standard error of L is too large"
         yield Finding(run.name, "current", "note", what, "at voltage edges", mend)
 

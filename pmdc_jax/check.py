@@ -53,9 +53,9 @@ def gaps(run: Recording) -> Iterator[Finding]:
             "time",
             "warning",
             f"{_count(len(rows), 'gap')} in time, the longest {steps[longest]:.4g} s "
-            f"where the step is {np.median(steps):.4g} s",
+            f"against a sample interval of {np.median(steps):.4g} s",
             place_of_sample(run, int(longest)),
-            "The voltage is taken to have been held meanwhile. If it was not, split the run at its gaps",
+            "The voltage is assumed constant during a gap. If it was not, split the run at its gaps",
         )
 
 
@@ -67,17 +67,17 @@ def jitter(run: Recording) -> Iterator[Finding]:
     scatter = steps / np.mean(steps) - 1
     deviation = float(np.sqrt(np.mean(scatter**2) / 2))
     if deviation > MAX_JITTER:
-        samples = "are taken when they were stamped"
+        samples = "the stamps are used as the sampling times"
         if is_evenly_sampled(run):
-            samples = "came evenly all the same, by how they go on: they are taken as even"
+            samples = "the signals were sampled evenly, so an even time grid is used"
         worst = int(np.argmax(np.abs(np.diff(run.time) - np.mean(steps))))
         yield Finding(
             run.name,
             "time",
             "note",
-            f"time stamps jitter by {deviation:.1%} of a step of {np.mean(steps):.4g} s, and the samples {samples}",
+            f"time stamps jitter by {deviation:.1%} of the sample interval of {np.mean(steps):.4g} s; {samples}",
             f"worst near {place_of_sample(run, worst)}",
-            "If these are not the times of sampling, export those of the sampling clock",
+            "If the stamps are not the sampling times, export the time of the sampling clock",
         )
 
 
@@ -110,7 +110,7 @@ def clipping(run: Recording) -> Iterator[Finding]:
                 "warning",
                 f"it looks clipped at {extreme:.6g}: {length} equal values in a row",
                 f"from {place_of_sample(run, start)}",
-                "Record with a larger range, or cut these samples out (leave the cells empty)",
+                "Record with a larger measuring range, or leave the cells of these samples empty",
             )
 
 
@@ -124,9 +124,9 @@ def wrapped_angle(run: Recording) -> Iterator[Finding]:
             run.name,
             "angle",
             "note",
-            f"it starts again after each turn, {_count(len(wraps), 'time')}: it is taken as going on",
+            f"the angle wraps after each turn, {_count(len(wraps), 'time')}: it is unwrapped",
             f"first at {place_of_sample(run, int(wraps[0]))}",
-            "If it does not, unwrap it yourself, for example by numpy.unwrap",
+            "If these are not wraps, give an unwrapped angle, for example from numpy.unwrap",
         )
 
 
@@ -137,9 +137,9 @@ def constant_load(run: Recording) -> Iterator[Finding]:
             run.name,
             "load",
             "note",
-            f"the load column is constant: it is taken as known, {run.load[0]:.6g} N m",
+            f"the load column is constant: used as a known load of {run.load[0]:.6g} N m",
             "whole run",
-            "If it was not measured, leave out the column",
+            "If the load was not measured, remove the column",
         )
 
 
@@ -150,9 +150,9 @@ def unused_torque(run: Recording) -> Iterator[Finding]:
             run.name,
             "torque",
             "note",
-            "the voltage drives the motor, and this column is not used",
+            "this column is not used: the voltage is the input",
             "whole run",
-            "Leave out the voltage for the torque to drive the mechanical half alone",
+            "To use the torque as the input of the mechanical equation, remove the voltage column",
         )
 
 
@@ -169,8 +169,8 @@ def current_jumps(run: Recording) -> Iterator[Finding]:
             run.name,
             "current",
             "note",
-            f"it leaps by up to {steps[row]:.3g} A between samples: what it did there is not known, and may look like a"
-            " missing effect",
+            f"the current jumps by up to {steps[row]:.3g} A between samples: its course there is unknown and may look"
+            " like a missing effect",
             place_of_sample(run, row),
             "Sample faster, or record the voltage as well",
         )
@@ -187,29 +187,29 @@ def excitation(runs: Sequence[Recording]) -> Iterator[Finding]:
                 run.name,
                 None,
                 "error" if len(still) == len(runs) else "note",
-                f"nothing moves beyond its noise: {', '.join(_outputs(run))}",
+                f"no signal varies by more than its noise: {', '.join(_outputs(run))}",
                 "whole run",
-                "Record steps of the voltage, and the motor as it starts and stops",
+                "Record voltage steps, with the motor starting and stopping",
             )
         elif run.stands_still:
             yield Finding(
                 run.name,
                 "speed",
                 "note" if turning else "warning",
-                "the rotor never moves: it is taken as held, and the run for what it says of R and L",
+                "the rotor never moves: used as a locked-rotor run, for R and L only",
                 "whole run",
-                "Record the motor as it turns as well. If only friction held it, leave out the run",
+                "Record the motor turning as well. If only friction held the rotor, leave out this run",
             )
         elif speed is not None and np.nanstd(speed) <= np.sqrt(2) * noise_by_differences(3, speed):
             noise = noise_by_differences(3, speed)
-            what = f"it swings less than its noise of {noise:.3g}" if noise else "it never changes"
+            what = f"it varies less than its noise of {noise:.3g}" if noise else "it never changes"
             yield Finding(
                 run.name,
                 "speed",
                 "note" if turning and run not in turning else "warning",
-                f"{what}: Kb, Kt, J and f can hardly be seen",
+                f"{what}: Kb, Kt, J and f are poorly determined",
                 "whole run",
-                "Record the motor as it starts and stops, with larger steps of the voltage",
+                "Record the motor starting and stopping, with larger voltage steps",
             )
 
 

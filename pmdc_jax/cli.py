@@ -95,11 +95,11 @@ def identify(
     effect: Effect = [],
     search: Search = "cma_es",
 ) -> None:
-    """Find the parameters of a motor from recordings.
+    """Identify the parameters of a motor from recordings.
 
-    R, L, Kb, Kt, J and f are found from voltage, current and speed, each with its standard error
-    and whether the recordings determine it at all. A run without current or voltage contributes
-    what it can.
+    Estimates R, L, Kb, Kt, J and f from voltage, current and speed, each with its standard error,
+    and reports which of them the recordings do not determine. Runs without current or voltage are
+    used for what they determine.
     """
     from .files import check_outputs
 
@@ -138,10 +138,10 @@ def diagnose(
     unloaded: Unloaded = False,
     search: Search = "cma_es",
 ) -> None:
-    """Find physical effects that the model of a motor lacks.
+    """Find physical effects that are missing from the motor model.
 
-    Shows where simulation and measurement disagree, names the missing effect, adds it, and shows
-    how much of the disagreement is gone. The motor saved is the completed one.
+    Shows where simulation and measurement disagree, names the missing effect, adds it to the model,
+    and shows how much of the disagreement it removes. --save writes the extended motor.
     """
     from .files import check_outputs
 
@@ -160,7 +160,9 @@ def diagnose(
         from .report.experiment import write_experiment
 
         if not write_experiment(diagnosis, experiment):
-            typer.echo(f"note: no experiment to write to {experiment}", err=True)
+            typer.echo(
+                f"note: no experiment was designed, so {experiment} was not written", err=True
+            )
     if report:
         from .report.diagnosis import write_diagnosis
 
@@ -170,7 +172,7 @@ def diagnose(
 
 @app.command(epilog="Example: pmdc simulate motor.json --input drive.csv --out simulated.csv")
 def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -> None:
-    """Simulate a motor under a recorded voltage.
+    """Simulate a motor with a recorded input voltage.
 
     Voltage and load are read from the recording; current and speed are written to another file.
     """
@@ -209,10 +211,10 @@ def tune(
     report: Report = None,
     seed: Seed = 0,
 ) -> None:
-    """Find the gains of a speed controller.
+    """Tune the gains of a speed controller.
 
-    They are tuned on the sampled loop with its delay and limits, and over the uncertainty of the
-    motor, and compared with the fastest settling that voltage and current allow.
+    Tunes on the sampled loop with its delay and limits and over the uncertainty of the motor, and
+    compares with the fastest settling possible within the voltage and current limits.
     """
     from .files import check_outputs
 
@@ -276,7 +278,7 @@ def export(controller: ControllerFile, c: HeaderFile) -> None:
 def paper(out: Folder = Path("paper_out")) -> None:
     """Reproduce the wheelchair-motor paper.
 
-    Its tables and figures beside ours, printed, and as paper.html and paper.json in a folder.
+    Prints its tables beside ours, and writes paper.html and paper.json with its figures to a folder.
     """
     from .paper import paper
     from .report.paper import paper_tables
@@ -291,9 +293,9 @@ def paper(out: Folder = Path("paper_out")) -> None:
 
 @app.command(epilog="Example: pmdc demo --out tour")
 def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
-    """Take the tour: identify and diagnose the packaged sample, and tune a controller.
+    """Run a demonstration: identify and diagnose the packaged sample, and tune a controller.
 
-    Four runs are fitted, a fifth is held out as a test; results and reports go to a folder.
+    Fits four runs, validates on a fifth, and writes results and reports to a folder.
     """
     from .demo import FILES, demo
     from .report.diagnosis_tables import print_diagnosis

@@ -134,7 +134,7 @@ def match_columns(
     **Raises**: `InputError` for unknown names or units, and if two headers mean the same quantity.
     """
     if not isinstance(columns, Mapping | None):
-        what = f"columns are {columns!r}, and no mapping"
+        what = f"columns is {columns!r}, not a mapping"
         raise InputError(where, what, 'Write for example {"speed": "rpm_meas:rpm"}')
     by_hand = [_by_hand(name, spec, headers, where) for name, spec in (columns or {}).items()]
     found = {column.quantity: column for column in by_hand}
@@ -146,7 +146,7 @@ def match_columns(
         try:
             column = understand(header)
         except UnitError as error:
-            mend = f"Write it as in {QUANTITIES[error.quantity].header}, or map it by --column"
+            mend = f"Write it as in {QUANTITIES[error.quantity].header}, or map it with --column"
             refused[error.quantity] = InputError(f"{where}, column {header}", str(error), mend)
             continue
         if column is None or column.quantity in found or header in taken:
@@ -243,7 +243,7 @@ def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column
     option = f"{where}, --column {name}={spec}"
     quantity = "load" if name == "load_torque" else name
     if quantity not in QUANTITIES:
-        raise InputError(option, f"unknown quantity '{name}'", f"Known are {', '.join(QUANTITIES)}")
+        raise InputError(option, f"unknown quantity '{name}'", f"Known: {', '.join(QUANTITIES)}")
     header, unit = spec, None
     if spec not in headers:
         header, _, unit = (part.strip() for part in spec.rpartition(":"))
@@ -317,5 +317,5 @@ def _ambiguous_headers(first: Column, second: Column, where: str) -> InputError:
     return InputError(
         f"{where}, columns {first.header} and {second.header}",
         f"both mean {first.quantity}",
-        f"Choose one, for example by --column {first.quantity}={second.header}",
+        f"Choose one, for example with --column {first.quantity}={second.header}",
     )

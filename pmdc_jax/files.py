@@ -24,25 +24,25 @@ def check_outputs(outputs: dict[str, Path | str | None], inputs: list[Path]) -> 
         check_writable(option, path)
         if path.resolve() in taken:
             other = taken[path.resolve()]
-            raise InputError(option, f"{path} is also {other}", "Give it a file of its own")
+            raise InputError(option, f"{path} is also {other}", "Give every output its own file")
         if path.is_file() or not path.exists():  # devices such as /dev/null may be shared
-            taken[path.resolve()] = f"where {option} is written"
+            taken[path.resolve()] = f"the output of {option}"
 
 
 def check_writable(option: str, path: Path) -> None:
     """**Raises**: `InputError` if a file cannot be written at `path`, the value of `option`."""
     if str(path) == "-":
-        raise InputError(option, "only --json can go to standard output", "Give the name of a file")
+        raise InputError(option, "only --json can write to standard output", "Give a file name")
     if path.is_dir():
-        raise InputError(option, f"{path} is a folder", "Give the name of a file")
+        raise InputError(option, f"{path} is a folder", "Give a file name")
     folder = path.parent
     if not folder.is_dir():
         raise InputError(
-            option, f"the folder {folder} does not exist", "Make it first, or choose another"
+            option, f"the folder {folder} does not exist", "Create it first, or choose another"
         )
     writable = os.access(path, os.W_OK) if path.exists() else _takes_files(folder)
     if not writable:
-        raise InputError(option, f"{path} cannot be written", "Choose another place")
+        raise InputError(option, f"{path} cannot be written", "Choose another location")
 
 
 def result_folder(path: Path, first: str) -> Path:
@@ -53,7 +53,7 @@ def result_folder(path: Path, first: str) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
-        raise InputError("--out", f"{path} is not a folder", "Name a new folder") from None
+        raise InputError("--out", f"{path} is not a folder", "Give another folder") from None
     check_writable("--out", path / first)
     return path
 
@@ -92,7 +92,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         part.replace(path)
     except OSError as error:
         what = f"it cannot be written ({error.strerror or error})"
-        mend = "Choose a folder that exists, has room and lets you write"
+        mend = "Choose an existing folder with free space and write permission"
         raise InputError(str(path), what, mend) from None
     finally:
         part.unlink(missing_ok=True)

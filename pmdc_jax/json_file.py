@@ -25,14 +25,14 @@ def read_object(path: str | Path, form: str, mend: str) -> dict[str, Any]:
         raise InputError(where, "there is no such file", mend) from None
     except OSError as error:
         what = f"cannot be read ({error.strerror})"
-        raise InputError(where, what, "Check path and permissions") from None
+        raise InputError(where, what, "Check the path and its permissions") from None
     except (ValueError, RecursionError) as error:
         raise InputError(where, f"is not JSON ({error})", mend) from None
     if not isinstance(content, dict):
         raise InputError(where, "is not a JSON object", mend)
     if content.get("format", form) != form:
         what = f'"format" is {content["format"]!r}, not {form!r}'
-        raise InputError(where, what, "Update pmdc_jax, or write the file with this version")
+        raise InputError(where, what, "Update pmdc_jax, or write the file again with this version")
     return content
 
 
@@ -43,5 +43,5 @@ def finite_number(where: str, name: str, value: object, mend: str) -> float:
             if math.isfinite(value):
                 return float(value)
         except OverflowError:  # integers in JSON may have any length
-            raise InputError(where, f"{name} is beyond what a double holds", mend) from None
+            raise InputError(where, f"{name} is too large for double precision", mend) from None
     raise InputError(where, f"{name} is {value!r}, not a number", mend)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .identify.identification import Identification
 
 FORMAT = "pmdc motor 1"
-MEND = "Write one with pmdc identify --save"
+MEND = "Write it with pmdc identify --save"
 UNDETERMINED = ("not_identifiable", "at_bound")
 
 
@@ -124,11 +124,9 @@ def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:
                 'Write {"name": ..., "parameters": {...}}',
             )
         if name not in EFFECTS:
-            raise InputError(
-                where, f"effect {name!r} is not known", f"Choose of {', '.join(EFFECTS)}"
-            )
+            raise InputError(where, f"unknown effect {name!r}", f"Choose from {', '.join(EFFECTS)}")
         if name in effects:
-            raise InputError(where, f"effect {name} is there twice", "Keep one of the two")
+            raise InputError(where, f"effect {name} is listed twice", "Keep one of the two")
         fields = _numbers(where, entry.get("parameters", {}), EFFECTS[name].ranges, name)
         effects[name] = EFFECTS[name](**fields)
     return tuple(effects.values())

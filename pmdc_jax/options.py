@@ -12,106 +12,116 @@ from .errors import InputError
 
 Runs = Annotated[
     list[Path],
-    typer.Argument(metavar="RUN", help="Recordings to fit, one run a file: CSV, Parquet or MAT."),
+    typer.Argument(metavar="RUN", help="Recordings to fit, one run per file: CSV, Parquet or MAT."),
 ]
 Holdout = Annotated[
     list[Path],
-    typer.Option(metavar="RUN", help="A run kept out of the fit to test it. Repeatable."),
+    typer.Option(metavar="RUN", help="A run held out of the fit, to validate it. Repeatable."),
 ]
 Save = Annotated[
-    Path | None, typer.Option(metavar="MOTOR.json", help="Write the motor, for pmdc simulate.")
+    Path | None,
+    typer.Option(metavar="MOTOR.json", help="Save the motor, for pmdc simulate and tune."),
 ]
 Json = Annotated[
     str | None,
     typer.Option(metavar="OUT", help="Write the result as JSON; - is standard output."),
 ]
 Report = Annotated[
-    Path | None, typer.Option(metavar="OUT.html", help="Write a report with pictures.")
+    Path | None, typer.Option(metavar="OUT.html", help="Write an HTML report with figures.")
 ]
 Experiment = Annotated[
     Path | None,
     typer.Option(
-        metavar="OUT.csv", help="Write the voltage to record next, where these runs cannot tell."
+        metavar="OUT.csv",
+        help="Write the voltage of the next experiment, if the verdict is ambiguous.",
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the search.")]
+Seed = Annotated[int, typer.Option(min=0, help="Random seed of the search.")]
 Column = Annotated[
     list[str],
     typer.Option(
         metavar="QUANTITY=HEADER:UNIT",
-        help="What a column holds, where its header does not say. Repeatable.",
+        help="Quantity and unit of a column whose header is not recognised. Repeatable.",
     ),
 ]
 Tie = Annotated[
     list[str],
-    typer.Option(metavar="A=B", help="Two parameters that are one, such as Kt=Kb. Repeatable."),
+    typer.Option(metavar="A=B", help="Two parameters to keep equal, such as Kt=Kb. Repeatable."),
 ]
 Known = Annotated[
     list[str],
-    typer.Option(metavar="NAME=VALUE", help="A parameter known from elsewhere, in SI. Repeatable."),
+    typer.Option(
+        metavar="NAME=VALUE", help="A parameter to fix at a known value, in SI. Repeatable."
+    ),
 ]
 Unloaded = Annotated[
-    bool, typer.Option("--unloaded", help="Runs without a load column have no load at all.")
+    bool, typer.Option("--unloaded", help="Assume no load in runs without a load column.")
 ]
 Effect = Annotated[
     list[str],
     typer.Option(
-        metavar="NAME", help="An effect to identify too, such as coulomb_friction. Repeatable."
+        metavar="NAME", help="An effect to identify as well, such as coulomb_friction. Repeatable."
     ),
 ]
-Search = Annotated[str, typer.Option(metavar="NAME", help="The global search.")]
+Search = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="Global search: cma_es, paper_ga, differential_evolution or particle_swarm.",
+    ),
+]
 MotorFile = Annotated[
-    Path, typer.Argument(metavar="MOTOR.json", help="Written by pmdc identify --save.")
+    Path, typer.Argument(metavar="MOTOR.json", help="Motor file, from pmdc identify --save.")
 ]
 Input = Annotated[
-    Path, typer.Option("--input", metavar="RUN", help="Recording that drives the motor.")
+    Path, typer.Option("--input", metavar="RUN", help="Recording with the input to simulate.")
 ]
 Output = Annotated[
-    Path, typer.Option("--out", metavar="RUN_OUT", help="Where it goes: .csv or .parquet.")
+    Path, typer.Option("--out", metavar="RUN_OUT", help="Output file, .csv or .parquet.")
 ]
 Controller = Annotated[
     str,
     typer.Option(metavar="NAME", help="pi, pid, state-feedback or state-feedback-integral."),
 ]
-Setpoint = Annotated[float | None, typer.Option(metavar="RAD_S", help="Speed to go to.")]
+Setpoint = Annotated[float | None, typer.Option(metavar="RAD_S", help="Set point of the speed.")]
 VoltageLimit = Annotated[
-    float | None, typer.Option(metavar="V", help="Voltage there is, in either direction.")
+    float | None, typer.Option(metavar="V", help="Largest voltage, in either direction.")
 ]
 CurrentLimit = Annotated[
-    float | None, typer.Option(metavar="A", help="Current that is allowed, none if not given.")
+    float | None, typer.Option(metavar="A", help="Largest current; unlimited if not given.")
 ]
 SampleTime = Annotated[
-    float | None, typer.Option(metavar="S", help="Of the controller. 1 ms, or less if needed.")
+    float | None, typer.Option(metavar="S", help="Sample time; by default 1 ms, or less if needed.")
 ]
 MaxOvershoot = Annotated[
-    float, typer.Option(metavar="PCT", help="Overshoot that is allowed, % of the step.")
+    float, typer.Option(metavar="PCT", help="Largest overshoot, % of the step.")
 ]
-MaxSettling = Annotated[
-    float | None, typer.Option(metavar="S", help="Settling time that is asked for.")
+MaxSettling = Annotated[float | None, typer.Option(metavar="S", help="Largest settling time.")]
+LoadTorque = Annotated[float | None, typer.Option(metavar="NM", help="Load torque step to reject.")]
+Delay = Annotated[
+    int, typer.Option(metavar="SAMPLES", help="Delay from measurement to voltage: 0 or 1.")
 ]
-LoadTorque = Annotated[
-    float | None, typer.Option(metavar="NM", help="Load step that has to be withstood.")
-]
-Delay = Annotated[int, typer.Option(metavar="SAMPLES", help="From measurement to voltage: 0 or 1.")]
 SpeedStep = Annotated[
-    float | None, typer.Option(metavar="RAD_S", help="Quantum of the speed sensor.")
+    float | None, typer.Option(metavar="RAD_S", help="Resolution of the speed sensor.")
 ]
-SpeedNoise = Annotated[float, typer.Option(metavar="RAD_S", help="Noise of the speed sensor, rms.")]
+SpeedNoise = Annotated[float, typer.Option(metavar="RAD_S", help="RMS noise of the speed sensor.")]
 CurrentSensor = Annotated[bool, typer.Option(help="Whether the controller measures the current.")]
 Spread = Annotated[
     float | None,
     typer.Option(
-        metavar="PCT", help="Spread of each parameter; else as uncertain as the file says."
+        metavar="PCT", help="Standard deviation of each parameter; by default from the motor file."
     ),
 ]
 SaveController = Annotated[
     Path | None,
-    typer.Option(metavar="CONTROLLER.json", help="Write the controller, for pmdc export."),
+    typer.Option(metavar="CONTROLLER.json", help="Save the controller, for pmdc export."),
 ]
 ControllerFile = Annotated[
-    Path, typer.Argument(metavar="CONTROLLER.json", help="Written by pmdc tune --save.")
+    Path, typer.Argument(metavar="CONTROLLER.json", help="Controller file, from pmdc tune --save.")
 ]
-HeaderFile = Annotated[Path, typer.Option("--c", metavar="CONTROLLER.h", help="Where the C goes.")]
+HeaderFile = Annotated[
+    Path, typer.Option("--c", metavar="CONTROLLER.h", help="C header file to write.")
+]
 Folder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")]
 
 
@@ -140,7 +150,7 @@ def _pair(option: str, text: str) -> tuple[str, str]:
         examples = {"--column": "speed=rpm_meas:rpm", "--tie": "Kt=Kb", "--known": "R=0.157"}
         raise InputError(
             f"{option} {text}",
-            "this is not a pair",
+            "this is not of the form A=B",
             f"Write for example {option} {examples[option]}",
         )
     return left, right

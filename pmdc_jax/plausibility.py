@@ -58,7 +58,7 @@ class Term(NamedTuple):
 def reversed_signs(run: Recording) -> Iterator[Finding]:
     """Channels wired or defined the other way round."""
     for column, what in _reversed_channels(run):
-        mend = f"Turn the sign of the {column} column, or swap its wires"
+        mend = f"Reverse the sign of the {column} column, or swap its wires"
         yield Finding(run.name, column, "warning", what, "whole run", mend)
 
 
@@ -83,8 +83,8 @@ def lost_signs(run: Recording) -> Iterator[Finding]:
     )
     if least < min(MAX_UNEXPLAINED, missed() / 2) and missed() > MAX_UNEXPLAINED / 2:
         for column in lost:
-            what = "it is never negative, though the voltage is: it has lost its sign"
-            mend = "Record which way it goes as well, or only one direction"
+            what = "it is never negative although the voltage is: its sign is missing"
+            mend = "Record it with its sign, or run the motor in one direction only"
             yield Finding(run.name, column, "warning", what, "whole run", mend)
 
 
@@ -99,7 +99,7 @@ def _reversed_channels(run: Recording) -> Iterator[tuple[str, str]]:
         elif R.negative and Kb.value > 0:
             yield "current", "its sign is opposite to that of the voltage"
     elif any(_falls_when_driven(run, longer) for longer in WINDOW_LENGTHS):
-        yield "speed", f"it falls where the {run.drive} should make it rise: one has a wrong sign"
+        yield "speed", f"it falls where the {run.drive} should make it rise: one sign is wrong"
 
 
 def _falls_when_driven(run: Recording, longer: int) -> bool:
@@ -131,15 +131,15 @@ def angle_against_speed(run: Recording) -> Iterator[Finding]:
     if explained < 0.98 or 0.9 < ratio < 1.1:
         return
     reasons = {
-        1 / RPM: "as if the speed were in rpm",
-        1 / DEGREES: "as if the speed were in deg/s",
-        DEGREES: "as if the angle were in degrees",
-        1 / (2 * np.pi): "as if the angle were in turns",
-        -1.0: "as if one of them had the wrong sign",
+        1 / RPM: ", as if the speed were in rpm",
+        1 / DEGREES: ", as if the speed were in deg/s",
+        DEGREES: ", as if the angle were in degrees",
+        1 / (2 * np.pi): ", as if the angle were in turns",
+        -1.0: ", as if one of them had the wrong sign",
     }
     why = next((why for k, why in reasons.items() if abs(ratio / k - 1) < 0.1), "")
-    what = f"the angle changes {ratio:.4g} times as fast as the speed says {why}".strip()
-    mend = "Correct the unit or the sign in the header or by --column"
+    what = f"the angle changes {ratio:.4g} times as fast as the recorded speed{why}".strip()
+    mend = "Correct the unit, in the header or with --column, or the sign"
     yield Finding(run.name, "angle", "warning", what, "whole run", mend)
 
 
@@ -160,7 +160,7 @@ def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
         return
     if Kt.negative:
         what = "the load rises where the current falls: its sign is reversed"
-        mend = "A load that opposes positive motion is positive: turn the sign of the column"
+        mend = "A load that opposes positive motion is positive: reverse the sign of the column"
         yield Finding(names, "load", "warning", what, "all loaded runs", mend)
     if not Kt.positive:
         return
@@ -168,7 +168,7 @@ def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
     for scale, (column, unit, read) in MISREAD.items():
         if 0.8 < ratio / scale < 1.25 and not any(finding.column == "voltage" for finding in wrong):
             what = f"Kt is {ratio:.3g} times Kb, as if the {column} were in {unit}, not {read}"
-            mend = f"If it is, write [{unit}] into the header, or --column {column}=HEADER:{unit}"
+            mend = f"If so, write [{unit}] in the header, or use --column {column}=HEADER:{unit}"
             yield Finding(names, column, "warning", what, "all loaded runs", mend)
 
 
@@ -197,22 +197,22 @@ def _beyond_any_motor(run: Recording) -> Iterator[Finding]:
     w = _windows(run)
 
     def wrong(column: str, what: str, units: str) -> Finding:
-        mend = f"Check the unit: write {units} into the header, or map it by --column"
+        mend = f"Check the unit: write {units} in the header, or map the column with --column"
         return Finding(run.name, column, "warning", what, "whole run", mend)
 
     top = {name: float(np.max(np.abs(w[name]))) for name in ("speed", "voltage") if name in w}
     if top.get("voltage", 0.0) > TOP_VOLTAGE:
-        yield wrong("voltage", f"{top['voltage']:.4g} V is more than brushed motors take", "[mV]")
+        yield wrong("voltage", f"{top['voltage']:.4g} V is too high for a brushed motor", "[mV]")
     elif top.get("speed", 0.0) > TOP_SPEED:
-        what = f"{top['speed']:.4g} rad/s is faster than brushed motors turn"
+        what = f"{top['speed']:.4g} rad/s is too fast for a brushed motor"
         yield wrong("speed", what, "[rpm] or [deg/s]")
     elif {"voltage", "current", "speed"} <= set(w):
         R, Kb = _electrical_balance(w)
         if Kb.positive and not KB_RANGE[0] < Kb.value < KB_RANGE[1]:
-            what = f"with the voltage it makes Kb = {Kb.value:.3g} V s/rad, unlike any motor"
+            what = f"with the voltage it gives Kb = {Kb.value:.3g} V s/rad, unlike any real motor"
             yield wrong("speed", what, "[rpm] or [deg/s]")
         if R.positive and R.value < LEAST_R:
-            what = f"with the voltage it makes R = {R.value:.3g} ohm, less than any motor has"
+            what = f"with the voltage it gives R = {R.value:.3g} ohm, less than any real motor has"
             yield wrong("current", what, "[mA]")
 
 

@@ -174,17 +174,17 @@ class Fault(NamedTuple):
 def faults(columns: Mapping[str, np.ndarray]) -> Iterator[Fault]:
     """Every fault that makes these columns unusable, the most basic first."""
     if not is_driven(columns):
-        what = f"nothing drives the motor in {', '.join(columns)}"
-        yield Fault(None, None, what, f"Needed beside time: {DRIVES}")
+        what = f"no input column, only {', '.join(columns)}"
+        yield Fault(None, None, what, f"Needed besides time: {DRIVES}")
     time = columns["time"]
     for quantity, values in columns.items():
         if values.ndim != 1 or len(values) != len(time):
-            what = f"shape {values.shape} where time has {time.shape}"
-            yield Fault(quantity, None, what, "Give every column one value a sample")
+            what = f"shape {values.shape}, but time has shape {time.shape}"
+            yield Fault(quantity, None, what, "Give every column one value per sample")
             return
     if len(time) < MIN_SAMPLES:
         what = f"{len(time)} samples, at least {MIN_SAMPLES} are needed"
-        yield Fault(None, None, what if len(time) else "it holds no rows", "Record a longer run")
+        yield Fault(None, None, what if len(time) else "it has no rows", "Record a longer run")
         return
     for quantity, values in columns.items():
         yield from _not_finite(quantity, values, columns)
@@ -220,10 +220,10 @@ def _not_finite(
     )
     if not output and quantity != "temperature":
         what = f"{count} of {len(values)} values are missing (empty or NaN), the first here"
-        yield Fault(quantity, first, what, "An input must be complete: fill it, or cut the run")
+        yield Fault(quantity, first, what, "Inputs must be complete: fill the gaps, or cut the run")
     elif output and count > MAX_MISSING * len(values):
         what = f"{count} of {len(values)} values are missing (empty or NaN), the first here"
-        mend = f"Up to {MAX_MISSING:.0%} may be missing: cut the run, or leave out the column"
+        mend = f"Up to {MAX_MISSING:.0%} may be missing: cut the run, or remove the column"
         yield Fault(quantity, first, what, mend)
 
 
@@ -235,7 +235,7 @@ def _time_order(time: np.ndarray) -> Iterator[Fault]:
     before, now = (f"{value:.9g}" for value in time[row - 1 : row + 1])
     if steps[row - 1] < 0:
         what = f"time goes backwards, from {before} s to {now} s"
-        mend = "One file is one run: split it, or sort the lines"
+        mend = "A file holds one run: split it, or sort the lines"
     else:
         what = f"the time stamp {now} s is repeated ({(steps == 0).sum()} repetitions in all)"
         mend = "Export time with more digits, or delete repeated lines"

@@ -90,8 +90,8 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (".csv", ".parquet"):
-        what = f"cannot write files of kind '{suffix}'"
-        raise InputError(str(path), what, "Name it .csv or .parquet")
+        what = f"cannot write files of type '{suffix}'"
+        raise InputError(str(path), what, "Use the suffix .csv or .parquet")
     data = recording.columns()
     frame = pl.DataFrame({QUANTITIES[quantity].header: array for quantity, array in data.items()})
     with replacing(path) as part, part.open("wb") as file:
@@ -104,17 +104,17 @@ def _refuse_too_little(
     headers = ", ".join(filter(None, table.headers[:20])) or "none"
     seen = f"columns in the file: {headers}"
     if len(table.headers) == 1:
-        seen += "; if these are several, separate them by comma, semicolon or tab"
+        seen += "; if this is more than one, separate them by comma, semicolon or tab"
     if "time" not in found:
-        mend = f"Name it time_s, or map it by --column time=HEADER:UNIT; {seen}"
+        mend = f"Name it time_s, or map it with --column time=HEADER:UNIT; {seen}"
         raise InputError(where, "there is no time column", mend)
     if to_simulate and not is_driven(found):
-        what, needed, lacking = "nothing drives the motor in", DRIVES, "voltage"
+        what, needed, lacking = "no input column, only", DRIVES, "voltage"
     elif not to_simulate and not is_identifiable_from(found):
-        what, needed, lacking = "nothing to identify from", OUTPUTS_TOO, "speed"
+        what, needed, lacking = "too few columns to identify a motor, only", OUTPUTS_TOO, "speed"
     else:
         return
-    mend = f"Needed beside time: {needed}. Map others by --column {lacking}=HEADER:UNIT; {seen}"
+    mend = f"Needed besides time: {needed}. Map columns with --column {lacking}=HEADER:UNIT; {seen}"
     raise InputError(where, f"{what} {', '.join(found)}", mend)
 
 
@@ -141,22 +141,20 @@ def _notes(
 
     for quantity, column in found.items():
         if quantity in empty:
-            yield note(column.header, "the column is empty", "It is left out")
+            yield note(column.header, "the column is empty", "It is ignored")
         elif column.by_unit:
-            mend = f"If it is something else, say what is: --column {quantity}=HEADER:UNIT"
-            yield note(column.header, f"taken for the {quantity}, by its unit", mend)
+            mend = f"If it is something else, map the right column: --column {quantity}=HEADER:UNIT"
+            yield note(column.header, f"used as the {quantity}, because of its unit", mend)
         elif column.unit is None:
-            mend = f"If it is not, write the unit into the header: {QUANTITIES[quantity].header}"
-            yield note(column.header, f"the header has no unit: taken as {column.base}", mend)
+            mend = f"If this is wrong, write the unit in the header, as in {QUANTITIES[quantity].header}"
+            yield note(column.header, f"the header has no unit: {column.base} assumed", mend)
     if mixed := mixed_axes(found):
         shaft, axis = mixed
-        what = (
-            f"{shaft.base} belongs to a rotating shaft, the {axis.base} of {axis.header} does not"
-        )
-        mend = "Give all columns for the shaft (rad, N m) or all for the linear axis (m, N)"
+        what = f"{shaft.base} is a unit of a rotating shaft, but the {axis.base} of {axis.header} is not"
+        mend = "Give all columns in shaft units (rad, N m) or all in linear-axis units (m, N)"
         yield Finding(run, shaft.header, "warning", what, "header", mend)
     for header in headers:
         quantity = likely_quantity(header)
         if quantity and quantity not in found:
-            what = f"not used, though it looks like {quantity}"
-            yield note(header, what, f"Map it by --column {quantity}={header}:UNIT")
+            what = f"not used, although it looks like {quantity}"
+            yield note(header, what, f"Map it with --column {quantity}={header}:UNIT")

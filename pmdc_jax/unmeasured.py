@@ -35,7 +35,7 @@ def without_unmeasured(run: Recording) -> Recording:
             continue
         spikes = _spikes(signal) & _steady(run)
         if 0 < spikes.sum() <= MAX_SPIKES * len(run):
-            run = _without(run, name, spikes, "leaps out and straight back")
+            run = _without(run, name, spikes, "has a single-sample spike")
         signal = getattr(run, name)
         ends = [extreme for extreme, *_ in clipped_extremes(signal)]
         clipped = np.isin(signal, ends)
@@ -53,9 +53,9 @@ def _without(run: Recording, name: str, lost: Bool[np.ndarray, " samples"], how:
         run.name,
         name,
         "note",
-        f"it {how}, at {signal[rows[0]]:.6g}: taken as missing",
+        f"it {how} at {signal[rows[0]]:.6g}: treated as missing",
         f"{place_of_sample(run, rows[0])}{others}",
-        "If the motor did so, sample faster, and with a larger range",
+        "If the values are real, sample faster and with a larger measuring range",
     )
     missing = np.where(lost, np.nan, signal)
     return attrs.evolve(run, notes=(*run.notes, note), **{name: missing})

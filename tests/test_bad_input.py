@@ -140,8 +140,8 @@ def cases() -> Iterator[Case]:
     yield Case(
         "nothing useful", csv("time_s,a,b,c", *rows()), "columns in the file: time_s, a, b, c"
     )
-    yield Case("voltage alone", csv("time_s,voltage_V", *rows(columns=2)), "nothing to identify")
-    yield Case("speed alone", csv("time_s,speed_rad_s", *rows(columns=2)), "nothing to identify")
+    yield Case("voltage alone", csv("time_s,voltage_V", *rows(columns=2)), "too few columns")
+    yield Case("speed alone", csv("time_s,speed_rad_s", *rows(columns=2)), "too few columns")
     yield Case("blanks separate", csv("time_s voltage_V speed_rad_s", "0 1 2"), "separate them by")
     yield Case(
         "text in a column", edited(7, "0.05,1,oops,2"), "line 7, column current_A: 'oops' is not"
@@ -174,10 +174,10 @@ def cases() -> Iterator[Case]:
     )
     yield Case("Latin-1 later", edited(8, "0.06,1,2,3 µ", encoding="latin-1"), "line 8: byte")
     yield Case("UTF-16", csv(HEADER, *rows(), encoding="utf-16"), "UTF-16")
-    yield Case("binary junk", raw(bytes(range(256)) * 20), "no text")
+    yield Case("binary junk", raw(bytes(range(256)) * 20), "not a text file")
     yield Case("gzip named csv", raw(gzip.compress(b"time_s" * 99)), "run.csv")
-    yield Case("unknown suffix", raw(b"PK\x03\x04", "run.xlsx"), "unknown kind of file '.xlsx'")
-    yield Case("no suffix", csv(HEADER, *rows(), name="run"), "unknown kind of file ''")
+    yield Case("unknown suffix", raw(b"PK\x03\x04", "run.xlsx"), "unknown file type '.xlsx'")
+    yield Case("no suffix", csv(HEADER, *rows(), name="run"), "unknown file type ''")
     yield Case(
         "duplicate columns",
         csv("time_s,voltage_V,speed_rad_s,speed_rad_s", *rows()),
@@ -235,7 +235,7 @@ def cases() -> Iterator[Case]:
     yield Case(
         "voltage column empty, nothing else drives",
         csv("time_s,voltage_V,speed_rad_s", *[f"{k / 100},,{k}" for k in range(20)]),
-        "nothing to identify",
+        "too few columns to identify a motor",
     )
     yield from mapping_cases()
     yield from binary_cases()
@@ -256,11 +256,11 @@ def mapping_cases() -> Iterator[Case]:
 
 def binary_cases() -> Iterator[Case]:
     """Bad MATLAB and Parquet files."""
-    yield Case("text named mat", raw(b"time_s,voltage_V\n" * 20, "run.mat"), "no MATLAB file")
-    yield Case("short junk named mat", raw(b"ab", "run.mat"), "no MATLAB file")
+    yield Case("text named mat", raw(b"time_s,voltage_V\n" * 20, "run.mat"), "not a MATLAB file")
+    yield Case("short junk named mat", raw(b"ab", "run.mat"), "not a MATLAB file")
     hdf5 = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n" * 20
     yield Case("MATLAB v7.3", raw(hdf5, "run.mat"), "-v7")
-    yield Case("mat of texts", mat(note="hello"), "no vectors")
+    yield Case("mat of texts", mat(note="hello"), "no numeric vectors")
     yield Case("mat of one matrix", mat(data=np.eye(30)), "no time column")
     yield Case("mat without time", mat(**good_mat(time_s="none")), "no time column")
     yield Case(
@@ -274,13 +274,15 @@ def binary_cases() -> Iterator[Case]:
         "both mean speed",
     )
     yield Case("mat with NaN in time", mat(**good_mat(time_s=np.full(50, np.nan))), "column time_s")
-    yield Case("text named parquet", raw(b"time_s,voltage_V\n" * 20, "run.parquet"), "no Parquet")
+    yield Case(
+        "text named parquet", raw(b"time_s,voltage_V\n" * 20, "run.parquet"), "not a Parquet"
+    )
     t = [k / 10 for k in range(20)]
     words = ["fast"] * 20
     yield Case(
         "parquet with texts",
         frame(time_s=t, voltage_V=t, speed_rad_s=words),
-        "column speed_rad_s: it holds String",
+        "column speed_rad_s: it contains String",
     )
     yield Case(
         "parquet with time backwards",
@@ -352,7 +354,7 @@ def test_no_permission_to_write(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("name", "what"), [("absent/out.csv", "No such"), ("out.mat", "kind")])
+@pytest.mark.parametrize(("name", "what"), [("absent/out.csv", "No such"), ("out.mat", "of type")])
 def test_bad_output(tmp_path, name, what):
     with pytest.raises(InputError, match=what):
         write_recording(good_recording(), tmp_path / name)
@@ -363,7 +365,7 @@ def test_bad_output(tmp_path, name, what):
     [
         ({"time": np.zeros(20)}, "sample 2, column time: the time stamp"),
         ({"speed": np.zeros(19)}, "column speed: shape"),
-        ({"voltage": None}, "nothing drives the motor"),
+        ({"voltage": None}, "no input column, only time, speed"),
         ({"voltage": np.full(20, np.inf)}, "infinite"),
     ],
 )
@@ -376,14 +378,14 @@ def test_recordings_made_in_python_are_checked_too(changes, what):
 def test_a_voltage_alone_is_enough_to_simulate_and_nothing_to_identify(tmp_path):
     t = np.arange(20) / 10
     run = Recording("run", t, voltage=t)
-    with pytest.raises(InputError, match="nothing to identify from time, voltage"):
+    with pytest.raises(InputError, match="too few columns to identify a motor, only time, voltage"):
         prepare([run], ())
     write_recording(run, tmp_path / "run.csv")
-    with pytest.raises(InputError, match="nothing to identify from time, voltage"):
+    with pytest.raises(InputError, match="too few columns to identify a motor, only time, voltage"):
         read_recording(tmp_path / "run.csv")
     assert read_recording(tmp_path / "run.csv", to_simulate=True).speed is None
     (tmp_path / "speed.csv").write_text("time_s,speed_rad_s\n0,0\n0.1,1\n")
-    with pytest.raises(InputError, match="nothing drives the motor in time, speed"):
+    with pytest.raises(InputError, match="no input column, only time, speed"):
         read_recording(tmp_path / "speed.csv", to_simulate=True)
 
 

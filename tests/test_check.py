@@ -102,11 +102,11 @@ def test_good_data_pass_in_silence(seed):
 def test_a_current_that_leaps_is_known_only_beside_a_voltage():
     steps = good_run(0)
     leaping = evolve(steps, current=np.repeat([1.0, -2.0], [700, len(steps) - 700]), voltage=None)
-    (note,) = [f for f in check([leaping]) if "leaps" in f.what]
+    (note,) = [f for f in check([leaping]) if "jumps" in f.what]
     assert "by up to 3 A" in note.what and "sample 700 " in note.where
     smooth = evolve(leaping, current=np.sin(0.01 * np.arange(len(steps))))
     beside = evolve(leaping, voltage=steps.voltage)
-    assert not any("leaps" in f.what for run in (smooth, beside) for f in check([run]))
+    assert not any("jumps" in f.what for run in (smooth, beside) for f in check([run]))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.03])
@@ -147,7 +147,7 @@ def test_a_run_at_rest_among_others_is_only_noted():
     current = 0.02 + 0.01 * rng.normal(size=len(run))
     rest = evolve(run, name="rest", voltage=0 * run.voltage, current=current, speed=0 * run.speed)
     assert told([run, rest]) == []
-    assert [f.run for f in check([run, rest]) if "nothing moves" in f.what] == ["rest"]
+    assert [f.run for f in check([run, rest]) if "no signal varies" in f.what] == ["rest"]
     assert [f.severity for f in told([rest])] == ["error"]
 
 
@@ -156,7 +156,7 @@ def test_a_load_of_zero_is_no_finding_and_a_constant_one_is_noted():
     assert check([evolve(run, load=np.zeros(len(run)))]) == check([run])
     (note,) = set(check([evolve(run, load=np.full(len(run), 0.2))])) - set(check([run]))
     assert (note.column, note.severity) == ("load", "note")
-    assert "the load column is constant: it is taken as known" in note.what
+    assert "the load column is constant: used as a known load of" in note.what
 
 
 def with_gap(run):
@@ -201,7 +201,7 @@ def test_a_wrapped_angle_is_noted_and_goes_on(step):
     (found,) = [f for f in check([run]) if f.column == "angle" and "turn" in f.what]
     times = int(step * (len(run) - 1) / (2 * np.pi))
     assert found.severity == "note"
-    assert f"starts again after each turn, {times} time" in found.what
+    assert f"wraps after each turn, {times} time" in found.what
     for speed in (uniform(run).speed[1:], speed_of(run)):
         np.testing.assert_allclose(speed, step / run.sample_time)
 
@@ -211,7 +211,7 @@ def test_stamps_that_jitter_are_noted_with_what_the_samples_are_taken_for():
         (found,) = [f for f in check([with_jitter(good_run(seed, "prbs"))]) if f.column == "time"]
         assert found.severity == "note"
         assert "jitter by" in found.what
-        assert "came evenly all the same" in found.what
+        assert "the signals were sampled evenly" in found.what
 
 
 RPM = 30 / np.pi
@@ -240,12 +240,12 @@ FAULTS = [
     ("late speed", lambda run: shifted(run, speed=8), "speed", "late"),
     ("early speed", lambda run: shifted(run, speed=-8), "speed", "early"),
     ("late both", lambda run: shifted(run, speed=8, current=8), "voltage", "8 samples"),
-    ("buried speed", buried, "speed", "it swings less than its noise"),
+    ("buried speed", buried, "speed", "it varies less than its noise"),
     ("angle in degrees", lambda run: with_angle(run, 180 / np.pi), "angle", "in degrees"),
     ("speed in rpm by angle", lambda run: with_angle(run, 1 / RPM), "angle", "speed were in rpm"),
     ("angle the other way", lambda run: with_angle(run, -1), "angle", "wrong sign"),
-    ("impossible speed", lambda run: evolve(run, speed=1e3 * run.speed), "speed", "faster than"),
-    ("voltage in mV", lambda run: evolve(run, voltage=1e3 * run.voltage), "voltage", "motors take"),
+    ("impossible speed", lambda run: evolve(run, speed=1e3 * run.speed), "speed", "too fast"),
+    ("voltage in mV", lambda run: evolve(run, voltage=1e3 * run.voltage), "voltage", "too high"),
     (
         "current in µA",
         lambda run: evolve(run, current=1e6 * run.current),
@@ -295,7 +295,7 @@ def test_channels_without_a_sign_are_found(columns):
     for seed in range(6):
         run = good_run(seed, "steps")
         bare = evolve(run, **{column: np.abs(getattr(run, column)) for column in columns})
-        found = [f for f in told([bare]) if "lost its sign" in f.what]
+        found = [f for f in told([bare]) if "its sign is missing" in f.what]
         assert [f.column for f in found] == list(columns), seed
 
 

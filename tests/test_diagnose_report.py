@@ -129,10 +129,10 @@ def test_a_named_effect_in_words():
         "Stribeck friction (coulomb 61.20 mN·m, static 148.00 mN·m, speed 11.00 rad/s; p < 0.001)"
     )
     assert where in told
-    assert f"Missing: {found}. Added." in told
-    assert "Hold-out error 4.90 to 1.02 times the noise: 99.80 % of the gap is closed." in told
+    assert f"Missing: {found}. Added to the model." in told
+    assert "Hold-out error from 4.90 to 1.02 times the noise: 99.80 % of the gap is closed." in told
     assert "f by −60.0 %" in told
-    assert "constant load above 4.00 mN·m would have shown" in told
+    assert "constant load above 4.00 mN·m would have been detected" in told
     assert "static_Nm" not in told
 
 
@@ -147,17 +147,17 @@ def test_nothing_found_says_what_would_have_been_seen():
     told = words(none_detected())
     assert "No missing effect was detected" in told
     assert "p = 0.37" in told
-    assert "Constant load above 4.00 mN·m would have shown" in told
+    assert "Constant load above 4.00 mN·m would have been detected" in told
     assert "gap" not in told
     assert "--tie Kt=Kb" in told  # what identification warns of is not lost
 
 
 def test_what_no_torque_can_leave_in_words():
-    left = "41.0 times what the noise of the sensors explains, and no torque can be why"
+    left = "41.0 times what the sensor noise explains, which no torque can cause"
     assert left in words(evolve(not_in_library(), electrical_misfit=41.0))
-    assert "times what the noise" not in words(not_in_library())
-    assert "no interval covers that" in words(not_in_library())
-    assert "no interval covers that" not in words(named())
+    assert "times what the sensor noise" not in words(not_in_library())
+    assert "the intervals do not cover this error" in words(not_in_library())
+    assert "the intervals do not cover this error" not in words(named())
 
 
 @pytest.mark.parametrize(
@@ -179,16 +179,16 @@ def test_a_run_that_alone_is_missed_is_told():
     first, *_ = (name for name, fit in runs.items() if fit.role == "train")
     gaps = {name: Gap(4.9, 30.0 if name == first else 1.0, 1.0) for name in runs}
     told = " ".join(verdict_sentences(named(gap_of_run=gaps, verdict="not_in_library")))
-    assert f"It is the run {first} that is missed, 30.0 times as much as any other" in told
+    assert f"The error is largest in the run {first}, 30.0 times that of any other" in told
     for changes in ({"gap_of_run": gaps}, {"verdict": "not_in_library"}):  # noise; all alike
-        assert "It is the run" not in " ".join(verdict_sentences(named(**changes)))
+        assert "The error is largest in" not in " ".join(verdict_sentences(named(**changes)))
 
 
 def test_what_is_left_beyond_white_noise_is_told():
     shaken = evolve(named().final, missed={"current": 22.4, "speed": 19.6})
     told = words(named(final=shaken))
     assert "22.4 times the white noise of the current and 19.6 times the white noise of the" in told
-    assert "counts as noise" not in words(named())
+    assert "treated as noise" not in words(named())
 
 
 def test_rivals_and_the_run_that_decides_in_words():
@@ -201,27 +201,30 @@ def test_rivals_and_the_run_that_decides_in_words():
     assert "Coulomb friction of 50.0 mN·m (p = 0.0020)" in told
     assert "record this: creep through zero, 6 s within 12 V." in told
     assert "93.00 %" in told
-    assert "No run within" in words(evolve(ambiguous(), next_experiment=None))
+    assert "No experiment within" in words(evolve(ambiguous(), next_experiment=None))
 
 
 def test_what_is_not_in_the_library_in_words():
     told = words(not_in_library())
     assert "no effect of the library explains" in told
-    assert "over speed, clearest with −30.0 mN·m at 40.0 rad/s" in told
+    assert "over speed, most significant with −30.0 mN·m at 40.0 rad/s" in told
     part = words(evolve(not_in_library(), effects=named().effects))
     assert "Stribeck friction (" in part
-    assert "explains part of it and was added; what is left is no effect of the library." in part
+    assert (
+        "explains part of this and was added to the model; no effect of the library explains the rest."
+        in part
+    )
     gap = {"train": Gap(4.0, 1.0, 1.0), "holdout": Gap(5.0, 3.0, 1.0)}
     held_out = words(evolve(not_in_library(), effects=named().effects, gap=gap))
-    assert "explains part of it and was added." in held_out
-    assert "Held-out runs are missed by 3.00 times what the fitted ones are" in held_out
+    assert "explains part of this and was added to the model." in held_out
+    assert "The error of the held-out runs is 3.00 times that of the training runs" in held_out
 
 
 def test_an_effect_that_makes_hold_outs_worse_is_said_to():
     gap = {"train": Gap(1.2, 1.0, 1.0), "holdout": Gap(1.3, 1.6, 1.0)}
     told = words(evolve(not_in_library(), effects=named().effects, gap=gap))
-    assert "With it held-out runs are missed by more than without" in told
-    assert "what is left is no effect" not in told
+    assert "The addition increases the error of the held-out runs" in told
+    assert "explains the rest" not in told
 
 
 @pytest.mark.parametrize(("after", "beyond"), [(2.4, None), (2.6, 2.6)])
@@ -250,7 +253,7 @@ def test_hold_outs_tell_what_fitted_runs_do_not(after, beyond):
             "from −100 to −50.0 rad/s and from 5.00 to 20.0 rad/s",
         ),
         ("current", [(3.0, 4.0)], None, "at a current from 3.00 to 4.00 A"),
-        ("time", [(0.25, 0.5)], None, "from 25.0 % to 50.0 % of a run"),
+        ("time", [(0.25, 0.5)], None, "from 25.0 % to 50.0 % of the run"),
     ],
 )
 def test_stretches_in_words(variable, intervals, reach, told):
@@ -321,8 +324,8 @@ def test_tables_show_everything(case):
         assert run in told
     for effect in diagnosis.effects:
         assert EFFECTS[effect.name].label in told
-    assert ("Moved" in told) == bool(diagnosis.effects)
-    assert ("Would have been seen" in told) == (case == "none_detected")
+    assert ("Change" in told) == bool(diagnosis.effects)
+    assert ("Detectable with" in told) == (case == "none_detected")
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -367,8 +370,8 @@ def test_a_limit_of_the_search_is_nothing_to_move_from():
     base = named().base
     limit = evolve(base.parameters["f"], status="at_bound", stderr=None, ci95=None)
     told = words(named(base=evolve(base, parameters={**base.parameters, "f": limit})))
-    assert "moved f by" in words(named())
-    assert "moved f by" not in told
+    assert "changed f by" in words(named())
+    assert "changed f by" not in told
 
 
 def test_the_next_experiment_can_be_played(tmp_path):

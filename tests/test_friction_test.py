@@ -43,8 +43,8 @@ def test_friction_that_hides_in_the_viscous_one_is_told():
     found = identify(runs)
     assert found.parameters["f"].value > 1.5 * PAPER.f
     (message,) = found.messages
-    assert "f is wrong" in message
-    friction = float(message.split("some ")[1].split()[0])
+    assert "f is biased" in message
+    friction = float(message.split("about ")[1].split()[0])
     assert friction == pytest.approx(0.04, rel=0.2)
     assert not said(identify(runs, effects=["coulomb_friction"]).messages)
 
@@ -57,7 +57,11 @@ def test_none_is_told_where_there_is_none(seed, torque):
 
 @pytest.mark.parametrize(
     ("error", "missed", "told"),
-    [(0.1, {}, ", and for want of it f is wrong"), (1.0, {"current": 4.6}, ": add"), (1.0, {}, "")],
+    [
+        (0.1, {}, ", and without it f is biased by more than its standard error"),
+        (1.0, {"current": 4.6}, ": add"),
+        (1.0, {}, ""),
+    ],
 )
 def test_friction_is_told_where_a_parameter_makes_up_for_it_or_far_more_than_noise_is_left(
     error, missed, told

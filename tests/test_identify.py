@@ -375,7 +375,7 @@ def test_a_held_rotor_goes_with_free_ones(runs, found):
     assert_right(more, PAPER)
     for name in ("R", "L"):
         assert more.parameters[name].stderr < found.parameters[name].stderr
-    assert any("taken as held" in finding.what for finding in more.findings)
+    assert any("locked-rotor run" in finding.what for finding in more.findings)
 
 
 def driven_by_torque(name: str, rng: np.random.Generator) -> Recording:

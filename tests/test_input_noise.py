@@ -72,7 +72,7 @@ def errors(found) -> np.ndarray:
 
 def test_noise_of_the_voltage_sensor_does_not_bend_the_parameters():
     found = identify(recorded(felt=0.0, unfelt=0.3))
-    assert [m.split(":")[0] for m in found.messages if "did not feel" in m] == [
+    assert [m.split(":")[0] for m in found.messages if "did not reach the motor" in m] == [
         *("prbs", "loaded", "stairs")
     ]
     assert np.max(np.abs(errors(found))) < 3.5
@@ -97,13 +97,13 @@ def controlled(samples: int = 3000, step: float = 1e-3) -> Recording:
 
 def test_a_held_out_voltage_that_answers_to_a_noisy_speed_is_left_alone():
     found = identify(recorded(felt=0.0, unfelt=0.0), [controlled()])
-    assert not [m for m in found.messages if "did not feel" in m]
+    assert not [m for m in found.messages if "did not reach the motor" in m]
     assert found.fit["controlled"].current_rmse == pytest.approx(0.1, rel=0.05)
 
 
 def test_a_rough_voltage_that_the_motor_felt_is_left_alone():
     found = identify(recorded(felt=0.3, unfelt=0.0))
-    assert not [m for m in found.messages if "did not feel" in m]
+    assert not [m for m in found.messages if "did not reach the motor" in m]
     assert np.max(np.abs(errors(found))) < 3.5
 
 
@@ -130,4 +130,4 @@ def in_a_speed_loop() -> Recording:
 @pytest.mark.slow
 def test_an_unknown_load_does_not_pass_for_a_voltage_that_the_motor_did_not_feel():
     found = identify([in_a_speed_loop()])
-    assert not [m for m in found.messages if "did not feel" in m]
+    assert not [m for m in found.messages if "did not reach the motor" in m]

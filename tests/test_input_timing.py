@@ -133,10 +133,10 @@ def test_sensitivities_are_central_differences(x64, names):
 # how runs are driven and logged, and what is said of it
 LOGS = {
     "held": None,
-    "straight": "straight",
-    "recorded late": "recorded a sample late",
-    "acts late": "acts a sample later",
-    "straight, counted": "straight",
+    "straight": "is linear between samples",
+    "recorded late": "recorded one sample late",
+    "acts late": "acts one sample later",
+    "straight, counted": "is linear between samples",
 }
 LINES = 2048
 

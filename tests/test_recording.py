@@ -161,7 +161,7 @@ def test_a_torque_of_unknown_name_is_not_passed_over_in_silence(tmp_path):
 def test_a_unit_alone_tells_what_a_column_is(tmp_path):
     run = read_text(tmp_path, table("time_s,U_mot/V,I_mot [mA],n_ist [U/min]", T, T, T, T))
     np.testing.assert_allclose((run.voltage, run.current, run.speed), (T, T / 1e3, T * RPM))
-    assert [(n.column, "by its unit" in n.what) for n in run.notes] == [
+    assert [(n.column, "because of its unit" in n.what) for n in run.notes] == [
         ("U_mot/V", True),
         ("I_mot [mA]", True),
         ("n_ist [U/min]", True),
@@ -200,7 +200,7 @@ def test_names_without_a_unit_are_taken_as_si_and_noted(tmp_path):
     run = read_text(tmp_path, table("time_s,voltage_V,speed", T, T, T))
     (note,) = run.notes
     assert (note.column, note.severity) == ("speed", "note")
-    assert "taken as rad/s" in note.what
+    assert "rad/s assumed" in note.what
 
 
 @pytest.mark.parametrize(

@@ -272,7 +272,7 @@ def test_long_runs_are_thinned_and_the_page_stays_small(tmp_path):
     runs = {f"run {number}": replace(long, **changes) for number in range(12)}
     write_report(fake_identification(fit=runs), tmp_path / "report.html")
     assert (tmp_path / "report.html").stat().st_size < 6_000_000
-    assert "drawn thinned" in Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    assert "plot reduced to" in Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
 
 
 def test_envelope_keeps_peaks_order_and_gaps():
@@ -304,13 +304,13 @@ def test_summary_says_what_matters():
     assert "All 6 parameters were identified from 4 training runs" in sentences
     assert "(f)" in sentences
     assert "drive is reproduced" in sentences
-    assert "what is left is the measurement noise" in sentences
+    assert "the residuals are measurement noise" in sentences
     assert "pmdc diagnose" in sentences
     sentences = " ".join(summary(partial_identification()))
-    assert "Kt, J and f could not be" in sentences
+    assert "Kt, J and f could not be identified" in sentences
     assert "--tie Kt=Kb" in sentences
     assert "No run was held out" in sentences
-    assert "L stands at the bound" in sentences
+    assert "L is at the bound" in sentences
     assert "did not converge" in sentences
 
 
@@ -345,8 +345,8 @@ def test_summary_names_the_worst_hold_out_and_its_excess():
     whole = fake_identification()
     bad = replace(whole.fit["prbs"], role="holdout", speed_rmse=3.0)
     sentences = " ".join(summary(fake_identification(fit={**whole.fit, "prbs": bad})))
-    assert "Of 2 held-out runs the worst, prbs," in sentences
-    assert "the speed misses by 5.0 times the measurement noise" in sentences
+    assert "The worst of 2 held-out runs, prbs," in sentences
+    assert "the speed error is 5.0 times the measurement noise" in sentences
 
 
 def test_json_follows_the_contract():

@@ -45,7 +45,7 @@ def test_the_tuned_loop_comes_close_to_the_limit():
     assert second["SettlingTime"] < found.fastest_possible_settling
     small = found.candidates[0].small_step
     assert 0.9 * 24.05 < small["Peak"] < 1.2 * 24.05
-    told = any("a small step, of 24.1 rad/s" in message for message in found.messages)
+    told = any("a small step of 24.1 rad/s" in message for message in found.messages)
     assert told == (small["Overshoot"] > 1.2)
 
 
@@ -89,7 +89,7 @@ def test_the_report_tells_the_same(tmp_path):
     assert "http" not in page.split("<script>")[0].replace("http-equiv", "")
     assert page.count('class="plot"') == 2
     text = " ".join(summary(found))
-    assert "times the fastest that 30 V and 150 A allow" in text
+    assert "times the fastest possible with 30 V and 150 A (" in text
     assert "256 motors" in text
 
 
@@ -118,33 +118,33 @@ def test_samples_too_far_apart_are_noted(sample_time, noted):
 IMPOSSIBLE = {
     "voltage": (
         {"setpoint": 481.0, "voltage_limit": 24.0},
-        "481 rad/s is beyond what 24 V reaches (480.0)",
+        "481 rad/s cannot be reached with 24 V (at most 480.0)",
     ),
     "load": (
         {"setpoint": 481.0, "voltage_limit": 25.0, "load_torque": 1.0},
-        "481 rad/s against 1 N m is beyond what 25 V reaches",
+        "481 rad/s against 1 N m cannot be reached with 25 V",
     ),
     "current": (
         {"setpoint": 481.0, "voltage_limit": 30.0, "current_limit": 2.0},
-        "holding 481 rad/s takes 2.44 A, beyond the limit of 2 A",
+        "holding 481 rad/s takes 2.44 A, more than the limit of 2 A",
     ),
     "time": (
         {"setpoint": 481.0, "voltage_limit": 30.0, "max_settling": 0.04},
-        "0.04 s is less than any controller needs within the limits (0.0441 s)",
+        "0.04 s is less than the fastest settling possible within the limits (0.0441 s)",
     ),
-    "no speed": ({"setpoint": 0.0}, "0 is not a speed to go to"),
+    "no speed": ({"setpoint": 0.0}, "0 is not a nonzero speed"),
     "negative voltage": ({"voltage_limit": -3.0}, "-3 is not a positive number"),
-    "delay": ({"delay": 2}, "2 samples are not supported"),
-    "overshoot": ({"max_overshoot": math.nan}, "nan is not a number from 0 up"),
+    "delay": ({"delay": 2}, "a delay of 2 samples is not supported"),
+    "overshoot": ({"max_overshoot": math.nan}, "nan is not a number of at least 0"),
     "sampling": (
         {"setpoint": 481.0, "voltage_limit": 30.0, "sample_time": 1e-6},
-        "1e-06 s makes",
+        "1e-06 s needs",
     ),
     "milliseconds": (
         {"setpoint": 481.0, "voltage_limit": 30.0, "sample_time": 1.0},
         "1 s is far longer than the fastest settling, 0.0441 s",
     ),
-    "controller": ({"controller": "fuzzy"}, "there is no controller 'fuzzy'"),
+    "controller": ({"controller": "fuzzy"}, "unknown controller 'fuzzy'"),
 }
 
 
@@ -170,7 +170,7 @@ def test_the_command_refuses_in_one_line(motor_file, capsys):
     assert cli.main(arguments.split()) == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
-    assert "481 rad/s is beyond what 24 V reaches (480.0)" in err
+    assert "481 rad/s cannot be reached with 24 V (at most 480.0)" in err
 
 
 @pytest.mark.slow

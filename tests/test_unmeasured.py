@@ -35,7 +35,7 @@ def test_spikes_are_missing_and_told_of(column, value):
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(getattr(mended, column))), rows)
     (note,) = mended.notes
     assert note.column == column
-    assert "straight back" in note.what
+    assert "single-sample spike" in note.what
 
 
 def test_a_pulse_of_the_voltage_makes_no_spike():
@@ -52,7 +52,7 @@ def test_a_fit_does_not_see_spikes_and_its_findings_tell_of_them():
     speed[ROWS] = 3000.0
     given = prepare([attrs.evolve(run, speed=speed)], ())
     assert np.isnan(given.runs[0].speed[ROWS]).all()
-    assert any("straight back" in finding.what for finding in given.findings)
+    assert any("single-sample spike" in finding.what for finding in given.findings)
 
 
 def test_what_is_clipped_is_missing():

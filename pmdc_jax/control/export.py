@@ -35,9 +35,9 @@ $constants
 
 typedef struct {
     pmdc_real integral; /* V */
-    pmdc_real filtered; /* rad/s, the speed behind the derivative filter */
+    pmdc_real filtered; /* rad/s, speed after the derivative filter */
     pmdc_real current;  /* A, as estimated */
-    pmdc_real voltage;  /* V, decided last */
+    pmdc_real voltage;  /* V, last command */
 } pmdc_state;
 
 static inline pmdc_real pmdc_clip(pmdc_real value, pmdc_real lowest, pmdc_real highest)
@@ -120,7 +120,7 @@ def _predicted_state(law: Law) -> list[str]:
     lines += ["const pmdc_real here = current;", "pmdc_real ahead = speed;"]
     if law.hardware.delay:
         lines += [
-            "/* the voltage decided last acts until this one does */",
+            "/* the last command acts until this one does */",
             f"ahead = {_next_sample('W', 'state->voltage')};",
             f"current = {_next_sample('I', 'state->voltage')};",
         ]
@@ -149,7 +149,7 @@ def _limited_voltage(law: Law) -> list[str]:
     lines = ["pmdc_real applied = asked;"]
     if law.hardware.current_limit is not None:
         lines += [
-            "/* the voltage that ends the sample at the current limit */",
+            "/* voltage that reaches the current limit at the end of the sample */",
             "const pmdc_real drift = PMDC_MODEL_II * current + PMDC_MODEL_IW * ahead;",
             "applied = pmdc_clip(applied, (-PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_IV,",
             "                    (PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_IV);",
@@ -162,7 +162,7 @@ def _memory_update(law: Law) -> list[str]:
     lines = []
     if law.controller.integrates:
         lines += [
-            "/* the integral follows the voltage really applied */",
+            "/* anti-windup: the integral tracks the voltage applied */",
             "const pmdc_real tracking = PMDC_TRACKING_TIME > PMDC_SAMPLE_TIME"
             " ? PMDC_TRACKING_TIME : PMDC_SAMPLE_TIME;",
             "state->integral += PMDC_SAMPLE_TIME * (PMDC_INTEGRAL * (reference - speed)",

@@ -31,15 +31,15 @@ def check_reachable(
         highest = _highest_speed(motor, setpoint, voltage_limit, load)
         raise InputError(
             option,
-            f"{setpoint:g} rad/s{against} is beyond what {voltage_limit:g} V reaches ({highest:.1f})",
-            f"It takes {voltage:.2f} V to hold it and more to get there in time",
+            f"{setpoint:g} rad/s{against} cannot be reached with {voltage_limit:g} V (at most {highest:.1f})",
+            f"Holding it takes {voltage:.2f} V, and reaching it in time takes more",
         )
     if current_limit is not None and current > current_limit:
         raise InputError(
             option,
             f"holding {setpoint:g} rad/s{against} takes {current:.2f} A,"
-            f" beyond the limit of {current_limit:g} A",
-            "Raise --current-limit, or lower set point or load",
+            f" more than the limit of {current_limit:g} A",
+            "Raise --current-limit, or lower the set point or the load",
         )
 
 
@@ -68,9 +68,9 @@ def check_settling(
     if max_settling is not None and max_settling < fastest_settling:
         raise InputError(
             "--max-settling",
-            f"{max_settling:g} s is less than any controller needs within the limits"
+            f"{max_settling:g} s is less than the fastest settling possible within the limits"
             f" ({fastest_settling:.4f} s)",
-            "Allow more time, more voltage or more current",
+            "Allow more time, voltage or current",
         )
     return fastest_settling
 

@@ -61,15 +61,15 @@ class LoopRequirements:
     def __attrs_post_init__(self) -> None:
         if self.controller not in CONTROLLERS:
             choice = ", ".join(CONTROLLERS)
-            message = f"there is no controller {self.controller!r}"
-            raise InputError("--controller", message, f"Choose of {choice}")
+            message = f"unknown controller {self.controller!r}"
+            raise InputError("--controller", message, f"Choose from {choice}")
         if self.delay not in (0, 1):
-            message = f"{self.delay} samples are not supported"
+            message = f"a delay of {self.delay} samples is not supported"
             raise InputError("--delay", message, "Choose 0 or 1")
-        _check_number("setpoint", self.setpoint, "a speed to go to", lambda x: x != 0)
+        _check_number("setpoint", self.setpoint, "a nonzero speed", lambda x: x != 0)
         _check_number("load_torque", self.load_torque, "a number", lambda x: True)
         for name in ("max_overshoot", "speed_noise", "spread"):
-            _check_number(name, getattr(self, name), "a number from 0 up", lambda x: x >= 0)
+            _check_number(name, getattr(self, name), "a number of at least 0", lambda x: x >= 0)
         for name in ("voltage_limit", "current_limit", "sample_time", "max_settling", "speed_step"):
             _check_number(name, getattr(self, name), "a positive number", lambda x: x > 0)
         _check_number("max_sensitivity", self.max_sensitivity, "a positive number", lambda x: x > 0)
@@ -109,12 +109,12 @@ class LoopRequirements:
             if setpoint is not None:
                 holding_voltage = abs(float(steady_state(motor, setpoint)[1]))
                 voltage_limit = _three_digits(VOLTAGE_RESERVE * holding_voltage)
-            notes.append(f"no voltage limit given: {voltage_limit:g} V")
+            notes.append(f"no voltage limit given: using {voltage_limit:g} V")
         if setpoint is None:
             setpoint = _three_digits(SETPOINT_SHARE * steady_speed(motor, voltage_limit))
             notes.append(
-                f"no set point given: {setpoint:g} rad/s,"
-                f" {100 * SETPOINT_SHARE:g} % of what the voltage reaches"
+                f"no set point given: using {setpoint:g} rad/s,"
+                f" {100 * SETPOINT_SHARE:g} % of the largest speed"
             )
         return setpoint, voltage_limit, notes
 
@@ -122,20 +122,20 @@ class LoopRequirements:
         """Sample time (s) for a fastest settling of `fastest` (s), and a note if it is a default or rather long."""
         suitable = min(MAX_DEFAULT_SAMPLE_TIME, _rounded_down(fastest / SAMPLES_PER_SETTLING))
         if self.sample_time is None:
-            return suitable, [f"no sample time given: {suitable:g} s"]
+            return suitable, [f"no sample time given: using {suitable:g} s"]
         if self.sample_time <= fastest / SUFFICIENT_SAMPLES:
             return self.sample_time, []
         if self.sample_time > MAX_SAMPLE_TIME_RATIO * fastest:
             raise InputError(
                 "--sample-time",
                 f"{self.sample_time:g} s is far longer than the fastest settling, {fastest:.3g} s:"
-                " nothing happens while a controller could see it",
-                f"It is in seconds; {suitable:g} would suit this motor",
+                " the transient is over within one sample",
+                f"The unit is seconds; {suitable:g} suits this motor",
             )
         samples = f"{fastest / self.sample_time:.2g} samples of {self.sample_time:g} s"
         remark = (
             f"the fastest settling, {fastest:.3g} s, takes {samples}:"
-            f" a sample time of {suitable:g} s would lose less"
+            f" a sample time of {suitable:g} s would perform better"
         )
         return self.sample_time, [remark]
 
@@ -189,7 +189,7 @@ def _part_samples(motor: Motor, fastest: float, sample_time: float, delay: int) 
     if needed > MAX_SAMPLES:
         raise InputError(
             "--sample-time",
-            f"{sample_time:g} s makes {needed} samples of one step",
+            f"{sample_time:g} s needs {needed} samples for one step",
             "Choose a longer sample time",
         )
     power = 2 ** math.floor(math.log2(needed))
@@ -202,7 +202,7 @@ def _check_sensor(motor: Motor, sample_time: float) -> None:
     if delay is not None and float(delay) > (REMEMBERED_SAMPLES - 2) * sample_time:
         raise InputError(
             "--sample-time",
-            f"the speed sensor is {float(delay):g} s late, more than {REMEMBERED_SAMPLES - 2} samples",
+            f"the speed sensor has a delay of {float(delay):g} s, more than {REMEMBERED_SAMPLES - 2} samples",
             "Choose a longer sample time",
         )
 

@@ -216,7 +216,7 @@ def design(
     task = _task(specification, motor, unit_noise)
     tuning_motors = _tuning_motors(motor, variation, seed)
     controller = _best_controller(specification, task, tuning_motors, unit_noise, seed, starts)
-    report("judging the loop", fraction=0.8)
+    report("evaluating the loop", fraction=0.8)
     validation_motors = None if variation is None else _validation_motors(motor, variation, seed)
     result = _evaluated(specification, task, motor, controller, validation_motors, seed)
     return attrs.evolve(
@@ -334,8 +334,8 @@ def _undetermined_remark(uncertainty: Uncertainty | None) -> Iterator[str]:
     """A message on the parameters that no recording determined."""
     if uncertainty is not None and uncertainty.undetermined:
         yield (
-            f"no recording determined {', '.join(uncertainty.undetermined)} of this motor: the values in the file are"
-            " taken as they are"
+            f"the recordings did not determine {', '.join(uncertainty.undetermined)} of this motor: the values in the"
+            " file are used as they are"
         )
 
 
@@ -345,7 +345,7 @@ def _remarks(result: Tuning) -> Iterator[str]:
     yield from _small_step_remark(result)
     peak = result.margins.sensitivity_peak
     if peak is not None and peak > SENSITIVITY_TO_REPORT * MAX_SENSITIVITY:
-        yield f"the loop has thin margins: its sensitivity reaches {peak:.2f}"
+        yield f"the loop has small stability margins: its sensitivity peak is {peak:.2f}"
 
 
 def _unmet_requirements(result: Tuning) -> Iterator[str]:
@@ -356,9 +356,9 @@ def _unmet_requirements(result: Tuning) -> Iterator[str]:
     if settling is None:
         yield "the loop does not settle: try another controller or a shorter sample time"
     elif max_settling is not None and settling > max_settling:
-        yield f"settling takes {settling:.4g} s, longer than the {max_settling:g} s asked for"
+        yield f"settling takes {settling:.4g} s, longer than the required {max_settling:g} s"
     if overshoot is not None and overshoot > max_overshoot:
-        yield f"overshoot is {overshoot:.3g} %, above the {max_overshoot:g} % asked for"
+        yield f"overshoot is {overshoot:.3g} %, above the allowed {max_overshoot:g} %"
 
 
 def _small_step_remark(result: Tuning) -> Iterator[str]:
@@ -372,6 +372,6 @@ def _small_step_remark(result: Tuning) -> Iterator[str]:
     quantum = result.requirements.speed_step or 0.0
     if overshoot > allowed and overshoot / 100 * abs(step) > quantum:
         yield (
-            f"a small step, of {step:.3g} rad/s, overshoots by {overshoot:.3g} %, more than the step to the set point:"
+            f"a small step of {step:.3g} rad/s overshoots by {overshoot:.3g} %, more than the step to the set point:"
             " tune for a smaller set point if such steps matter"
         )

@@ -81,7 +81,7 @@ def diagnose(
     selection = StepwiseSelection(model_of((), given, solved.fit), solved, report)
     naming = selection.name()
     named = time.perf_counter()
-    report("judging the uncertainty", naming.chosen.fit.fitness)
+    report("estimating the uncertainty", naming.chosen.fit.fitness)
     base = results_of(given, solved)
     final = _judged(naming, solved)
     while (idle := _idle(naming, final, selection.library)) is not None:

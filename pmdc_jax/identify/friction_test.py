@@ -71,15 +71,15 @@ def of_friction(missing: Missing | None, found: Identification) -> Iterator[str]
     moved = np.abs(missing.moved) / np.where(errors > 0, errors, np.inf)
     most = int(np.argmax(moved))
     if moved[most] > MAKES_UP:
-        wrong = f", and for want of it {found.covariance_names[most]} is wrong by more than it says"
+        wrong = f", and without it {found.covariance_names[most]} is biased by more than its standard error"
     elif found.missed:
         wrong = ""
     else:
         return
     yield (
-        f"dry friction of some {missing.friction_Nm:.2g} N m would explain part of what the fit leaves "
-        f"({missing.errors:.0f} standard errors){wrong}: add `--effect {DRY}`, or let `pmdc diagnose` find what is "
-        "missing"
+        f"dry friction of about {missing.friction_Nm:.2g} N m would explain part of the residuals "
+        f"({missing.errors:.0f} standard errors){wrong}: add `--effect {DRY}`, or run `pmdc diagnose` to find what "
+        "is missing"
     )
 
 

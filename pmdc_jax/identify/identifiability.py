@@ -46,17 +46,17 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
         )
     if not turning and names & {"Kb", "Kt", "J", "f"}:
         return (
-            f"No run of a rotor that turns has a speed or an angle, so {listed} trade off against each other",
+            f"No run with a turning rotor has a speed or an angle, so {listed} trade off against each other",
             "Record the speed or the angle too, or give values with --known",
         )
     if {"J", "f"} <= names and not electrical and not loaded and not driven:
         return (
-            "No run has a voltage or a known load torque other than zero, so only the ratios of Kt, J and f are seen",
+            "No run has a voltage or a nonzero known load torque, so only the ratios of Kt, J and f are identifiable",
             "Record the voltage too, add a run with a known load torque, or give Kt with --known",
         )
     if {"Kt", "J"} <= names and not loaded and not driven:
         return (
-            "No run has a known load torque other than zero, so only the ratios of Kt, J and f are seen",
+            "No run has a nonzero known load torque, so only the ratios of Kt, J and f are identifiable",
             "Add a run with a known load torque, or tie Kt = Kb with --tie Kt=Kb",
         )
     if names == {"L"}:
@@ -67,12 +67,12 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
     if names == {"f"}:
         return (
             "Viscous friction changes these runs by less than their noise",
-            "Record steady running at several speeds, light and long",
+            "Record long steady runs at several speeds with little load",
         )
     if "J" in names and not names & {"Kt", "Kb"}:
         return (
-            "Speed changes too little for its inertia to show",
-            "Add a run with voltage steps or a fast changing voltage",
+            "The speed changes too little to show the inertia",
+            "Add a run with voltage steps or a rapidly changing voltage",
         )
     if {"R", "Kb"} & names:
         return (
@@ -80,7 +80,7 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
             "Add runs at other loads, at stall, or with voltage steps",
         )
     return (
-        f"The runs do not tell {listed} apart",
+        f"The runs cannot distinguish {listed}",
         "Add a run with more excitation: voltage steps, both directions, several speeds and loads",
     )
 

@@ -109,7 +109,7 @@ def effects_named(names: Sequence[str]) -> tuple[type[AbstractEffect], ...]:
     for name in names:
         if name not in EFFECTS:
             raise InputError(
-                "--effect", f"there is no effect {name}", f"Choose of {', '.join(EFFECTS)}"
+                "--effect", f"unknown effect {name}", f"Choose from {', '.join(EFFECTS)}"
             )
     return tuple(EFFECTS[name] for name in dict.fromkeys(names))
 
@@ -119,5 +119,5 @@ def check_names(option: str, names: Sequence[str]) -> None:
     for name in names:
         if name not in PARAMETERS:
             raise InputError(
-                option, f"there is no parameter {name}", f"Choose of {', '.join(PARAMETERS)}"
+                option, f"unknown parameter {name}", f"Choose from {', '.join(PARAMETERS)}"
             )

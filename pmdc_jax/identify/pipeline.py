@@ -54,7 +54,7 @@ def identify(
         recordings, holdout, tie=tie, known=known, unloaded=unloaded, effects=effects_named(effects)
     )
     given, solved = solve(given, search, seed, progress)
-    report("judging the uncertainty", solved.fit.fitness)
+    report("estimating the uncertainty", solved.fit.fitness)
     plainly = solved.fit
     friction = missing_friction(given, plainly)
     white = whitener(residuals_of(given, plainly))
@@ -62,8 +62,8 @@ def identify(
     found = results_of(given, solved._replace(fit=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
     left = (
-        f"what the fit leaves of the {name} is {times:.2g} times its white noise: `pmdc diagnose` tells whether the "
-        "model lacks something, or the motor or a sensor was disturbed"
+        f"the residual of the {name} is {times:.2g} times its white noise: run `pmdc diagnose` to find out whether the "
+        "model lacks an effect, or the motor or a sensor was disturbed"
         for name, times in found.missed.items()
     )
     doubts = (*of_friction(friction, found), *left)

@@ -115,8 +115,8 @@ def prepare(
     if not parameters.names:
         raise InputError(
             "--known",
-            "with every parameter known nothing is left to identify",
-            "Leave one out, R say: it then stays near its value, or tells that something is amiss",
+            "every parameter is known: nothing is left to identify",
+            "Leave one out, for example R: its estimate then confirms or contradicts its known value",
         )
     # hold-out runs are on the tape too, but only their own unknowns may be fitted to them
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True))
@@ -149,15 +149,15 @@ def _refuse(
     known: Mapping[str, float] | None,
 ) -> None:
     if not recordings:
-        raise InputError("RUN", "there is no recording to fit", "Name at least one")
+        raise InputError("RUN", "there is no recording to fit", "Give at least one")
     for run in (*recordings, *holdout):
         if not run.tells:
-            what = f"nothing to identify from {', '.join(run.columns())}"
-            raise InputError(run.source or run.name, what, f"Needed beside time: {OUTPUTS_TOO}")
+            what = f"too few columns to identify a motor, only {', '.join(run.columns())}"
+            raise InputError(run.source or run.name, what, f"Needed besides time: {OUTPUTS_TOO}")
     names = [r.name for r in (*recordings, *holdout)]
     for name in names:
         if names.count(name) > 1:
-            raise InputError(name, "two runs have this name", "Rename one, or name it only once")
+            raise InputError(name, "two runs have this name", "Rename one, or list it only once")
     check_names("--tie", [name for pair in tie for name in pair])
     check_names("--known", list(known or {}))
     targets = [target for target, _ in tie]
@@ -166,7 +166,7 @@ def _refuse(
             raise InputError("--tie", f"{target} is tied twice", "Drop one")
         if target == source or target in (known or {}) or target in {b for _, b in tie}:
             raise InputError(
-                "--tie", f"{target}={source} ties in a circle or a known value", "Drop one"
+                "--tie", f"{target}={source} forms a circle or ties a known value", "Drop one"
             )
     for name, value in (known or {}).items():
         if not 0 < value < np.inf:

@@ -30,7 +30,7 @@ MISSED = 2.0
 # Units of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
 # Spans over which a speed may be averaged
-MEANS = {OVER_LAST: "the last sample", OVER_BOTH: "the last and the next sample"}
+MEANS = {OVER_LAST: "the last sample interval", OVER_BOTH: "the last and the next sample interval"}
 # A parameter is unseen by itself if at least this share of it lies in unseen directions
 ALONE = 0.99
 # A parameter is visible if it changes the outputs by this share of what the most sensitive one does
@@ -284,20 +284,20 @@ def _missed(fit: Mapping[str, RunFit]) -> dict[str, float]:
 
 def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:
     messages = [
-        f"{run.name}: the {run.drive} holds {given.input_noise[run.name]:.3g} {UNITS[run.drive]} of noise that the "
-        "motor did not feel: it was taken out"
+        f"{run.name}: the recorded {run.drive} has {given.input_noise[run.name]:.3g} {UNITS[run.drive]} of sensor "
+        "noise that did not reach the motor: it was removed"
         for run in given.runs
         if run.name in given.input_noise
     ]
     acts = "steps between samples" if given.stepped else given.timing and given.timing.what
     if acts:
-        messages.append(f"the voltage {acts}: it is taken for that")
+        messages.append(f"the voltage {acts}: this is modelled")
     if given.averaging:
         messages.append(
-            f"the speed is a mean over {MEANS[given.averaging]}, as differences of an angle are: it is taken for that"
+            f"the speed is a mean over {MEANS[given.averaging]}, as differences of an angle are: this is modelled"
         )
     if solved.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
     if tied:
-        messages.append("Kt was set equal to Kb, as they are in SI, and J and f go with it")
+        messages.append("Kt was set equal to Kb, as holds in SI units, and J and f scale with it")
     return tuple(messages)

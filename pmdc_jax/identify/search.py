@@ -97,7 +97,7 @@ def search(
     """
     if method not in METHODS:
         raise InputError(
-            "--search", f"there is no search {method}", f"Choose of {', '.join(METHODS)}"
+            "--search", f"unknown search {method}", f"Choose from {', '.join(METHODS)}"
         )
     chosen = METHODS[method]
     size, rounds = population or chosen.population, generations or chosen.generations

@@ -79,7 +79,7 @@ def _tiles(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     if diagnosis.effects:
         error += f" → {significant(gap.after)}"
     chance = p_value_words(diagnosis.p_nothing)
-    tiles = [("Verdict", VERDICTS[diagnosis.verdict], f"nothing missing: {chance}")]
+    tiles = [("Verdict", VERDICTS[diagnosis.verdict], f"no missing effect: {chance}")]
     tiles.append((f"{role_word(role).capitalize()} error", error, "times the noise"))
     if diagnosis.effects and diagnosis.closed_fraction is not None:
         tiles.append(("Gap closed", percent(100 * diagnosis.closed_fraction), ""))
@@ -184,7 +184,7 @@ def _clearest_misfit(diagnosis: Diagnosis) -> tuple[str, str]:
 
 
 def _curve(curve: LearnedCurve) -> dict[str, Any]:
-    where = {"sensor": "reading of the speed"}.get(curve.equation, f"{curve.equation} equation")
+    where = {"sensor": "speed reading"}.get(curve.equation, f"{curve.equation} equation")
     return {
         "title": f"{'friction' if curve.reverses else where} over"
         f" {AXIS_TITLES.get(curve.variable, curve.variable)}",

@@ -30,7 +30,7 @@ AXIS_TITLES = {
     "current": "current [A]",
     "voltage": "voltage [V]",
     "angle": "angle [rad]",
-    "time": "share of a run",
+    "time": "fraction of the run",
 }
 # number of bins with equally many samples, over each of which residuals are averaged
 BINS = 30
@@ -87,7 +87,7 @@ def gap_figure(gaps: Mapping[str, Gap]) -> go.Figure:
     figure.add_trace(floor)
     style(figure, height=340)
     wide = max(gap.before for gap in gaps.values()) > LOGARITHMIC_FROM
-    figure.update_yaxes(title_text="error over the noise", type="log" if wide else "linear")
+    figure.update_yaxes(title_text="error relative to the noise", type="log" if wide else "linear")
     figure.update_xaxes(type="category")
     return figure
 
@@ -178,7 +178,7 @@ def curve_figure(curve: LearnedCurve) -> go.Figure:
     titles = {
         "mechanical": "friction [N·m]" if curve.reverses else "torque [N·m]",
         "electrical": "voltage [V]",
-        "sensor": "share of the speed",
+        "sensor": "fraction of the speed",
     }
     title = titles[curve.equation]
     figure.update_yaxes(title_text=title, zeroline=True, zerolinecolor=INK)

@@ -47,13 +47,13 @@ def _effects(diagnosis: Diagnosis) -> Table:
             probability = p_value_words(effect.p_value).removeprefix("p ").removeprefix("= ")
             end = probability if first else ""
             rows.append((name, field_words(effect.name, field), *numbers, end))
-    return plain_table("Missing", headings, rows, left=(0, 1, 3), first_wraps="ellipsis")
+    return plain_table("Missing effects", headings, rows, left=(0, 1, 3), first_wraps="ellipsis")
 
 
 def _parameters(diagnosis: Diagnosis) -> Table:
     if not diagnosis.effects:
         return parameter_table(diagnosis.final)
-    headings = ("Parameter", "Before", "", "After", "", "Std. error", "Moved", "Status")
+    headings = ("Parameter", "Before", "", "After", "", "Std. error", "Change", "Status")
     rows = []
     for one in drifts(diagnosis):
         before, after = write_estimate(one.before), write_estimate(one.after)
@@ -70,7 +70,7 @@ def _gaps(diagnosis: Diagnosis) -> Table:
         numbers = (significant(error) for error in (gap.before, gap.after, gap.floor))
         rows.append((run, role_word(fit.role), *numbers))
     return plain_table(
-        "Free-run error over the noise", headings, rows, left=(0, 1), first_wraps="ellipsis"
+        "Free-run error relative to the noise", headings, rows, left=(0, 1), first_wraps="ellipsis"
     )
 
 
@@ -81,7 +81,7 @@ def _detectable(diagnosis: Diagnosis) -> Table:
         rows.append((*names, value_with_unit(one.amplitude, one.unit, 2)))
     headings = ("Effect", "Parameter", "From")
     return plain_table(
-        "Would have been seen nine times of ten",
+        "Detectable with 90 % probability",
         headings,
         rows,
         left=(0, 1),

@@ -148,7 +148,7 @@ def _caption(fit: RunFit, points: int) -> str:
     samples = len(fit.time)
     if samples > points:
         group = group_size(samples, points)
-        fits.append(f"drawn thinned to the lowest and highest of every {group} samples")
+        fits.append(f"plot reduced to the minimum and maximum of every {group} samples")
     return ", ".join(fits)
 
 

@@ -99,15 +99,14 @@ def table_2(paper: Paper) -> tuple[list[str], list[list[str]]]:
 def remarks(paper: Paper) -> list[str]:
     """Errors and impossible results in the paper, with the numbers that show them."""
     return [
-        f"{VOLTAGE:g} V holds {paper.reach:.1f} rad/s: the set point of {SETPOINT:g} rad/s is beyond it, for any"
-        " controller.",
-        f"From rest, flat out, {VOLTAGE:g} V enters the 2 % band after {paper.fastest[VOLTAGE]:.4f} s; the printed"
-        f" 0.08 s takes {SUFFICIENT_VOLTAGE:g} V ({paper.fastest[SUFFICIENT_VOLTAGE]:.4f} s).",
+        f"{VOLTAGE:g} V reaches {paper.reach:.1f} rad/s: no controller can reach the set point of {SETPOINT:g} rad/s.",
+        f"From rest at full voltage, {VOLTAGE:g} V enters the 2 % band after {paper.fastest[VOLTAGE]:.4f} s; the"
+        f" printed 0.08 s takes {SUFFICIENT_VOLTAGE:g} V ({paper.fastest[SUFFICIENT_VOLTAGE]:.4f} s).",
         *_printed_remarks(paper),
         "Equation (8) prints +R/L where equation (5) gives -R/L, and multiplies the load column by u.",
         "Kt and Kb are one constant in SI; the paper has 0.0501 and 0.0492.",
-        "A motor of two poles never oscillates at any gain, so the Ziegler-Nichols rule has nothing to start from on"
-        " the ideal loop.",
+        "A motor with two poles does not oscillate at any gain, so the Ziegler-Nichols rule cannot be applied to the"
+        " ideal loop.",
     ]
 
 
@@ -115,7 +114,7 @@ def _printed_remarks(paper: Paper) -> list[str]:
     return [
         f"The printed gains of the {CONTROLLERS[kind].label}, simulated on the printed motor without any limit, give"
         f" {found.overshoot:.1f} % and {found.settling:.3f} s instead of {TABLE_2[kind].overshoot:g} % and"
-        f" {TABLE_2[kind].settling:g} s, and ask for {found.peak_voltage:.0f} V on the way."
+        f" {TABLE_2[kind].settling:g} s, with a peak of {found.peak_voltage:.0f} V."
         for kind, found in paper.as_printed.items()
     ]
 

@@ -15,7 +15,9 @@ STATUS_WORDS = {
     "known": "known",
     "not_identifiable": "not identifiable",
 }
-MODEL_ASSUMPTION = "All errors presume that the motor has nothing that the model lacks: `pmdc diagnose` tests that."
+MODEL_ASSUMPTION = (
+    "The standard errors assume that the model lacks no effect: `pmdc diagnose` tests that."
+)
 # an RMS residual up to this multiple of the noise counts as noise: the RMS of few samples scatters as much
 MAX_NOISE_RATIO = 1.25
 
@@ -47,18 +49,18 @@ def cautions(identification: Identification) -> list[str]:
     if doubted:
         sentences.append(
             f"The data check warns about the {enumerate_words(list(doubted))}:"
-            " the numbers hold only as far as that is harmless or mended."
+            " the results are valid only if these warnings are harmless or corrected."
         )
     directions = identification.unidentified_directions
     reasons = (f"{as_sentence(one.why)} {as_sentence(one.mend)}" for one in directions)
     sentences += dict.fromkeys(reasons)  # several directions may have the same
     at_bound = _with_status(identification, "at_bound")
     if at_bound:
-        who = f"{enumerate_words(at_bound)} {'stand' if len(at_bound) > 1 else 'stands'}"
-        sentences.append(f"{who} at the bound of the search: a limit, not an estimate.")
+        who = f"{enumerate_words(at_bound)} {'are' if len(at_bound) > 1 else 'is'}"
+        sentences.append(f"{who} at the bound of the search range: a limit, not an estimate.")
     if not identification.converged:
         sentences.append(
-            "The refinement did not converge: treat every number with care, or try another seed."
+            "The refinement did not converge: treat all results with care, or try another seed."
         )
     return sentences
 
@@ -83,7 +85,7 @@ def _identified_sentence(identification: Identification) -> str:
         found = f"{enumerate_words(identified)} {verb} identified {source}"
     found += _precision_clause({name: parameters[name] for name in identified})
     if not_identifiable:
-        found += f"; {enumerate_words(not_identifiable)} could not be"
+        found += f"; {enumerate_words(not_identifiable)} could not be identified"
     return f"{found}."
 
 
@@ -108,28 +110,28 @@ def _holdout_sentence(identification: Identification) -> str:
     held_out = {name: fit for name, fit in runs_in_order(identification) if fit.role == "holdout"}
     if not held_out:
         return (
-            "No run was held out, so nothing here tests the motor on data the fit has not seen:"
-            " hold one back with --holdout RUN."
+            "No run was held out, so the motor was not validated on data outside the fit:"
+            " hold out a run with --holdout RUN."
         )
     worst = max(held_out, key=lambda name: _misfit(held_out[name], identification.noise))
     fit = held_out[worst]
     who = f"The held-out run {worst}"
     if len(held_out) > 1:
-        who = f"Of {len(held_out)} held-out runs the worst, {worst},"
+        who = f"The worst of {len(held_out)} held-out runs, {worst},"
     channels = _channels(fit, identification.noise)
     reproduced = [
-        f"{one.quantity} to {significant(one.rmse)}{NARROW_SPACE}{one.unit} RMS ({percent(one.fit)} fit)"
+        f"a {one.quantity} RMSE of {significant(one.rmse)}{NARROW_SPACE}{one.unit} ({percent(one.fit)} fit)"
         for one in channels
     ]
     excess = [
-        f"the {one.quantity} misses by {one.rmse / one.noise:.1f} times the measurement noise"
+        f"the {one.quantity} error is {one.rmse / one.noise:.1f} times the measurement noise"
         for one in channels
         if one.noise and one.rmse > MAX_NOISE_RATIO * one.noise
     ]
-    sentence = f"{who} is reproduced in free-run simulation, {enumerate_words(reproduced)}"
+    sentence = f"{who} is reproduced in free-run simulation with {enumerate_words(reproduced)}"
     if not any(one.noise for one in channels):
         return f"{sentence}."
-    return f"{sentence}; {enumerate_words(excess) or 'what is left is the measurement noise'}."
+    return f"{sentence}; {enumerate_words(excess) or 'the residuals are measurement noise'}."
 
 
 class _Channel(NamedTuple):

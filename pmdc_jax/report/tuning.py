@@ -19,7 +19,7 @@ from .terminal import plain_table
 GAIN_HEADINGS = ("Gain", "Value", "Unit")
 COMPARISON_HEADINGS = (
     "Settling\n[ms]",
-    "Times the\nlimit",
+    "Relative to\nfastest",
     "Overshoot\n[%]",
     "Rise\n[ms]",
     "Settling\np95 [ms]",
@@ -93,7 +93,7 @@ def _step_sentence(tuning: Tuning) -> str:
     ratio = settling / tuning.fastest_possible_settling
     return (
         f"Settles at {tuning.setpoint:g} rad/s in {_time_text(settling)},"
-        f" {significant(ratio)} times the fastest that {_limits_text(tuning)} allow"
+        f" {significant(ratio)} times the fastest possible with {_limits_text(tuning)}"
         f" ({_time_text(tuning.fastest_possible_settling)}), with {percent(overshoot)} overshoot."
     )
 
@@ -110,42 +110,42 @@ def _load_sentence(tuning: Tuning) -> str:
     if not tuning.load_torque:
         return ""
     recovery, left = tuning.load["RecoveryTime"], tuning.load["SteadyStateError"]
-    back = "never comes back into the 2 % band"
+    back = "does not return to the 2 % band"
     if recovery is not None:
         back = (
-            f"is back in the 2 % band after {_time_text(recovery)}"
+            f"returns to the 2 % band after {_time_text(recovery)}"
             if recovery
             else "stays within 2 %"
         )
     return (
-        f"A load of {tuning.load_torque:.3g} N m moves it by {significant(tuning.load['Deviation'])}"
-        f" rad/s; it {back}, with a steady error of {significant(left, 2)} rad/s."
+        f"A load step of {tuning.load_torque:.3g} N m changes the speed by {significant(tuning.load['Deviation'])}"
+        f" rad/s; it {back}, with a steady-state error of {significant(left, 2)} rad/s."
     )
 
 
 def _robust_sentence(robust: Robustness | None) -> str:
     if robust is None:
         return ""
-    slow = "do not settle"
+    slow = "more than 5 % do not settle"
     if robust.SettlingTime_p95 is not None:
-        slow = f"settle within {_time_text(robust.SettlingTime_p95)}"
+        slow = f"95 % settle within {_time_text(robust.SettlingTime_p95)}"
     return (
-        f"Of {robust.samples} motors drawn from the uncertainty, 95 % {slow}"
-        f" and overshoot by at most {percent(robust.Overshoot_p95)}."
+        f"Of {robust.samples} motors drawn from the uncertainty, {slow}"
+        f" and 95 % overshoot by at most {percent(robust.Overshoot_p95)}."
     )
 
 
 def _margin_sentence(tuning: Tuning) -> str:
     found = tuning.margins
     if not found.stable:
-        return "Near the set point the linear loop is unstable: it is held together by its limits."
+        return "The loop linearised at the set point is unstable: only its limits keep it bounded."
     parts = []
     if found.gain_margin is not None:
         parts.append(f"gain margin {significant(found.gain_margin)}")
     if found.phase_margin_deg is not None:
         parts.append(f"phase margin {significant(found.phase_margin_deg)}°")
     if found.delay_margin_s is not None:
-        parts.append(f"{_time_text(found.delay_margin_s)} of further delay")
+        parts.append(f"delay margin {_time_text(found.delay_margin_s)}")
     return f"Margins: {', '.join(parts)}." if parts else ""
 
 
@@ -226,13 +226,13 @@ def _tiles(tuning: Tuning) -> list[tuple[str, str, str]]:
     ratio = None if settling is None else settling / tuning.fastest_possible_settling
     max_overshoot = tuning.requirements.max_overshoot
     tiles = [
-        ("Settling", _time_text(settling), f"{significant(ratio)} times the limit"),
-        ("Overshoot", percent(overshoot), f"at most {max_overshoot:g} % asked for"),
+        ("Settling", _time_text(settling), f"{significant(ratio)} times the fastest possible"),
+        ("Overshoot", percent(overshoot), f"at most {max_overshoot:g} % allowed"),
         ("Largest current", f"{significant(tuning.peak_current)} A", _limits_text(tuning)),
     ]
     if tuning.robust is not None:
         slow = _time_text(tuning.robust.SettlingTime_p95)
         tiles.append((f"Settling, {tuning.robust.samples} motors", slow, "95th percentile"))
     peak = tuning.margins.sensitivity_peak
-    tiles.append(("Sensitivity peak", significant(peak), "below 2 is comfortable"))
+    tiles.append(("Sensitivity peak", significant(peak), "below 2 is robust"))
     return tiles

@@ -70,8 +70,8 @@ def verdict_sentences(diagnosis: Diagnosis) -> list[str]:
 
 def _none_detected(diagnosis: Diagnosis) -> list[str]:
     return [
-        "No missing effect was detected: what simulation and measurement differ by is no more than"
-        f" noise may do ({p_value_words(diagnosis.p_nothing)}).",
+        "No missing effect was detected: simulation and measurement differ by no more than the noise"
+        f" explains ({p_value_words(diagnosis.p_nothing)}).",
         _detectable_sentence("", diagnosis),
     ]
 
@@ -79,8 +79,8 @@ def _none_detected(diagnosis: Diagnosis) -> list[str]:
 def _named(diagnosis: Diagnosis) -> list[str]:
     return [
         _disagreement_sentence(diagnosis),
-        f"Missing: {_effects_in_words(diagnosis)}. Added.",
-        _detectable_sentence("These runs call for nothing else in the library: ", diagnosis),
+        f"Missing: {_effects_in_words(diagnosis)}. Added to the model.",
+        _detectable_sentence("No other effect of the library was detected: ", diagnosis),
     ]
 
 
@@ -90,8 +90,8 @@ def _ambiguous(diagnosis: Diagnosis) -> list[str]:
     either = " or ".join(enumerate_words([effect_words(name) for name in one]) for one in sets)
     return [
         _disagreement_sentence(diagnosis),
-        f"These runs cannot tell what is missing: {either} would explain them equally well.",
-        f"Added, as the one that fits best: {_effects_in_words(diagnosis)}.",
+        f"These runs do not determine what is missing: {either} would explain them equally well.",
+        f"Added to the model, as the best fit: {_effects_in_words(diagnosis)}.",
         _experiment_sentence(diagnosis),
     ]
 
@@ -100,33 +100,36 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
     sentences = [_disagreement_sentence(diagnosis)]
     if diagnosis.effects:
         rest = (
-            "" if unlike_held_out(diagnosis.gap) else "; what is left is no effect of the library"
+            "" if unlike_held_out(diagnosis.gap) else "; no effect of the library explains the rest"
         )
         found = _capitalised(_effects_in_words(diagnosis))
         verb, added = ("explain", "were") if len(diagnosis.effects) > 1 else ("explains", "was")
-        sentences.append(f"{found} {verb} part of it and {added} added{rest}.")
+        sentences.append(f"{found} {verb} part of this and {added} added to the model{rest}.")
     else:
         sentences.append("Something is missing that no effect of the library explains.")
     if diagnosis.curves:
         sentences.append(_curve_sentence(diagnosis.curves[0]))
     if diagnosis.breaks_electrical_equation:
         sentences.append(
-            "From sample to sample the current departs from where voltage and speed lead it by"
-            f" {significant(diagnosis.electrical_misfit)} times what the noise of the sensors explains, and no torque"
-            " can be why: what is missing acts on voltage or current, as a supply does that sags where a duty times its"
-            " nominal voltage was recorded; or the recorded current was filtered or averaged."
+            "From sample to sample the current deviates from the prediction by voltage and speed by"
+            f" {significant(diagnosis.electrical_misfit)} times what the sensor noise explains, which no torque"
+            " can cause: what is missing acts on voltage or current, such as a sagging supply where the recorded"
+            " voltage is duty cycle times nominal voltage; or the recorded current was filtered or averaged."
         )
     if beyond := diagnosis.beyond_fitted:
         sentences.append(
-            f"Held-out runs are missed by {significant(beyond)} times what the fitted ones are: something shows there"
-            " that the fitted ones do not tell of. Fit one of them, too."
+            f"The error of the held-out runs is {significant(beyond)} times that of the training runs: they contain"
+            " something that the training runs do not show. Include one of them in the fit."
         )
     if worse_held_out(diagnosis.gap):
         sentences.append(
-            "With it held-out runs are missed by more than without: something else is missing that looks alike in the"
-            " fitted ones. Fit one of the held-out runs, too."
+            "The addition increases the error of the held-out runs: something else is missing that looks alike in the"
+            " training runs. Include one of the held-out runs in the fit."
         )
-    return [*sentences, "Parameters make up for what is missing: no interval covers that."]
+    return [
+        *sentences,
+        "The parameters compensate for what is missing: the intervals do not cover this error.",
+    ]
 
 
 def _curve_sentence(curve: LearnedCurve) -> str:
@@ -135,16 +138,16 @@ def _curve_sentence(curve: LearnedCurve) -> str:
     if curve.equation == "sensor":
         times, share = 2 * np.pi / curve.x[-1], 100 * float(np.max(np.abs(curve.value)))
         return (
-            f"Drawn by the data it looks most like a speed reading that swings {significant(times)} times a turn, by"
-            f" {percent(share)} of the speed ({chance}): the ripple of a tachometer, or an encoder off its centre."
+            f"Estimated from the data, it looks most like a speed reading that oscillates {significant(times)} times"
+            f" per turn, by {percent(share)} of the speed ({chance}): tachometer ripple, or an eccentric encoder."
         )
     known = curve.stderr > 0
     peak = int(np.argmax(np.abs(curve.value) / np.where(known, curve.stderr, np.inf)))
-    torque = "friction" if curve.reverses else "torque opposing motion"
+    torque = "friction torque" if curve.reverses else "torque opposing motion"
     kind = torque if curve.unit == "N m" else "voltage at the terminals"
     value = value_with_unit(curve.value[peak], curve.unit)
     return (
-        f"Drawn by the data it looks most like a {kind} over {curve.variable}, clearest with"
+        f"Estimated from the data, it looks most like a {kind} over {curve.variable}, most significant with"
         f" {value} {place_in_words(curve.variable, curve.x[peak])} ({chance})."
     )
 
@@ -168,7 +171,7 @@ def intervals_in_words(
     joined = _merged(intervals)
     if variable == "time":
         parts = [f"{percent(100 * low)} to {percent(100 * high)}" for low, high in joined]
-        return f"from {enumerate_words(parts)} of a run"
+        return f"from {enumerate_words(parts)} of the run"
     unit = VARIABLE_UNITS.get(variable, "")
     ends = _symmetric(joined)
     if ends is None:
@@ -256,17 +259,19 @@ def _value_in_words(estimate: Estimate) -> str:
 def place_in_words(variable: str, value: float) -> str:
     """Where on the axis of a variable."""
     if variable == "time":
-        return f"at {percent(100 * float(value))} of a run"
+        return f"at {percent(100 * float(value))} of the run"
     return f"at {significant(float(value))} {VARIABLE_UNITS.get(variable, '')}".strip()
 
 
 def _experiment_sentence(diagnosis: Diagnosis) -> str:
     experiment = diagnosis.next_experiment
     if experiment is None:
-        return "No run within the recorded voltage was found that would tell them apart."
+        return (
+            "No experiment within the recorded voltage range was found that would distinguish them."
+        )
     return (
-        f"To decide, record this: {as_sentence(experiment.description)} It tells them apart with a"
-        f" chance of {percent(100 * experiment.power)}; --experiment OUT.csv writes its voltage."
+        f"To decide, record this: {as_sentence(experiment.description)} It distinguishes them with a"
+        f" probability of {percent(100 * experiment.power)}; --experiment OUT.csv writes its voltage."
     )
 
 
@@ -286,7 +291,7 @@ def _detectable_sentence(begin: str, diagnosis: Diagnosis) -> str:
     parts = [f"{effect_words(x.effect)} above {value_with_unit(x.amplitude, x.unit)}" for x in told]
     if not parts:
         return ""
-    sentence = f"{begin}{enumerate_words(parts)} would have shown, nine times of ten."
+    sentence = f"{begin}{enumerate_words(parts)} would have been detected with 90 % probability."
     return sentence[0].upper() + sentence[1:]
 
 
@@ -299,7 +304,9 @@ def _gap_sentence(diagnosis: Diagnosis) -> str:
     role = judged_role(diagnosis)
     gap = diagnosis.gap[role]
     what = role_word(role).capitalize()
-    sentence = f"{what} error {significant(gap.before)} to {significant(gap.after)} times the noise"
+    sentence = (
+        f"{what} error from {significant(gap.before)} to {significant(gap.after)} times the noise"
+    )
     if diagnosis.closed_fraction is None or diagnosis.closed_fraction <= 0:
         return f"{sentence}."
     return f"{sentence}: {percent(100 * diagnosis.closed_fraction)} of the gap is closed."
@@ -309,8 +316,8 @@ def _formula_sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.leaves_noise or not diagnosis.effects:
         return ""
     return (
-        "What is left is small beside that, but more than noise: as much as another formula of the same effect would"
-        " leave. No interval covers that."
+        "The remaining error is small compared with the effect, but exceeds the noise: as much as another formula of"
+        " the same effect would leave. The intervals do not cover it."
     )
 
 
@@ -323,8 +330,8 @@ def _slow_rest_sentence(diagnosis: Diagnosis) -> str:
     if not rest:
         return ""
     return (
-        f"What is left counts as noise, but is {enumerate_words(rest)}: a torque that fluctuates by itself may do that,"
-        " and so may something else that is missing. Look at the residuals over time."
+        f"The remaining residual was treated as noise, but is {enumerate_words(rest)}: a fluctuating torque may cause"
+        " this, and so may another missing effect. Inspect the residuals over time."
     )
 
 
@@ -334,9 +341,9 @@ def _run_apart_sentence(diagnosis: Diagnosis) -> str:
         return ""
     name, ratio = diagnosis.run_apart
     return (
-        f"It is the run {name} that is missed, {significant(ratio)} times as much as any other: something acted there"
-        " that was not recorded, such as a changing load, or that the others do not excite. Record that as well, or"
-        " diagnose the others without it."
+        f"The error is largest in the run {name}, {significant(ratio)} times that of any other: something acted there"
+        " that was not recorded, such as a changing load, or that the other runs do not excite. Record it as well, or"
+        " diagnose the other runs without this one."
     )
 
 
@@ -381,9 +388,9 @@ def _drift_sentence(diagnosis: Diagnosis) -> str:
     far = [one for one in drifts(diagnosis) if abs(one.percent or 0.0) > MIN_DRIFT]
     far = sorted(far, key=lambda one: -abs(one.percent or 0.0))[:3]
     if not far:
-        return f"No parameter that both fits determine moved by more than {MIN_DRIFT:g} %."
+        return f"No parameter determined by both fits changed by more than {MIN_DRIFT:g} %."
     drifted = enumerate_words([f"{one.name} by {drift_words(one)}" for one in far])
-    return f"Adding it moved {drifted}."
+    return f"Adding it changed {drifted}."
 
 
 def _capitalised(text: str) -> str:

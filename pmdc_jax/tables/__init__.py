@@ -37,11 +37,11 @@ def open_table(path: Path) -> Table:
     kinds = dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm"), CsvTable)
     kinds |= {".parquet": ParquetTable, ".pq": ParquetTable, ".mat": MatTable}
     if path.is_dir():
-        raise InputError(str(path), "this is a folder", "Name the files in it, one run each")
+        raise InputError(str(path), "this is a folder", "Give the files in it, one run each")
     if not path.exists():
-        raise InputError(str(path), "no such file", "Check the spelling and the folder")
+        raise InputError(str(path), "no such file", "Check the name and the folder")
     if path.suffix.lower() not in kinds:
-        what = f"unknown kind of file '{path.suffix}'"
+        what = f"unknown file type '{path.suffix}'"
         raise InputError(str(path), what, f"Export it as one of {', '.join(kinds)}")
     try:
         with path.open("rb") as file:

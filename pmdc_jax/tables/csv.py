@@ -45,7 +45,7 @@ class CsvTable:
             # spreadsheets may append lines of empty cells
             self._kept_rows = np.array([bool(line.strip(b" \t\r,;")) for _, line in self._lines()])
             if len(self._kept_rows) != frame.height:
-                what = "it breaks lines inside quotes"
+                what = "a quoted cell contains a line break"
                 raise InputError(str(self._path), what, "Export it as plain CSV")
             frame = frame.filter(self._kept_rows)
         columns = (frame[i].to_numpy().astype(float) for i in wanted)
@@ -130,7 +130,7 @@ class CsvTable:
                     f"{self._path}, line {number}",
                     f"it has {fields} fields where the header (line {self._header.line}) "
                     f"has {len(self.headers)}",
-                    "Mend or delete this line",
+                    "Correct or delete this line",
                 )
 
 
@@ -141,7 +141,7 @@ def _text(path: Path) -> bytes:
         raise InputError(str(path), "it is UTF-16 text", "Save it as UTF-8")
     raw = raw.removeprefix(b"\xef\xbb\xbf")
     if b"\0" in raw:
-        what = f"this is no text (byte {raw.index(0)} is zero)"
+        what = f"this is not a text file (byte {raw.index(0)} is zero)"
         raise InputError(str(path), what, "Export the recording as CSV")
     if not raw.isascii():
         try:

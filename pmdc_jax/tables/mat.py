@@ -29,7 +29,7 @@ class MatTable:
             what, mend = "it is a MATLAB v7.3 (HDF5) file", "Save it in MATLAB with the option -v7"
             raise InputError(str(path), what, mend) from None
         except Exception:  # damaged files make scipy raise many kinds, even UnboundLocalError
-            what, mend = "it is no MATLAB file, or damaged", "Save it in MATLAB with the option -v7"
+            what, mend = "not a MATLAB file, or damaged", "Save it in MATLAB with the option -v7"
             raise InputError(str(path), what, mend) from None
         vectors = list[tuple[str, np.ndarray]]()
         for header, vector in _vectors(content, ""):
@@ -40,7 +40,7 @@ class MatTable:
         self._vectors = dict(vectors)
         if not self.headers:
             mend = "Save time, voltage, current and speed as vectors, for example named time_s"
-            raise InputError(str(path), "it holds no vectors of numbers", mend)
+            raise InputError(str(path), "it contains no numeric vectors", mend)
 
     def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
         """See `Table`."""

@@ -21,7 +21,7 @@ class ParquetTable:
         try:
             self.headers = tuple(pl.read_parquet_schema(path))
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
-            raise InputError(str(path), "it is no Parquet file", "Export it again") from None
+            raise InputError(str(path), "this is not a Parquet file", "Export it again") from None
 
     def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
         """See `Table`."""
@@ -37,7 +37,7 @@ class ParquetTable:
                 frame = frame.with_columns(seconds_since_first(frame[header]))
             elif not kind.is_numeric() and kind != pl.Null:
                 where = f"{self._path}, column {header}"
-                raise InputError(where, f"it holds {kind}, not numbers", NUMBERS_ONLY)
+                raise InputError(where, f"it contains {kind}, not numbers", NUMBERS_ONLY)
         return {h: frame[h].cast(pl.Float64).to_numpy().astype(float) for h in headers}
 
     def place(self, row: int) -> str:

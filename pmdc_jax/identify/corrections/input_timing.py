@@ -40,9 +40,9 @@ class Timing(NamedTuple):
 
 
 OTHERWISE = (
-    Timing("goes straight from sample to sample instead of being held", 0, True),
-    Timing("was recorded a sample late, when it had been held instead of before", 1, False),
-    Timing("acts a sample later than it was recorded", -1, False),
+    Timing("is linear between samples instead of held", 0, True),
+    Timing("was recorded one sample late, after it had been held instead of before", 1, False),
+    Timing("acts one sample later than it was recorded", -1, False),
 )
 
 
