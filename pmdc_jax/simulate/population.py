@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Motor
-from ..threads import CORES, side_by_side
+from ..threads import CORES, map_in_threads
 from .exponential import Matrix, product
 from .propagator import Propagator, along_grids, pick_grid, steps_in_sample
 from .solver import HeldInput, Input, Walk, held_step_and_mean, walk
@@ -47,7 +47,7 @@ def squared_errors(motors: Motor, tape: Tape) -> Errors:
         return jax.block_until_ready(_errors(motors, tape, np.asarray(k), shares))
 
     # XLA runs the loop over samples on one core, so the population is divided among threads
-    parts = side_by_side(part, range(shares))
+    parts = map_in_threads(part, range(shares))
     current, speed = (jnp.asarray(np.concatenate(errors)) for errors in zip(*parts, strict=True))
     return current, speed
 
