@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..motor import Drive
 from ..recording import OVER_LAST
-from .uneven import flows_on, mean_and_rise, pieces_of
+from .uneven import mean_and_rise, pieces_of, varies_linearly
 
 if TYPE_CHECKING:
     from ..recording import Recording
@@ -190,11 +190,11 @@ class _Run:
         if drive == "voltage" and recording.current is not None:
             self.current = recording.current
         value = getattr(recording, drive)
-        goes_on = straight or flows_on(recording)
+        linear = straight or varies_linearly(recording)
         if recording.uneven is not None:
             self.value, self.rise = mean_and_rise(recording, pieces_of(recording, straight))
         else:
-            self.rise = np.diff(value, append=value[-1]) if goes_on else np.zeros(self.length)
+            self.rise = np.diff(value, append=value[-1]) if linear else np.zeros(self.length)
             self.value = value + self.rise / 2
         # rounded: two runs of one clock must share a grid even if their time stamps differ in the last bits
         self.grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held)
