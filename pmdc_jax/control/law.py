@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from ..effects.base import State
 from ..motor import Drive, Motor
-from ..simulate.propagator import propagator
+from ..simulate.propagator import make_propagator
 from .controllers import AbstractController, Memory, Number
 from .hardware import Hardware
 
@@ -27,7 +27,7 @@ class SampledMotor(NamedTuple):
     @classmethod
     def of(cls, motor: Motor, sample_time: Number) -> SampledMotor:
         """Exact discretisation, with held voltage and no load, of the motor without its effects."""
-        whole, inputs, *_ = propagator(
+        whole, inputs, *_ = make_propagator(
             motor.with_effects(()), jnp.asarray(sample_time, float), Drive()
         )
         return cls(whole[0, 0], whole[0, 1], inputs[0, 0], whole[1, 0], whole[1, 1], inputs[1, 0])

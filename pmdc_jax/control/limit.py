@@ -12,7 +12,7 @@ from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
 from ..precision import double_precision
-from ..simulate.propagator import Propagator, propagator
+from ..simulate.propagator import Propagator, make_propagator
 from ..simulate.solver import Input, held_step
 from .controllers import Number
 from .metrics import BAND
@@ -94,7 +94,7 @@ def _dash(
     edge.
     """
     step = duration / INSTANTS
-    along = propagator(motor, jnp.asarray(step), DRIVE)
+    propagator = make_propagator(motor, jnp.asarray(step), DRIVE)
     ahead = jnp.sign(setpoint - initial)
     band = BAND * jnp.abs(setpoint - initial)
     load = jnp.asarray(load, float)
@@ -104,7 +104,7 @@ def _dash(
         short = ahead * (setpoint - state.speed) - band
         braking = braking | (k >= switch) | (short <= 0)
         voltage = jnp.where(braking, -ahead, ahead) * voltage_limit
-        new = _next_state(motor, along, state, voltage, current_limit, load)
+        new = _next_state(motor, propagator, state, voltage, current_limit, load)
         turned = turned | (braking & (ahead * (new.speed - state.speed) <= 0))
         # frozen once the speed has turned: what comes later is irrelevant
         state = jax.tree.map(lambda now, then: jnp.where(turned, now, then), state, new)
@@ -121,7 +121,7 @@ def _dash(
 
 def _next_state(
     motor: Motor,
-    along: Propagator,
+    propagator: Propagator,
     state: State,
     voltage: Float[Array, ""],
     current_limit: Number | None,
@@ -129,12 +129,12 @@ def _next_state(
 ) -> State:
     """The next state under this voltage, reduced where the step would end beyond the current limit."""
     acting = Input(DRIVE, voltage, load)
-    flat_out = held_step(motor, along, acting, state)
+    flat_out = held_step(motor, propagator, acting, state)
     if current_limit is None:
         return flat_out
-    idle = held_step(motor, along, acting._replace(value=jnp.zeros_like(voltage)), state)
+    idle = held_step(motor, propagator, acting._replace(value=jnp.zeros_like(voltage)), state)
     gain = flat_out.current - idle.current
     most = jnp.sign(voltage) * current_limit
     share = (most - idle.current) / jnp.where(gain == 0, 1.0, gain)
     applied = voltage * jnp.clip(share, -1.0, 1.0)
-    return held_step(motor, along, acting._replace(value=applied), state)
+    return held_step(motor, propagator, acting._replace(value=applied), state)

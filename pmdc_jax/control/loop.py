@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
-from ..simulate.propagator import propagator
+from ..simulate.propagator import make_propagator
 from ..simulate.solver import Input, held_step
 from .controllers import Number
 from .law import Law, LawState
@@ -58,7 +58,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
     `jax.vmap` over any of them.
     """
     drive, hardware = Drive(), law.hardware
-    along = propagator(motor, jnp.asarray(hardware.sample_time / substeps), drive)
+    propagator = make_propagator(motor, jnp.asarray(hardware.sample_time / substeps), drive)
     at, voltage = steady_state(motor, course.initial)
     late = motor.speed_delay()
     memory = law.start(course.initial, at, voltage)
@@ -79,7 +79,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
 
         def between(state: State, _: None) -> tuple[State, Instants]:
             seen = (state.current, state.speed, applied)
-            return held_step(motor, along, Input(drive, applied, load), state), seen
+            return held_step(motor, propagator, Input(drive, applied, load), state), seen
 
         # not unrolled: a step with effects is a long program, and a sample may have dozens
         state, instants = jax.lax.scan(between, state, length=substeps, unroll=substeps == 1)

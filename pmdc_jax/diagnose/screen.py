@@ -11,7 +11,7 @@ from scipy import special, stats
 
 from ..effects import EFFECTS
 from ..identify.noise_model import Series, Whitener, plain, whitener
-from ..simulate import LOCAL
+from ..simulate import UNKNOWNS_PER_RUN
 from .candidates import Candidate
 from .effect_relations import unbalances
 from .evidence import Block, Evidence, blocks_of, products
@@ -261,7 +261,7 @@ def log_chance(gain: float, freedom: int) -> float:
 def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
     """The evidence from all rows, whitened by one filter."""
     white = (run.white(k, whiten) for k, run in enumerate(rows))
-    return products(white, rows[0].fit.shared.values.shape[-1], LOCAL, READINGS)
+    return products(white, rows[0].fit.shared.values.shape[-1], UNKNOWNS_PER_RUN, READINGS)
 
 
 def _is_definite(curve: Signal) -> bool:

@@ -96,16 +96,16 @@ class Tape(eqx.Module):
         first = 0
         for index, run in enumerate(runs):
             part = slice(first, first + run.blocks)
-            tape["value"][part] = run.fill(run.value, hold=True)
-            tape["load"][part] = run.fill(run.load, hold=True)
+            tape["value"][part] = run.to_blocks(run.value, hold=True)
+            tape["load"][part] = run.to_blocks(run.load, hold=True)
             for channel, samples in enumerate((run.current, run.speed)):
                 missing = np.isnan(samples)
-                tape["measured"][part, channel] = run.fill(np.where(missing, 0.0, samples))
-                tape["weight"][part, channel] = run.fill(np.where(missing, 0.0, 1.0))
+                tape["measured"][part, channel] = run.to_blocks(np.where(missing, 0.0, samples))
+                tape["weight"][part, channel] = run.to_blocks(np.where(missing, 0.0, 1.0))
             if rises:
-                tape["rise"][part] = run.fill(run.rise)
+                tape["rise"][part] = run.to_blocks(run.rise)
             if follow:
-                tape["turn"][part] = run.fill(run.turn(), hold=True)
+                tape["turn"][part] = run.to_blocks(run.turn(), hold=True)
             tape["run"][part], tape["grid"][part] = index, grids.index(run.grid)
             tape["begins"][first] = True
             first += run.blocks
@@ -208,7 +208,7 @@ class _Run:
             return sample_time * ahead
         return sample_time * (self.speed + ahead) / 2
 
-    def fill(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
+    def to_blocks(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
         spare = self.blocks * BLOCK - self.length
         return np.pad(samples, (0, spare), mode="edge" if hold else "constant").reshape(-1, BLOCK)
 
