@@ -78,6 +78,7 @@ def contact_correction(
     last, slope = overlap_and_compression(after), slope * step
     quadratic = last - first - slope
     # teeth touch once overlap and compression have both risen through zero, and part once compression falls through it
+    # (if only overlap has fallen, compression has done so and risen again: such a graze is taken to part at the start)
     direction = jnp.where(touched, -1.0, 1.0)
     crosses = (direction * first < 0) & (direction * last > 0)
     root = jnp.sqrt(jnp.where(crosses, slope**2 - 4 * quadratic * first, 1.0))

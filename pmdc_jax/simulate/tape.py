@@ -80,8 +80,8 @@ class Tape(eqx.Module):
         rises = straight or any(recording.uneven is not None for recording in recordings)
         averaged = any(recording.averaging is not None for recording in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
-        spare = _power_of_two(len(runs)) - len(runs)
-        blocks = _round_up(sum(run.blocks for run in runs) + spare)
+        empty_runs = _power_of_two(len(runs)) - len(runs)
+        blocks = _round_up(sum(run.blocks for run in runs) + empty_runs)
         tape = {
             "value": np.zeros((blocks, BLOCK)),
             "load": np.zeros((blocks, BLOCK)),
@@ -89,7 +89,7 @@ class Tape(eqx.Module):
             "weight": np.zeros((blocks, 2, BLOCK)),
             "turn": np.full((blocks, BLOCK), np.nan),
             "rise": np.zeros((blocks, BLOCK)) if rises else None,
-            "run": np.full(blocks, len(runs) + spare - 1),
+            "run": np.full(blocks, len(runs) + empty_runs - 1),
             "begins": np.zeros(blocks, bool),
             "grid": np.full(blocks, grids.index(runs[-1].grid)),
         }
@@ -109,13 +109,13 @@ class Tape(eqx.Module):
             tape["run"][part], tape["grid"][part] = index, grids.index(run.grid)
             tape["begins"][first] = True
             first += run.blocks
-        tape["run"][first : first + spare] = np.arange(len(runs), len(runs) + spare)
+        tape["run"][first : first + empty_runs] = np.arange(len(runs), len(runs) + empty_runs)
         # every block of padding begins anew, so that joining the blocks never waits for it
         tape["begins"][first:], tape["turn"][first:] = True, 0.0
 
         def of_runs(values: Iterable[float | Sequence[float]]) -> np.ndarray:
             known = np.array(list(values))
-            return np.append(known, np.zeros((spare, *known.shape[1:]), known.dtype), axis=0)
+            return np.append(known, np.zeros((empty_runs, *known.shape[1:]), known.dtype), axis=0)
 
         kinds, free = np.array([drive for _, drive, _ in grids]), np.array([f for *_, f in grids])
         return cls(
@@ -125,7 +125,7 @@ class Tape(eqx.Module):
                 *(np.where(kinds == kind, 1.0, 0.0) for kind in Drive._fields[:3]),
                 free=np.where(free, 1.0, 0.0),
             ),
-            initial=np.array([run.initial for run in runs] + spare * [(0.0, 0.0)]),
+            initial=np.array([run.initial for run in runs] + empty_runs * [(0.0, 0.0)]),
             averaging=of_runs(r.averaging or (0.0, 0.0) for r in recordings) if averaged else None,
             load_unknown=of_runs(
                 r.load is None and not unloaded and not r.held for r in recordings
@@ -209,8 +209,8 @@ class _Run:
         return sample_time * (self.speed + ahead) / 2
 
     def to_blocks(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
-        spare = self.blocks * BLOCK - self.length
-        return np.pad(samples, (0, spare), mode="edge" if hold else "constant").reshape(-1, BLOCK)
+        padding = self.blocks * BLOCK - self.length
+        return np.pad(samples, (0, padding), mode="edge" if hold else "constant").reshape(-1, BLOCK)
 
 
 def _first(samples: np.ndarray | None) -> float:
