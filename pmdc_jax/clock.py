@@ -41,7 +41,7 @@ def evenly_stamped(recording: Recording) -> Recording:
     """The record with even time stamps if its own are uneven but its samples were taken evenly; otherwise unchanged."""
     if is_even(recording.time) or not is_evenly_sampled(recording):
         return recording
-    even, _ = _even_clock(recording.time)
+    even, _ = _fit_even_clock(recording.time)
     return attrs.evolve(recording, time=even)
 
 
@@ -49,7 +49,7 @@ def is_evenly_sampled(recording: Recording) -> bool:
     """Whether samples were taken evenly: by their time stamps, or, if these are uneven, judged by the motion."""
     if is_even(recording.time):
         return True
-    even, step = _even_clock(recording.time)
+    even, step = _fit_even_clock(recording.time)
     late = recording.time - even
     motion = recording.angle if recording.speed is None else recording.speed
     if motion is None or np.max(np.abs(late)) > MAX_LATENESS * step:
@@ -58,7 +58,7 @@ def is_evenly_sampled(recording: Recording) -> bool:
     return bool(share + STANDARD_ERRORS * error < MAX_FOLLOWED_SHARE)
 
 
-def _even_clock(time: Samples) -> tuple[Samples, float]:
+def _fit_even_clock(time: Samples) -> tuple[Samples, float]:
     """The even time stamps nearest to the given ones, by least squares, and their step."""
     ticks = np.arange(len(time))
     step, begin = np.polyfit(ticks, time, 1)
@@ -73,15 +73,18 @@ def _followed_share(signal: Samples, late: Samples, step: float) -> tuple[float,
     """
     lags = np.arange(-SLOPE_SAMPLES, SLOPE_SAMPLES + 1)
     slope = np.correlate(signal, lags / (lags @ lags) / step, "same")
-    missed, expected = _half_second_difference(signal), slope[1:-1] * _half_second_difference(late)
-    known = np.isfinite(missed) & np.isfinite(expected)
+    observed, expected = (
+        _half_second_difference(signal),
+        slope[1:-1] * _half_second_difference(late),
+    )
+    known = np.isfinite(observed) & np.isfinite(expected)
     known[:SLOPE_SAMPLES] = known[-SLOPE_SAMPLES:] = False
-    missed, expected = missed[known], expected[known]
+    observed, expected = observed[known], expected[known]
     power = expected @ expected
     if not power > ROUNDED_SQUARES * np.nansum(signal**2):
         return 1.0, np.inf
-    share = float(missed @ expected / power)
-    return share, float(np.sqrt(np.sum((expected * (missed - share * expected)) ** 2)) / power)
+    share = float(observed @ expected / power)
+    return share, float(np.sqrt(np.sum((expected * (observed - share * expected)) ** 2)) / power)
 
 
 def _half_second_difference(signal: Samples) -> Float[np.ndarray, " inner"]:

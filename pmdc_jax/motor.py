@@ -62,12 +62,12 @@ class Motor(eqx.Module):
         zero if the rotor is held.
         """
         v, c, t, free = drive or Drive()
-        zero, lightness = jnp.zeros_like(self.R), free / self.J
+        zero, inverse_inertia = jnp.zeros_like(self.R), free / self.J
         A = [
             [-v * self.R / self.L, -v * self.Kb / self.L],
-            [v * self.Kt * lightness, -self.f * lightness],
+            [v * self.Kt * inverse_inertia, -self.f * inverse_inertia],
         ]
-        B = [[v / self.L, zero], [(c * self.Kt + t) * lightness, -lightness]]
+        B = [[v / self.L, zero], [(c * self.Kt + t) * inverse_inertia, -inverse_inertia]]
         return _matrix(A), _matrix(B)
 
     def transfer_function(

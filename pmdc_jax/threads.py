@@ -17,35 +17,35 @@ T = TypeVar("T")
 CORES = os.cpu_count() or 1
 
 
-def side_by_side(function: Callable[[A], T], items: Iterable[A]) -> list[T]:
+def map_in_threads(function: Callable[[A], T], items: Iterable[A]) -> list[T]:
     """Results of a function for every item, computed in parallel on all cores. Not to be nested: it could deadlock."""
-    return [future.result() for future in [beside(function, item) for item in items]]
+    return [future.result() for future in [submit(function, item) for item in items]]
 
 
-def side_by_side_until(
+def map_in_threads_until(
     function: Callable[[A], T], items: Sequence[A], enough: Callable[[list[T]], bool]
 ) -> list[T]:
     """The same, in batches of one item per core, until the results so far are `enough`."""
     made: list[T] = []
     for first in range(0, len(items), CORES):
-        made += side_by_side(function, items[first : first + CORES])
+        made += map_in_threads(function, items[first : first + CORES])
         if enough(made):
             break
     return made
 
 
-def one_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
+def run_one_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
     """Results of calls in their order, with the next call already running in another thread. Must not be nested."""
     waiting: Future[T] | None = None
     for call in calls:
-        before, waiting = waiting, beside(call)
+        before, waiting = waiting, submit(call)
         if before is not None:
             yield before.result()
     if waiting is not None:
         yield waiting.result()
 
 
-def beside(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+def submit(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
     """Run a call in another thread, with the caller's precision, which JAX keeps for each thread."""
     double = jax.config.read("jax_enable_x64")
 

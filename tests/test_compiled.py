@@ -36,9 +36,11 @@ class Keeping:
     """The programs of one process: which were made, and whether the last one found what it asked for."""
 
     def __init__(self, monkeypatch, folder: Path):
-        self.monkeypatch, self.folder, self.made, make = monkeypatch, folder, [], compiled._made
+        self.monkeypatch, self.folder, self.made, make = monkeypatch, folder, [], compiled._compile
         monkeypatch.setenv(PROGRAMS, str(folder))
-        monkeypatch.setattr(compiled, "_made", lambda *args: self.made.append(args) or make(*args))
+        monkeypatch.setattr(
+            compiled, "_compile", lambda *args: self.made.append(args) or make(*args)
+        )
         self.begin_another_process()
 
     def begin_another_process(self) -> None:
@@ -80,7 +82,7 @@ def test_another_argument_is_another_program(x64, keeping, monkeypatch):
     assert not keeping.makes(MATRIX, 2)
     assert not keeping.makes(MATRIX, 3)
     keeping.begin_another_process()
-    monkeypatch.setattr(compiled, "_source", lambda: "a later version")
+    monkeypatch.setattr(compiled, "_environment_hash", lambda: "a later version")
     assert keeping.makes(MATRIX, 2)
 
 
@@ -95,7 +97,7 @@ def test_a_damaged_program_is_made_anew(x64, keeping):
 
 
 def test_what_was_not_used_for_longest_goes_first(keeping, monkeypatch):
-    monkeypatch.setattr(compiled, "MOST", 250)
+    monkeypatch.setattr(compiled, "MAX_DISK_BYTES", 250)
     keeping.folder.mkdir()
     ages = [keeping.folder / f"of age {age}" for age in range(5)]
     for age, path in enumerate(ages):
@@ -120,8 +122,8 @@ def test_what_was_compiled_is_forgotten_only_where_there_is_no_room_for_more(
     maps, limit = tmp_path / "maps", tmp_path / "max_map_count"
     maps.write_text("7f00-7f01 r-xp\n" * used)
     limit.write_text("1000\n")
-    monkeypatch.setattr(compiled, "MAPS", maps)
-    monkeypatch.setattr(compiled, "LIMIT", limit)
+    monkeypatch.setattr(compiled, "MAPS_FILE", maps)
+    monkeypatch.setattr(compiled, "MAP_LIMIT_FILE", limit)
     traced = []
 
     @jax.jit
@@ -130,15 +132,15 @@ def test_what_was_compiled_is_forgotten_only_where_there_is_no_room_for_more(
         return 2 * x
 
     doubled(jnp.ones(3))
-    compiled.make_room()
+    compiled.free_memory_maps()
     assert doubled(jnp.ones(3)).sum() == 6
     assert len(traced) == times
 
 
 def test_where_a_system_does_not_say_nothing_is_done(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiled, "MAPS", tmp_path / "none")
+    monkeypatch.setattr(compiled, "MAPS_FILE", tmp_path / "none")
     monkeypatch.setattr(jax, "clear_caches", lambda: pytest.fail("cleared"))
-    compiled.make_room()
+    compiled.free_memory_maps()
 
 
 def test_what_this_version_of_xla_does_not_know_is_left_out(x64, monkeypatch, tmp_path):

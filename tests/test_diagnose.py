@@ -39,7 +39,7 @@ from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Unknowns
 from pmdc_jax.identify.refine import Optimum
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape, free_run
+from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, free_run
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 SCALES = Scales(10.0, 300.0, 10.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0, 500.0)
@@ -648,7 +648,7 @@ def test_sizes_in_amperes_are_not_tried_where_no_current_was_measured(x64):
     time, voltage, speed = (columns[q] for q in ("time_s", "voltage_V", "speed_rad_s"))
     given = prepare([Recording("silent", time, voltage, speed=speed)], [], unloaded=True)
     coordinates = jnp.log(jnp.asarray([PAPER[n] for n in PARAMETERS]))
-    start = Unknowns(coordinates, RunUnknowns(*jnp.zeros((LOCAL, 1))))
+    start = Unknowns(coordinates, RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1))))
     base = model_of((), given, polish(given.problem, Optimum(start, np.inf, (), False), steps=0))
     tried = {candidate.effect for candidate in Library(base).candidates}
     assert {"coulomb_friction", "speed_sensor_delay"} <= tried

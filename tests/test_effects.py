@@ -21,7 +21,14 @@ from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recording import OVER_BOTH, OVER_LAST, Averaging, Recording
-from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape, free_run, sensitivities, squared_errors
+from pmdc_jax.simulate import (
+    UNKNOWNS_PER_RUN,
+    RunUnknowns,
+    Tape,
+    free_run,
+    sensitivities,
+    squared_errors,
+)
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 STARTS = ((5.0, 60.0), (-3.0, -8.0), (0.0, 0.0))  # current A, speed rad/s of each run
@@ -654,8 +661,8 @@ def test_sensitivities_are_central_differences(x64, name):
 
     np.testing.assert_allclose(seen, run(at, own), rtol=1e-9, atol=1e-9)
     count = len(at)
-    for column in range(count + LOCAL):
-        step = np.zeros(count + LOCAL)
+    for column in range(count + UNKNOWNS_PER_RUN):
+        step = np.zeros(count + UNKNOWNS_PER_RUN)
         step[column] = CASES[name].difference * max(1.0, np.abs(np.r_[at, own.max(0)][column]))
         up, down = (run(at + s * step[:count], own + s * step[count:]) for s in (1, -1))
         expected = (up - down) / (2 * step[column])

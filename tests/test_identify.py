@@ -44,7 +44,7 @@ from pmdc_jax.identify.whitening import Whitening
 from pmdc_jax.motor import PARAMETERS
 from pmdc_jax.motor_file import Uncertainty
 from pmdc_jax.recording import Recording
-from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape, sensitivities
+from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, sensitivities
 
 PAPER = vb.paper_motor()
 NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
@@ -830,7 +830,7 @@ def test_few_moments_that_decide_widen_the_interval():
     rng, covered, plain = np.random.default_rng(7), [], []
     blocks, samples = 20, 128
     for _ in range(400):
-        jacobian = np.zeros((blocks, 2, samples, 1 + LOCAL))
+        jacobian = np.zeros((blocks, 2, samples, 1 + UNKNOWNS_PER_RUN))
         noise = 0.1 * rng.standard_normal((blocks, 2, samples))
         for block in (3, 8, 12, 17):
             jacobian[block, 1, :, 0] = 1.0
@@ -849,7 +849,7 @@ def test_few_moments_that_decide_widen_the_interval():
 def test_white_noise_leaves_intervals_as_they_are():
     rng, reaches, inflations, covered = np.random.default_rng(8), [], [], []
     for _ in range(300):
-        jacobian = np.zeros((20, 2, 128, 2 + LOCAL))
+        jacobian = np.zeros((20, 2, 128, 2 + UNKNOWNS_PER_RUN))
         jacobian[..., :2] = rng.standard_normal((20, 2, 128, 2))
         noise = rng.standard_normal((20, 2, 128))
         J = jacobian[..., :2].reshape(-1, 2)
@@ -953,7 +953,9 @@ def behind_a_gear(gap: float, load: float, twist: float = 0.0) -> tuple[Problem,
     named = [truth[name.removeprefix("gear_backlash.")] for name in given.problem.parameters.names]
     logarithmic = np.asarray(given.problem.parameters.logarithmic)
     coordinates = np.where(logarithmic, np.log(named), named)
-    return given.problem, Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((LOCAL, 1))))
+    return given.problem, Unknowns(
+        jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1)))
+    )
 
 
 @pytest.mark.slow
@@ -1021,7 +1023,7 @@ def test_a_hold_out_may_begin_at_any_angle(turned_by):
         truth = motor | {f"cogging_torque.{field}": x for field, x in wave.items()}
         named = zip(problem.parameters.names, problem.parameters.logarithmic, strict=True)
         coordinates = [np.log(truth[name]) if log else truth[name] for name, log in named]
-        begun = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((LOCAL, 2))))
+        begun = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 2))))
         right = begun._replace(runs=begun.runs._replace(angle=jnp.array([0.0, angle])))
         ended = fit_run_unknowns(problem, begun)[1]
         fitted, least = (

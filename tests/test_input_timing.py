@@ -14,12 +14,12 @@ from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recording import Recording
-from pmdc_jax.simulate import LOCAL, RunUnknowns, Tape, free_run, sensitivities
+from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, free_run, sensitivities
 
 # sampled more slowly than its current settles: 2 ms beside L / R of 1.25 ms
 SMALL = {"R": 0.8, "L": 1e-3, "Kb": 0.04, "Kt": 0.039, "J": 4e-5, "f": 3e-5}
 STEP = 2e-3
-FROM_REST = RunUnknowns(*np.zeros((LOCAL, 1)))
+FROM_REST = RunUnknowns(*np.zeros((UNKNOWNS_PER_RUN, 1)))
 
 
 def driven(seed: int, samples: int, load: float = 0.0) -> Recording:
@@ -123,7 +123,7 @@ def test_sensitivities_are_central_differences(x64, names):
         return np.asarray(free_run(parameters(jnp.asarray(at)), tape, FROM_REST))
 
     np.testing.assert_allclose(found, run(at), rtol=1e-9, atol=1e-9)
-    assert jacobian.shape[-1] == len(at) + LOCAL
+    assert jacobian.shape[-1] == len(at) + UNKNOWNS_PER_RUN
     for column, step in enumerate(1e-5 * np.eye(len(at))):
         expected = (run(at + step) - run(at - step)) / 2e-5
         error = np.linalg.norm(jacobian[..., column] - expected) / np.linalg.norm(expected)

@@ -33,7 +33,7 @@ from pmdc_jax.simulate import (
     uniform,
 )
 from pmdc_jax.simulate.exponential import phi_functions
-from pmdc_jax.threads import side_by_side
+from pmdc_jax.threads import map_in_threads
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 BLOCKS = 4  # every tape below has this shape, so that few are compiled
@@ -523,5 +523,5 @@ def test_importing_changes_no_setting_and_prints_nothing():
 def test_threads_work_in_the_precision_of_their_caller(double):
     """JAX keeps it for each thread, and a new one begins with single precision."""
     with jax.enable_x64(double):
-        found = side_by_side(lambda k: (k, jnp.arange(k, dtype=float).dtype.itemsize), range(7))
+        found = map_in_threads(lambda k: (k, jnp.arange(k, dtype=float).dtype.itemsize), range(7))
     assert found == [(k, 8 if double else 4) for k in range(7)]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from ..effects.base import State
 from ..motor import Drive, Motor
-from ..simulate.propagator import propagator
+from ..simulate.propagator import make_propagator
 from .controllers import AbstractController, Memory, Number
 from .hardware import Hardware
 
@@ -27,7 +27,7 @@ class SampledMotor(NamedTuple):
     @classmethod
     def of(cls, motor: Motor, sample_time: Number) -> SampledMotor:
         """Exact discretisation, with held voltage and no load, of the motor without its effects."""
-        A, B, *_ = propagator(motor.with_effects(()), jnp.asarray(sample_time, float), Drive())
+        A, B, *_ = make_propagator(motor.with_effects(()), jnp.asarray(sample_time, float), Drive())
         return cls(ii=A[0, 0], iw=A[0, 1], iv=B[0, 0], wi=A[1, 0], ww=A[1, 1], wv=B[1, 0])
 
     def next(self, current: Number, speed: Number, voltage: Number) -> tuple[Number, Number]:

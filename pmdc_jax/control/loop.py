@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
-from ..simulate.propagator import propagator
+from ..simulate.propagator import make_propagator
 from ..simulate.solver import Input, held_step
 from .controllers import Number
 from .law import Law, LawState
@@ -65,7 +65,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
     `jax.vmap` over any of them.
     """
     drive, hardware = Drive(), law.hardware
-    step_matrices = propagator(motor, jnp.asarray(hardware.sample_time / substeps), drive)
+    step_matrices = make_propagator(motor, jnp.asarray(hardware.sample_time / substeps), drive)
     sensor_delay = motor.speed_delay()
     state, voltage = steady_state(motor, course.initial)
     law_state = law.start(course.initial, state, voltage)

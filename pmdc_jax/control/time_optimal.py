@@ -13,7 +13,7 @@ from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
 from ..precision import double_precision
-from ..simulate.propagator import Propagator, propagator
+from ..simulate.propagator import Propagator, make_propagator
 from ..simulate.solver import Input, held_step
 from .controllers import Number
 from .metrics import BAND
@@ -114,7 +114,7 @@ def _simulate_bang_bang(
 ) -> BangBangStep:
     """Simulate full drive until instant `switch` or the band, then full reverse until the speed turns."""
     step = duration / INSTANTS
-    step_matrices = propagator(motor, jnp.asarray(step), DRIVE)
+    step_matrices = make_propagator(motor, jnp.asarray(step), DRIVE)
     direction = jnp.sign(setpoint - initial)
     band = BAND * jnp.abs(setpoint - initial)
     load = jnp.asarray(load, float)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from attrs import field, frozen
 
-from ..compiled import make_room
+from ..compiled import free_memory_maps
 from ..motor import Motor
 from ..motor_file import Uncertainty
 from ..precision import double_precision
@@ -204,7 +204,7 @@ def design(
     **Raises**: `InputError`, stating the limit, for requirements that no controller can meet.
     """
     begin = time.perf_counter()
-    make_room()
+    free_memory_maps()
     report = progress or silent
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
     specification = requirements.completed(motor)

@@ -17,7 +17,7 @@ from ..identify.noise import is_coarse, quantum, resolution
 from ..motor import Motor
 from ..recording import Recording
 from ..simulate import Tape, free_run
-from ..threads import one_ahead
+from ..threads import run_one_ahead
 from .candidates import Candidate, Scales, candidates
 from .model import Model
 from .response import Outputs, Path, kicks, pushes, sensed
@@ -119,7 +119,7 @@ class Library:
 
     def changes(self, tape: Tape, path: Path) -> Iterator[Change]:
         """What the candidates change along a path, in their order; each `Change` is of some of one effect."""
-        return one_ahead(self._calls(tape, path))
+        return run_one_ahead(self._calls(tape, path))
 
     def _calls(self, tape: Tape, path: Path) -> Iterator[Callable[[], Change]]:
         for name in EFFECTS:

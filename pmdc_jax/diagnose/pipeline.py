@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 from scipy import stats
 
-from ..compiled import make_room
+from ..compiled import free_memory_maps
 from ..effects import EFFECTS
 from ..identify.identification import Identification, Role, RunFit
 from ..identify.noise import FLOOR
@@ -72,7 +72,7 @@ def diagnose(
     """
     began = time.perf_counter()
     report = progress or silent
-    make_room()
+    free_memory_maps()
     report("checking the recordings")
     given = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
     given, solved = solve(given, search, seed, progress)

@@ -21,7 +21,7 @@ from ..identify.refine import Optimum
 from ..identify.solve import POOR, Solved, searched
 from ..identify.uncertainty import information_of
 from ..progress import ReportProgress
-from ..threads import side_by_side_until
+from ..threads import map_in_threads_until
 from .candidates import TRIALS, Values
 from .compare import Comparison
 from .effect_relations import CONTAINS, FULLER, spelt_out
@@ -216,7 +216,7 @@ class Refits:
             good = least < POOR * given.problem.outputs
             return bool(good or (others and others[0] < AGREED * least))
 
-        ends = side_by_side_until(_roughly, starts, enough)
+        ends = map_in_threads_until(_roughly, starts, enough)
         best = min(ends, key=lambda end: end.fitness)
         begun = best._replace(unknowns=best_backlash_start(given.problem, best.unknowns, runs))
         if factors:

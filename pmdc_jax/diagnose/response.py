@@ -20,7 +20,7 @@ from ..effects import State
 from ..effects.base import Scalars
 from ..motor import Motor
 from ..simulate import Tape
-from ..simulate.propagator import Propagator, along_grids, pick_grid, steps_in_sample
+from ..simulate.propagator import Propagator, grid_propagators, pick_grid, steps_in_sample
 from ..simulate.sensing import outputs, reported
 from ..simulate.solver import Input, held_step, held_step_and_mean
 
@@ -119,7 +119,7 @@ def respond(
     Blocks are simulated side by side from zero; then the state at the end of each is carried on into the next.
     """
     along, _ = _of_blocks(motor, tape)
-    whole = along.whole[:, :, 0]
+    whole = along.transition[:, :, 0]
 
     def step(
         x: Columns,
@@ -150,7 +150,7 @@ def respond(
     if along.mean is None:
         return response
     # a kick builds up evenly over its sample: half of it is in the mean
-    mean = jnp.einsum("jsb,sjbc->sbc", along.mean.whole[1], response) + kicks[:, 1] / 2
+    mean = jnp.einsum("jsb,sjbc->sbc", along.mean.transition[1], response) + kicks[:, 1] / 2
     moving = mean * (1.0 - stuck[:, :, None])
     seen = jnp.concatenate([response, moving[:, None]], 1)
     return jax.vmap(partial(_reported_in_time, motor, tape), in_axes=-1, out_axes=-1)(seen)
@@ -158,7 +158,7 @@ def respond(
 
 def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Input]:
     """The propagator of every block, and the inputs that act there, broadcast to (samples, blocks)."""
-    along, drive = pick_grid(along_grids(motor, tape), tape, tape.grid)
+    along, drive = pick_grid(grid_propagators(motor, tape), tape, tape.grid)
     samples = tape.value.shape[1]
 
     def spread(leaf: Float[Array, "blocks ..."]) -> Float[Array, "... samples blocks"]:

@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from ..identify.noise_model import Series, Whitener, plain, whitener
-from ..simulate import LOCAL
+from ..simulate import UNKNOWNS_PER_RUN
 from .evidence import Evidence, blocks_of, products
 from .library import Curve, Library, curves_over
 from .model import Model
@@ -57,7 +57,7 @@ def beyond_curves(found: Screen) -> float:
 def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
     """The evidence from all rows, whitened by one filter."""
     white = (run.white(k, whiten) for k, run in enumerate(rows))
-    return products(white, rows[0].fit.shared.values.shape[-1], LOCAL, READINGS)
+    return products(white, rows[0].fit.shared.values.shape[-1], UNKNOWNS_PER_RUN, READINGS)
 
 
 def _is_definite(curve: Signal) -> bool:

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from ..motor import Motor
 
 
-PHASE = ParameterRange("rad", -4.0, 4.0, "linear")
-PERIODS = ParameterRange("", 0.5, 200.0)
+PHASE_RANGE = ParameterRange("rad", -4.0, 4.0, "linear")
+PERIODS_RANGE = ParameterRange("", 0.5, 200.0)
 
 
 class _Angular(AbstractEffect):
@@ -51,8 +51,8 @@ class CoggingTorque(_Angular):
     variable: ClassVar = "angle"
     ranges: ClassVar = {
         "amplitude_Nm": ParameterRange("N m", 1e-10, 1e4),
-        "phase_rad": PHASE,
-        "periods": PERIODS,
+        "phase_rad": PHASE_RANGE,
+        "periods": PERIODS_RANGE,
     }
 
     amplitude_Nm: Scalars
@@ -63,7 +63,9 @@ class CoggingTorque(_Angular):
         return self.amplitude_Nm * _wave(self, state)
 
     def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
-        return replace(self, amplitude_Nm=self.amplitude_Nm * _fitted(self, state.speed * seconds))
+        return replace(
+            self, amplitude_Nm=self.amplitude_Nm * _averaging_factor(self, state.speed * seconds)
+        )
 
     def repeats_after(self) -> dict[str, Scalars]:
         return _period(self)
@@ -90,8 +92,8 @@ class TorqueRipple(_Angular):
     variable: ClassVar = "angle"
     ranges: ClassVar = {
         "amplitude": ParameterRange("", 1e-5, 1.0),
-        "phase_rad": PHASE,
-        "periods": PERIODS,
+        "phase_rad": PHASE_RANGE,
+        "periods": PERIODS_RANGE,
         # beyond 0 and 1, because estimates scatter around them
         "emf_share": ParameterRange("", -0.5, 1.5, "linear"),
     }
@@ -107,7 +109,9 @@ class TorqueRipple(_Angular):
         return eqx.tree_at(lambda m: (m.Kt, m.Kb), motor, constants)
 
     def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
-        return replace(self, amplitude=self.amplitude * _fitted(self, state.speed * seconds))
+        return replace(
+            self, amplitude=self.amplitude * _averaging_factor(self, state.speed * seconds)
+        )
 
     def repeats_after(self) -> dict[str, Scalars]:
         return _period(self)
@@ -123,7 +127,7 @@ def _period(effect: CoggingTorque | TorqueRipple) -> dict[str, Scalars]:
     return {"angle": 2 * jnp.pi * (1 / effect.periods)}
 
 
-def _fitted(effect: CoggingTorque | TorqueRipple, turn: Scalars) -> Scalars:
+def _averaging_factor(effect: CoggingTorque | TorqueRipple, turn: Scalars) -> Scalars:
     """The factor with which Simpson's rule gives the exact mean of the wave over a `turn` in rad, for any number of
     periods: without it, a wave with whole periods within a step would be aliased to a slow one.
 

@@ -131,7 +131,7 @@ class GearBacklash(_TwoInertias):
     def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
         """The effect as it stays until its teeth touch or part."""
         del seconds
-        return self._held(self.gap_rad, self.teeth(state))
+        return self._fixed(self.gap_rad, self.teeth(state))
 
     def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars:
         """The natural frequency of teeth in contact, rad/s: a step is then a third of the half period of a bounce."""
@@ -147,26 +147,26 @@ class GearBacklash(_TwoInertias):
     def linear(self) -> AbstractEffect:
         """Without a gap, always in contact."""
         one = jnp.ones_like(self.gap_rad)
-        return self._held(0.0 * one, Teeth(one, one, one))
+        return self._fixed(0.0 * one, Teeth(one, one, one))
 
     def without_contact(self) -> AbstractEffect:
         one = jnp.ones_like(self.gap_rad)
-        return self._held(self.gap_rad, Teeth(one, -one, -one))
+        return self._fixed(self.gap_rad, Teeth(one, -one, -one))
 
-    def _held(self, gap_rad: Scalars, stand: Teeth) -> FixedTeeth:
+    def _fixed(self, gap_rad: Scalars, contact: Teeth) -> FixedTeeth:
         shaft = (self.stiffness_Nm_rad, self.damping_Nms_rad, self.load_share)
-        return FixedTeeth(*shaft, gap_rad, stand)
+        return FixedTeeth(*shaft, gap_rad, contact)
 
 
 class FixedTeeth(GearBacklash):
-    """Backlash whose teeth stay in contact on one side, or stay apart, as in `stood`."""
+    """Backlash whose teeth stay in contact on one side, or stay apart, as in `contact`."""
 
-    stood: Teeth
+    contact: Teeth
 
     def linear(self) -> AbstractEffect:
         return self
 
     def torque(self, state: State) -> Scalars:
-        teeth = self.teeth(state, self.stood.side)
+        teeth = self.teeth(state, self.contact.side)
         push = teeth.side * self.stiffness_Nm_rad * teeth.compression
-        return jnp.where(self.stood.touch, push, 0.0)
+        return jnp.where(self.contact.touch, push, 0.0)

@@ -17,7 +17,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter, ss2tf
 
 from ..motor import Motor
-from ..simulate import LOCAL, Tape
+from ..simulate import UNKNOWNS_PER_RUN, Tape
 from .generalised_least_squares import residuals_of, series_of, training_runs
 from .identification import Identification
 from .noise_model import Series, Whitener, plain, whitener
@@ -136,7 +136,7 @@ class _Regression(NamedTuple):
 
 def _regressed(rows: Sequence[Series], white: Whitener, count: int) -> _Regression:
     shared = [*range(count + 1), -1]  # the motor's columns, that of friction, and the residual
-    own = slice(count + 1, count + 1 + LOCAL)
+    own = slice(count + 1, count + 1 + UNKNOWNS_PER_RUN)
     total, of_own = np.zeros((len(shared), len(shared))), []
     for run, series in enumerate(rows):
         made = white(run, series)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import attrs
 
-from ..compiled import make_room
+from ..compiled import free_memory_maps
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..recording_file import Runs
@@ -48,7 +48,7 @@ def identify(
     """
     began = time.perf_counter()
     report = progress or silent
-    make_room()
+    free_memory_maps()
     report("checking the recordings")
     given = prepare(
         recordings, holdout, tie=tie, known=known, unloaded=unloaded, effects=effects_named(effects)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..simulate import RunUnknowns
-from ..threads import side_by_side
+from ..threads import map_in_threads
 from .noise import FLOOR
 from .parameters import Parameters
 from .problem import (
@@ -219,7 +219,7 @@ def _whichever_fits(
     def squares(runs: RunUnknowns) -> Float[np.ndarray, " runs"]:
         return _squares_of_runs(problem, evaluate(problem, unknowns._replace(runs=runs)))
 
-    best, each = np.argmin(side_by_side(squares, tried), axis=0), np.arange(problem.tape.runs)
+    best, each = np.argmin(map_in_threads(squares, tried), axis=0), np.arange(problem.tape.runs)
     runs = jax.tree.map(lambda *values: jnp.stack(values)[best, each], *tried)
     return unknowns._replace(runs=runs)
 

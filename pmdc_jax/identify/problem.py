@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..compiled import compiled, quickly_compiled
-from ..simulate import LOCAL, RunUnknowns, Tape, sensitivities
+from ..simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, sensitivities
 from .parameters import Parameters
 from .whitening import Whitening
 
@@ -182,21 +182,21 @@ def normal_matrix(
     both = jnp.concatenate([jacobian, r[..., None]], -1)
     of_block = jnp.einsum("bcsi,bcsj->bij", both, both)
     of_run = jax.ops.segment_sum(of_block, tape.run, tape.runs) * fitted_runs[:, None, None]
-    index = _columns(jacobian.shape[-1] - LOCAL, tape.runs)
+    index = _columns(jacobian.shape[-1] - UNKNOWNS_PER_RUN, tape.runs)
     size = index.max() + 1
     return jnp.zeros((size, size)).at[index[:, :, None], index[:, None, :]].add(of_run)
 
 
 def _columns(count: int, runs: int) -> np.ndarray:
     """Indices of each run's columns among all unknowns and the residual."""
-    own = count + LOCAL * np.arange(runs)[:, None] + np.arange(LOCAL)
+    own = count + UNKNOWNS_PER_RUN * np.arange(runs)[:, None] + np.arange(UNKNOWNS_PER_RUN)
     shared = np.broadcast_to(np.arange(count), (runs, count))
-    return np.concatenate([shared, own, np.full((runs, 1), count + LOCAL * runs)], 1)
+    return np.concatenate([shared, own, np.full((runs, 1), count + UNKNOWNS_PER_RUN * runs)], 1)
 
 
 def unflatten(problem: Problem, flat: Float[Array, " columns"]) -> Unknowns:
     count = len(problem.free)
-    return Unknowns(flat[:count], RunUnknowns(*flat[count:].reshape(-1, LOCAL).T))
+    return Unknowns(flat[:count], RunUnknowns(*flat[count:].reshape(-1, UNKNOWNS_PER_RUN).T))
 
 
 def flatten(unknowns: Unknowns) -> Float[Array, " columns"]:

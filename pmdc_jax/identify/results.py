@@ -11,7 +11,7 @@ import numpy as np
 from ..motor import PARAMETERS, Motor
 from ..recording import OVER_BOTH, OVER_LAST, Recording
 from ..simulate import RunUnknowns, Tape
-from ..threads import side_by_side
+from ..threads import map_in_threads
 from .identifiability import SHARE, explain
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import noise_of_sensor, white_noise
@@ -94,7 +94,7 @@ def _intervals(
         return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
 
     identified = [k for k in range(len(coordinates)) if _status(k, best, info) == "identified"]
-    return dict(zip(identified, side_by_side(interval, identified), strict=True))
+    return dict(zip(identified, map_in_threads(interval, identified), strict=True))
 
 
 def _released_from_bounds(problem: Problem, polished: Fit) -> Fit:

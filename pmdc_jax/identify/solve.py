@@ -12,7 +12,7 @@ import numpy as np
 
 from ..progress import ReportProgress, silent
 from ..simulate import RunUnknowns, Tape
-from ..threads import beside, side_by_side_until
+from ..threads import map_in_threads_until, submit
 from .bounds import effect_bounds
 from .corrections.input_noise import without_input_noise
 from .corrections.input_timing import (
@@ -114,7 +114,7 @@ def searched(
 
     middle = (problem.parameters.lower + problem.parameters.upper) / 2
     # a refinement that stops at once, so that it is compiled on another core while the search runs
-    compiled = beside(refine, problem, _start(problem.tape, middle), tolerance=1e3)
+    compiled = submit(refine, problem, _start(problem.tape, middle), tolerance=1e3)
     found = look(seed)
     searched = time.perf_counter()
     report("refining the best candidates", float(found.best[-1]))
@@ -181,7 +181,7 @@ def _refine_all(problem: Problem, found: Found) -> list[Optimum]:
     def agreed(ends: list[Optimum]) -> bool:
         return _agreed(sorted(ends, key=_fitness), problem.outputs)
 
-    return sorted(side_by_side_until(lambda s: refine(problem, s), starts, agreed), key=_fitness)
+    return sorted(map_in_threads_until(lambda s: refine(problem, s), starts, agreed), key=_fitness)
 
 
 def _fitness(end: Optimum) -> float:

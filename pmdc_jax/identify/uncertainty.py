@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.special import chdtri, stdtrit
 
-from ..simulate import LOCAL
+from ..simulate import UNKNOWNS_PER_RUN
 from .polish import Fit
 from .problem import Problem
 
@@ -87,13 +87,13 @@ def information(
     MacKinnon, Nielsen, Webb, Journal of Econometrics 232 (2023), doi:10.1016/j.jeconom.2022.04.001.
     """
     residuals, jacobian, run = (np.asarray(x) for x in (residuals, jacobian, run))
-    count = jacobian.shape[-1] - LOCAL
+    count = jacobian.shape[-1] - UNKNOWNS_PER_RUN
     scores: list[np.ndarray] = []
     parts: list[Part] = []
     for index in range(runs):
         J = jacobian[run == index]
         r = residuals[run == index]
-        own = J[..., count:].reshape(-1, LOCAL)
+        own = J[..., count:].reshape(-1, UNKNOWNS_PER_RUN)
         across = J[..., :count].reshape(-1, count)
         # project the run's own unknowns out
         taken = np.linalg.pinv(own.T @ own, hermitian=True) @ (own.T @ across)

@@ -13,13 +13,13 @@ from ..recording import Recording
 from ..recording_file import Run, recordings_of
 from .population import squared_errors
 from .reference import reference_solution
-from .shooting import LOCAL, RunUnknowns, free_run, sensitivities
+from .shooting import UNKNOWNS_PER_RUN, RunUnknowns, free_run, sensitivities
 from .tape import Tape
 from .uneven import seen_at_record
 from .uniform import uniform
 
 __all__ = [
-    "LOCAL",
+    "UNKNOWNS_PER_RUN",
     "RunUnknowns",
     "Tape",
     "free_run",

@@ -14,10 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Motor
-from ..threads import CORES, side_by_side
+from ..threads import CORES, map_in_threads
 from .exponential import Matrix, product
-from .propagator import Propagator, along_grids, pick_grid, steps_in_sample
-from .solver import HeldInput, Input, Walk, held_step_and_mean, walk
+from .propagator import Propagator, grid_propagators, pick_grid, steps_in_sample
+from .solver import Carry, Input, StepSolver, held_step_and_mean, take_steps
 from .tape import BLOCK, Samples, Tape
 
 # Samples in a stride of linear motors, a power of two that divides a block; 8 and 32 were measured to be slower.
@@ -26,8 +26,8 @@ STRIDE = 16
 # Sums of squared errors of current (A^2) and speed (rad^2/s^2)
 Errors = tuple[Float[Array, " population"], Float[Array, " population"]]
 
-# Fewest candidates for a thread, linear and with effects: with fewer, threads cost more than they save.
-LINEAR_SHARE, SHARE = 256, 32
+# With fewer candidates for each, linear or with effects, threads cost more than they save.
+MIN_LINEAR_PER_THREAD, MIN_PER_THREAD = 256, 32
 
 
 def squared_errors(motors: Motor, tape: Tape) -> Errors:
@@ -37,7 +37,7 @@ def squared_errors(motors: Motor, tape: Tape) -> Errors:
     state; unknown loads are taken as zero. A motor whose simulation fails gets infinity, never NaN.
     """
     size = motors.R.shape[0]
-    least = SHARE if motors.effects else LINEAR_SHARE
+    least = MIN_PER_THREAD if motors.effects else MIN_LINEAR_PER_THREAD
     cores = CORES if jax.default_backend() == "cpu" else 1
     shares = max(1, min(cores, size // least))
     if shares == 1 or size % shares:  # shares of another size would need another compilation
@@ -47,7 +47,7 @@ def squared_errors(motors: Motor, tape: Tape) -> Errors:
         return jax.block_until_ready(_errors(motors, tape, np.asarray(k), shares))
 
     # XLA runs the loop over samples on one core, so the population is divided among threads
-    parts = side_by_side(part, range(shares))
+    parts = map_in_threads(part, range(shares))
     current, speed = (jnp.asarray(np.concatenate(errors)) for errors in zip(*parts, strict=True))
     return current, speed
 
@@ -58,15 +58,17 @@ def _errors(motors: Motor, tape: Tape, share: Int[Array | np.ndarray, ""], share
     """Errors of one of the equal shares of a population."""
     if shares > 1:
         size = motors.R.shape[0] // shares
-        mine = [
+        leaves = [
             jax.lax.dynamic_slice_in_dim(x, share * size, size) for x in jax.tree.leaves(motors)
         ]
         # the barrier keeps XLA from fusing the slices into the arithmetic, which would lose its vector instructions
-        motors = jax.tree.unflatten(jax.tree.structure(motors), jax.lax.optimization_barrier(mine))
+        motors = jax.tree.unflatten(
+            jax.tree.structure(motors), jax.lax.optimization_barrier(leaves)
+        )
     return _errors_with_effects(motors, tape) if motors.effects else _errors_of_linear(motors, tape)
 
 
-def _with_its_sample(tape: Tape) -> tuple[Samples, Samples, Bool[Array, " blocks"] | None]:
+def _means_at_sample_start(tape: Tape) -> tuple[Samples, Samples, Bool[Array, " blocks"] | None]:
     """Measurements and weights, with mean speeds over the last sample moved to where that sample begins; and which
     blocks have such speeds, None if no speed of the tape is a mean.
 
@@ -76,19 +78,19 @@ def _with_its_sample(tape: Tape) -> tuple[Samples, Samples, Bool[Array, " blocks
         return tape.measured, tape.weight, None
     over_last = (jnp.asarray(tape.averaging)[:, 0] == 1)[tape.run]
     # the mean from the last sample of a run on was not recorded
-    ends = jnp.append(jnp.asarray(tape.begins)[1:], True)
+    last_of_run = jnp.append(jnp.asarray(tape.begins)[1:], True)
 
     def moved(signal: Samples) -> Float[Array, "blocks 2 samples"]:
         signal = jnp.asarray(signal)
         speed = signal[:, 1].reshape(-1)
         sooner = jnp.append(speed[1:], 0.0).reshape(signal[:, 1].shape)
-        sooner = sooner.at[:, -1].multiply(jnp.where(ends, 0.0, 1.0))
+        sooner = sooner.at[:, -1].multiply(jnp.where(last_of_run, 0.0, 1.0))
         return signal.at[:, 1].set(jnp.where(over_last[:, None], sooner, signal[:, 1]))
 
     return moved(tape.measured), moved(tape.weight), over_last
 
 
-def _seen_speed(
+def _sensed_speed(
     speed: Scalars,
     mean: Scalars | None,
     over_last: Bool[Array, " blocks"] | None,
@@ -105,37 +107,41 @@ Gathered = tuple[State, tuple[Scalars, ...]]
 
 
 class Stride(NamedTuple):
-    """The exact step of linear motors over `STRIDE` samples: x(end) = whole x(start) + from_rest inputs."""
+    """The exact step of linear motors over `STRIDE` samples: x(end) = transition x(start) + response to inputs."""
 
-    whole: Matrix  # exp(A h)^STRIDE
+    transition: Matrix  # exp(A h)^STRIDE
     # first axis: the driving values at all samples, then the loads
-    from_rest: Float[Array, "inputs 2 population"]
+    input_response: Float[Array, "inputs 2 population"]
 
 
-def _stride(along: Propagator) -> Stride:
+def _stride(propagator: Propagator) -> Stride:
     """By repeated doubling from one sample: the response to the earlier inputs is propagated through the later half."""
-    whole, from_rest = along.whole[:, :, None], along.inputs[:, :, None]
+    transition, input_response = propagator.transition[:, :, None], propagator.inputs[:, :, None]
     for _ in range(STRIDE.bit_length() - 1):
-        from_rest = jnp.concatenate([product(whole, from_rest), from_rest], axis=2)
-        whole = product(whole, whole)
-    by_input = jnp.moveaxis(from_rest, 0, 2)
-    return Stride(whole[:, :, 0], by_input.reshape(2 * STRIDE, 2, -1))
+        input_response = jnp.concatenate(
+            [product(transition, input_response), input_response], axis=2
+        )
+        transition = product(transition, transition)
+    by_input = jnp.moveaxis(input_response, 0, 2)
+    return Stride(transition[:, :, 0], by_input.reshape(2 * STRIDE, 2, -1))
 
 
-def _starts(stride: Stride, state: State, value: Samples, load: Samples) -> tuple[State, State]:
+def _stride_starts(
+    stride: Stride, state: State, value: Samples, load: Samples
+) -> tuple[State, State]:
     """States of linear motors at the end of a block, and at the start of each of its strides, (strides, population).
 
     The inputs of all strides go through one matrix product, so that little sequential work is left.
     """
     inputs = jnp.concatenate([_in_strides(value), _in_strides(load)], axis=1)
-    pushes = jnp.tensordot(inputs, stride.from_rest, 1)
+    responses = jnp.tensordot(inputs, stride.input_response, 1)
 
     def follow(
-        x: Float[Array, "2 population"], push: Float[Array, "2 population"]
+        x: Float[Array, "2 population"], response: Float[Array, "2 population"]
     ) -> tuple[Float[Array, "2 population"], Float[Array, "2 population"]]:
-        return stride.whole[:, 0] * x[0] + stride.whole[:, 1] * x[1] + push, x
+        return stride.transition[:, 0] * x[0] + stride.transition[:, 1] * x[1] + response, x
 
-    end, starts = jax.lax.scan(follow, jnp.stack([state.current, state.speed]), pushes)
+    end, starts = jax.lax.scan(follow, jnp.stack([state.current, state.speed]), responses)
     return State(end[0], end[1], {}), State(starts[:, 0], starts[:, 1], {})
 
 
@@ -149,20 +155,20 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
     The strides of a block run in parallel: XLA fuses all the arithmetic of a stride into one loop over strides and
     candidates.
     """
-    grids = along_grids(motors, tape)
+    grids = grid_propagators(motors, tape)
     strides, rows = jax.vmap(_stride)(grids), BLOCK // STRIDE
-    measured, weights, over_last = _with_its_sample(tape)
+    measured, weights, over_last = _means_at_sample_start(tape)
 
-    def advance(carry: Walk, block: Int[Array, ""]) -> Walk:
+    def advance(carry: Carry, block: Int[Array, ""]) -> Carry:
         grid = jnp.asarray(tape.grid)[block]
         _, drive = pick_grid(grids, tape, grid)
-        along = jax.tree.map(lambda leaf: _repeated(_taken(leaf, grid), rows), grids)
+        propagator = jax.tree.map(lambda leaf: _repeat_rows(_pick(leaf, grid), rows), grids)
         samples = (tape.value[block], tape.load[block], measured[block], weights[block])
         initial = motors.initial_state(*tape.initial[tape.run[block]])
         begins = tape.begins[block]
         state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
         stride = jax.tree.map(lambda leaf: leaf[grid], strides)
-        end, starts = _starts(stride, state, *samples[:2])
+        end, starts = _stride_starts(stride, state, *samples[:2])
         # the samples of a stride along the first axis, then a row for each stride
         by_sample = jax.tree.map(lambda s: jnp.moveaxis(_in_strides(s), -1, 0)[..., None], samples)
 
@@ -177,31 +183,34 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
         ) -> tuple[Gathered, None]:
             state, errors = carry
             value, load, measured, weight = samples
-            after, mean = held_step_and_mean(motors, along, Input(drive, value, load), state)
-            seen = (state.current, _seen_speed(state.speed, mean and mean.speed, over_last, block))
+            after, mean = held_step_and_mean(motors, propagator, Input(drive, value, load), state)
+            seen = (
+                state.current,
+                _sensed_speed(state.speed, mean and mean.speed, over_last, block),
+            )
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
             return (after, errors), None
 
-        (_, errors), _ = jax.lax.scan(sample, (starts, carry.seen), by_sample, unroll=STRIDE)
-        return Walk(end, errors)
+        (_, errors), _ = jax.lax.scan(sample, (starts, carry.output), by_sample, unroll=STRIDE)
+        return Carry(end, errors)
 
     zero = jnp.zeros_like(motors.R)
     nothing = jnp.zeros((rows, len(zero)))
-    start = Walk(motors.initial_state(zero, zero), (nothing, nothing))
+    start = Carry(motors.initial_state(zero, zero), (nothing, nothing))
     saveat = diffrax.SaveAt(t1=True)
-    errors = walk(HeldInput(advance), start, tape.value.shape[0], saveat).seen
+    errors = take_steps(StepSolver(advance), start, tape.value.shape[0], saveat).output
     # rows are summed only here: XLA would fuse the sum into the arithmetic, which would lose its vector instructions
     current, speed = (e[0].sum(0) for e in errors)
-    return _finite(current), _finite(speed)
+    return _infinite_if_failed(current), _infinite_if_failed(speed)
 
 
-def _finite(errors: Float[Array, " population"]) -> Float[Array, " population"]:
+def _infinite_if_failed(errors: Float[Array, " population"]) -> Float[Array, " population"]:
     return jnp.where(jnp.isfinite(errors), errors, jnp.inf)
 
 
-def _taken(grids: Float[Array, "grids ..."], grid: Int[Array, ""]) -> Float[Array, "..."]:
+def _pick(grids: Float[Array, "grids ..."], grid: Int[Array, ""]) -> Float[Array, "..."]:
     """One grid's entry, by a matrix product: XLA would fuse indexing into the arithmetic, which would lose its vector
     instructions."""
     if len(grids) == 1:
@@ -209,7 +218,7 @@ def _taken(grids: Float[Array, "grids ..."], grid: Int[Array, ""]) -> Float[Arra
     return jnp.tensordot(jnp.where(jnp.arange(len(grids)) == grid, 1.0, 0.0), grids, 1)
 
 
-def _repeated(
+def _repeat_rows(
     leaf: Float[Array, "... population"], rows: int
 ) -> Float[Array, "... rows population"]:
     return jnp.broadcast_to(leaf[..., None, :], (*leaf.shape[:-1], rows, leaf.shape[-1]))
@@ -217,14 +226,14 @@ def _repeated(
 
 def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
     """Errors of one share of motors with effects, sample by sample."""
-    grids, steps = along_grids(motors, tape), steps_in_sample(motors, tape)
+    grids, steps = grid_propagators(motors, tape), steps_in_sample(motors, tape)
     delay = motors.speed_delay()
-    measured, weights, over_last = _with_its_sample(tape)
-    speeds, of_speeds = (jnp.asarray(x)[:, 1].reshape(-1) for x in (measured, weights))
-    ends = BLOCK * jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs), side="right")
+    measured, weights, over_last = _means_at_sample_start(tape)
+    speeds, speed_weights = (jnp.asarray(x)[:, 1].reshape(-1) for x in (measured, weights))
+    run_ends = BLOCK * jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs), side="right")
 
-    def advance(carry: Walk, block: Int[Array, ""]) -> Walk:
-        along, drive = pick_grid(grids, tape, tape.grid[block])
+    def advance(carry: Carry, block: Int[Array, ""]) -> Carry:
+        propagator, drive = pick_grid(grids, tape, tape.grid[block])
 
         def sample(
             carry: Gathered,
@@ -240,15 +249,15 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
             value, load, measured, weight, k = samples
             if delay is not None:  # what is seen later is compared with what was measured later
                 late = k + jnp.round(delay / tape.sample_time[tape.grid[block]]).astype(int)
-                inside = late < ends[tape.run[block]]
+                inside = late < run_ends[tape.run[block]]
                 late = jnp.minimum(late, len(speeds) - 1)
                 measured = (measured[0], speeds[late])
-                weight = (weight[0], jnp.where(inside, of_speeds[late], 0.0))
+                weight = (weight[0], jnp.where(inside, speed_weights[late], 0.0))
             acting = Input(drive, value, load)
-            after, mean = held_step_and_mean(motors, along, acting, state, steps)
+            after, mean = held_step_and_mean(motors, propagator, acting, state, steps)
             current, speed = motors.sensors(state)
             mean_speed = mean and motors.sensors(mean)[1]
-            seen = (current, _seen_speed(speed, mean_speed, over_last, block))
+            seen = (current, _sensed_speed(speed, mean_speed, over_last, block))
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
@@ -266,11 +275,11 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
             weights[block].T,
             block * BLOCK + jnp.arange(BLOCK),
         )
-        (state, errors), _ = jax.lax.scan(sample, (state, carry.seen), samples)
-        return Walk(state, errors)
+        (state, errors), _ = jax.lax.scan(sample, (state, carry.output), samples)
+        return Carry(state, errors)
 
     zero = jnp.zeros_like(motors.R)
-    start = Walk(motors.initial_state(zero, zero), (zero, zero))
+    start = Carry(motors.initial_state(zero, zero), (zero, zero))
     saveat = diffrax.SaveAt(t1=True)
-    errors = walk(HeldInput(advance), start, tape.value.shape[0], saveat).seen
-    return _finite(errors[0][0]), _finite(errors[1][0])
+    errors = take_steps(StepSolver(advance), start, tape.value.shape[0], saveat).output
+    return _infinite_if_failed(errors[0][0]), _infinite_if_failed(errors[1][0])

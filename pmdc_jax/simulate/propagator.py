@@ -21,14 +21,14 @@ from .switches import contact_response
 if TYPE_CHECKING:
     from .tape import Tape
 
-Held = Float[Array, "*#batch"]
+StepLength = Float[Array, "*#batch"]  # s
 Vector = tuple[Scalars, ...]  # current, speed, and the states of linear effects
-Slow = dict[str, Scalars]  # the states that are not in the linear part, by name
+NonlinearStates = dict[str, Scalars]  # the states that are not in the linear part, by name
 
-# Largest number of steps in a sample
-FINEST = 32
-# Largest product of an effect's fastest rate (`fastest_rate`) and the step: a decay by no more than exp(-1)
-STIFF = 1.0
+# In a sample
+MAX_STEPS = 32
+# Of an effect's `fastest_rate`: a decay by no more than exp(-1) in a step
+MAX_RATE_TIMES_STEP = 1.0
 
 
 class Stages(NamedTuple):
@@ -45,86 +45,86 @@ class Stages(NamedTuple):
 class Weights(NamedTuple):
     """Weights over one step for a motor with effects."""
 
-    push: Matrix  # h phi_1(A h)
-    linear: Matrix  # A
-    step: Float[Array, "*#batch"]  # s
+    rate_response: Matrix  # h phi_1(A h): response to a constant rate
+    A: Matrix  # of the linear part
+    step: StepLength
     stages: Stages | None = None  # if the rest varies within a step
     # response to the torque that teeth begin or cease to pass within a step, per rad of compression; None without teeth
     contact: Float[Array, "powers n *#batch"] | None = None
 
 
-class Mean(NamedTuple):
+class MeanPropagator(NamedTuple):
     """Matrices for the mean of the state over a step: those for its end, with phi_(k + 1) in place of every phi_k, and
     so as accurate. The last three are for a motor with `Stages`."""
 
-    whole: Matrix  # phi_1(A h)
+    transition: Matrix  # phi_1(A h)
     inputs: Float[Array, "n 2 *#batch"]  # h phi_2(A h) B
-    push: Matrix  # h phi_2(A h)
+    rate_response: Matrix  # h phi_2(A h)
     ramp: Matrix | None = None  # h (phi_3 - phi_2 / 2)(A h)
     first: Matrix | None = None  # h (phi_2 - 3 phi_3 + 4 phi_4)
     middle: Matrix | None = None  # h (2 phi_3 - 4 phi_4)
     last: Matrix | None = None  # h (4 phi_4 - phi_3)
 
 
-class Look(NamedTuple):
+class SensorInstant(NamedTuple):
     """The instant within each sample at which a delayed sensor sees the speed."""
 
-    along: Propagator  # one of the equal steps up to that instant
-    share: Held  # of the sample up to that instant, 0 < share <= 1
+    propagator: Propagator  # one of the equal steps up to that instant
+    share: Scalars  # of the sample up to that instant, 0 < share <= 1
 
 
 class Propagator(NamedTuple):
     """Step matrices of a motor for one step length h.
 
-    x(h) = whole x + inputs u is exact for the linear motor. With effects, h is one of the equal steps in a sample, and
-    the inputs act through `weights`, like everything else that is not in the linear part.
+    x(h) = transition x + inputs u is exact for the linear motor. With effects, h is one of the equal steps in a sample,
+    and the inputs act through `weights`, like everything else that is not in the linear part.
     """
 
-    whole: Matrix  # exp(A h)
+    transition: Matrix  # exp(A h)
     inputs: Float[Array, "n 2 *#batch"]  # h phi_1(A h) B
     weights: Weights | None = None
-    apart: Propagator | None = None  # the same while the teeth do not touch
+    without_contact: Propagator | None = None  # the same while the teeth do not touch
     # h (phi_2 - phi_1 / 2)(A h): effect of a drive's rise within a step, beyond that of its mean
     ramp: Matrix | None = None
-    look: Look | None = None  # for a delayed sensor
-    mean: Mean | None = None  # for a speed that is reported as a mean
+    sensor_instant: SensorInstant | None = None  # for a delayed sensor
+    mean: MeanPropagator | None = None  # for a speed that is reported as a mean
 
 
 @eqx.filter_jit  # one trace serves all grids
-def propagator(
-    motor: Motor, step: Held, drive: Drive, straight: bool = False, averaged: bool = False
+def make_propagator(
+    motor: Motor, step: StepLength, drive: Drive, straight: bool = False, averaged: bool = False
 ) -> Propagator:
     """Exact step of the linear part over `step` seconds, and the weights for what the effects add.
 
-    With teeth it is made for teeth that touch, and its `apart` for those that do not. `straight` asks for the matrices
-    of a drive that varies linearly instead of being held, `averaged` for those of the mean of the state.
+    With teeth it is made for teeth that touch, and its `without_contact` for those that do not. `straight` asks for the
+    matrices of a drive that varies linearly instead of being held, `averaged` for those of the mean of the state.
     """
     A, B = _linear_part(motor, drive)
-    along = _by_linear_part(motor, step, A, B, straight, averaged)
+    propagator = _by_linear_part(motor, step, A, B, straight, averaged)
     teeth = motor.toothed
     if teeth is None:
-        return along
+        return propagator
     assert teeth.contact_state is not None
     open_teeth = motor.with_effects(e.without_contact() for e in motor.effects)
-    A_apart, _ = _linear_part(open_teeth, drive)
-    apart = _by_linear_part(motor, step, A_apart, B, straight, averaged)
-    push = (A - A_apart)[:, 2 + linear_states(motor).index(teeth.contact_state)]
-    apart = _with_contact_response(apart, contact_response(A, push, step))
-    return _with_contact_response(along, contact_response(A_apart, push, step))._replace(
-        apart=apart
+    A_without, _ = _linear_part(open_teeth, drive)
+    without_contact = _by_linear_part(motor, step, A_without, B, straight, averaged)
+    push = (A - A_without)[:, 2 + linear_states(motor).index(teeth.contact_state)]
+    without_contact = _with_contact_response(without_contact, contact_response(A, push, step))
+    return _with_contact_response(propagator, contact_response(A_without, push, step))._replace(
+        without_contact=without_contact
     )
 
 
 def _with_contact_response(
-    along: Propagator, contact: Float[Array, "powers n *#batch"]
+    propagator: Propagator, contact: Float[Array, "powers n *#batch"]
 ) -> Propagator:
-    assert along.weights is not None
-    return along._replace(weights=along.weights._replace(contact=contact))
+    assert propagator.weights is not None
+    return propagator._replace(weights=propagator.weights._replace(contact=contact))
 
 
 def _by_linear_part(
     motor: Motor,
-    step: Held,
+    step: StepLength,
     A: Matrix,
     B: Float[Array, "n 2 *#batch"],
     straight: bool,
@@ -142,7 +142,7 @@ def _by_linear_part(
     if staged:
         half_input = step / 2 * half1
         half_minus_one = product(half0, half_input) - half_input
-        stages = Stages(half0, half_input, half_minus_one, *_rest(step, phi))
+        stages = Stages(half0, half_input, half_minus_one, *_etdrk4_weights(step, phi))
     if motor.effects:
         weights = Weights(step * phi[1], A, step * jnp.ones_like(motor.R), stages)
     return Propagator(
@@ -154,28 +154,29 @@ def _by_linear_part(
     )
 
 
-def _ramp(step: Held, phi: Sequence[Matrix]) -> Matrix:
+def _ramp(step: StepLength, phi: Sequence[Matrix]) -> Matrix:
     """Weight of a drive's rise within a step, beyond the effect of its mean."""
     return step * (phi[2] - phi[1] / 2)
 
 
-def _rest(step: Held, phi: Sequence[Matrix]) -> tuple[Matrix, Matrix, Matrix]:
+def _etdrk4_weights(step: StepLength, phi: Sequence[Matrix]) -> tuple[Matrix, Matrix, Matrix]:
     """Weights of the stages of ETDRK4: the first, the two in the middle, and the last."""
     first = step * (phi[1] - 3 * phi[2] + 4 * phi[3])
     return first, step * (2 * phi[2] - 4 * phi[3]), step * (4 * phi[3] - phi[2])
 
 
 def _mean(
-    step: Held,
+    step: StepLength,
     phi: Sequence[Matrix],
     B: Float[Array, "n 2 *#batch"],
     ramps: bool,
     staged: bool,
-) -> Mean:
+) -> MeanPropagator:
     """Matrices for the mean over a step; `phi` begins with phi_1 instead of phi_0."""
-    push = step * phi[1]
+    rate_response = step * phi[1]
     ramp = _ramp(step, phi) if ramps else None
-    return Mean(phi[0], product(push, B), push, ramp, *(_rest(step, phi) if staged else ()))
+    stages = _etdrk4_weights(step, phi) if staged else ()
+    return MeanPropagator(phi[0], product(rate_response, B), rate_response, ramp, *stages)
 
 
 def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 *#batch"]]:
@@ -195,21 +196,21 @@ def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 
     return A, jnp.concatenate([B, jnp.zeros_like(A[2:, :2])])
 
 
-def along_grids(motor: Motor, tape: Tape) -> Propagator:
+def grid_propagators(motor: Motor, tape: Tape) -> Propagator:
     """The propagators of one step on every grid of the tape, stacked along the first axis."""
     steps, delay = steps_in_sample(motor, tape), motor.speed_delay()
 
     def of_grid(g: int) -> Propagator:
         sample = jnp.asarray(tape.sample_time)[g]
         drive = Drive(*(jnp.asarray(share)[g] for share in tape.drive))
-        how = (tape.rise is not None, tape.averaging is not None)
-        along = propagator(motor, sample / steps, drive, *how)
+        options = (tape.rise is not None, tape.averaging is not None)
+        propagator = make_propagator(motor, sample / steps, drive, *options)
         if delay is None:
-            return along
+            return propagator
         samples = jnp.asarray(delay / sample)
         share = 1 - (samples - jnp.floor(samples))
-        part = propagator(motor, share * sample / steps, drive, *how)
-        return along._replace(look=Look(part, share))
+        part = make_propagator(motor, share * sample / steps, drive, *options)
+        return propagator._replace(sensor_instant=SensorInstant(part, share))
 
     grids = map(of_grid, range(tape.sample_time.shape[0]))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *grids)
@@ -229,18 +230,18 @@ def steps_in_sample(motor: Motor, tape: Tape) -> int | Int[Array, ""]:
 
 
 def steps_within(motor: Motor, seconds: float, current: Scalars) -> int | Int[Array, ""]:
-    """Number of equal steps in this time, at most `FINEST`, so that none is longer than the effects allow at currents
-    up to `current` in A."""
+    """Number of equal steps in this time, at most `MAX_STEPS`, so that none is longer than the effects allow at
+    currents up to `current` in A."""
     allowed = [e.longest_step for e in motor.effects if e.holds or e.contact_state or not e.affine]
     if not allowed:
         return 1
-    least = min(max(round(seconds / min(allowed)), 1), FINEST)
+    least = min(max(round(seconds / min(allowed)), 1), MAX_STEPS)
     rates = [rate for e in motor.effects if (rate := e.fastest_rate(motor, current)) is not None]
     if not rates:
         return least
     # the median of a population: an outlier that needs far more steps would slow down all of it
-    needed = jnp.ceil(jnp.median(reduce(jnp.maximum, rates)) * seconds / STIFF)
-    return jnp.clip(jnp.nan_to_num(needed, nan=FINEST), least, FINEST).astype(int)
+    needed = jnp.ceil(jnp.median(reduce(jnp.maximum, rates)) * seconds / MAX_RATE_TIMES_STEP)
+    return jnp.clip(jnp.nan_to_num(needed, nan=MAX_STEPS), least, MAX_STEPS).astype(int)
 
 
 def linear_states(motor: Motor) -> list[str]:
@@ -254,6 +255,6 @@ def vector(motor: Motor, state: State) -> Vector:
     return (state.current, state.speed, *(state.extra[name] for name in linear_states(motor)))
 
 
-def state_of(motor: Motor, x: Vector, slow: Slow) -> State:
+def state_of(motor: Motor, x: Vector, nonlinear: NonlinearStates) -> State:
     """The state from its `vector` and the states that are not in the linear part."""
-    return State(x[0], x[1], slow | dict(zip(linear_states(motor), x[2:], strict=True)))
+    return State(x[0], x[1], nonlinear | dict(zip(linear_states(motor), x[2:], strict=True)))

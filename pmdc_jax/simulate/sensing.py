@@ -15,7 +15,7 @@ from .tape import BLOCK, Tape
 
 def outputs(
     motor: Motor,
-    along: Propagator,
+    propagator: Propagator,
     acting: Input,
     state: State,
     steps: int | Int[Array, ""],
@@ -29,21 +29,21 @@ def outputs(
     """
     seen = [*motor.sensors(state)]
     part_mean = None
-    if along.look is not None:
-        part, share = along.look
+    if propagator.sensor_instant is not None:
+        part, share = propagator.sensor_instant
         within = acting.part(share / 2, share)
         there, part_mean = held_step_and_mean(motor, part, within, state, steps)
         seen.append(motor.sensors(there)[1])
     if mean is not None:
         seen.append(motor.sensors(mean)[1])
-    if along.look is not None and part_mean is not None:
-        seen.append(along.look.share * motor.sensors(part_mean)[1])
+    if propagator.sensor_instant is not None and part_mean is not None:
+        seen.append(propagator.sensor_instant.share * motor.sensors(part_mean)[1])
     return jnp.stack(seen)
 
 
-def reports_of(along: Propagator) -> int:
+def reports_of(propagator: Propagator) -> int:
     """Number of `outputs`."""
-    late, averaged = along.look is not None, along.mean is not None
+    late, averaged = propagator.sensor_instant is not None, propagator.mean is not None
     return 2 + late + averaged + (late and averaged)
 
 

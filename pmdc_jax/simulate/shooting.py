@@ -23,20 +23,20 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compiled import compiled
 from ..effects.base import State
 from ..motor import Motor
-from .propagator import Propagator, along_grids, pick_grid, steps_in_sample
+from .propagator import Propagator, grid_propagators, pick_grid, steps_in_sample
 from .sensing import outputs, reported, reports_of
-from .solver import HeldInput, Input, Walk, held_step_and_mean, walk
+from .solver import Carry, Input, StepSolver, held_step_and_mean, take_steps
 from .tape import BLOCK, Tape
 
 T = TypeVar("T")
 
 # Relative gap between blocks below which no further pass follows. The last pass still corrects the gap to first order,
 # so the remaining error is about the square of this.
-JOINED = 1e-4
+MAX_RELATIVE_GAP = 1e-4
 
 # Passes after which a fit gives up on a motor. Where teeth rattle in their play, the end of a block depends chaotically
 # on its start: joining takes as many passes as a run has blocks, and the derivatives are of no use.
-PASSES = 32
+MAX_PASSES = 32
 
 Starts = Float[Array, "blocks states"]
 Start = Float[Array, " states"]  # of one block
@@ -71,7 +71,7 @@ class RunUnknowns(NamedTuple):
 
 
 # Columns of the sensitivities for the unknowns of a run
-LOCAL = len(RunUnknowns._fields)
+UNKNOWNS_PER_RUN = len(RunUnknowns._fields)
 
 
 @compiled
@@ -83,11 +83,10 @@ def free_run(
     `own`, the unknowns of each run, is by default as recorded.
     """
     own = own or RunUnknowns.as_recorded(tape)
-    prepared = (motor, along_grids(motor, tape))
-    begins = _begins(motor, own, tape)
-    states = begins.shape[1]
-    still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
-    joined, starts, last = _join(prepared, still, tape, own, begins)
+    prepared = (motor, grid_propagators(motor, tape))
+    initial = _initial_states(motor, own, tape)
+    states = initial.shape[1]
+    starts, joined, last, *_ = _join_blocks(prepared, tape, own, initial)
     seen = last.seen + jnp.einsum("sncb,bn->scb", last.d_seen[:, -states:], joined - starts)
     return reported(motor, tape, seen.transpose(2, 1, 0))
 
@@ -101,43 +100,44 @@ def sensitivities(
 ) -> tuple[Float[Array, "blocks 2 samples"], Float[Array, "blocks 2 samples columns"]]:
     """Free run, and its derivatives with respect to `parameters` and then to the unknowns of the sample's own run.
 
-    `assemble` makes a motor from the parameters; the rest is as in `free_run`. All is NaN if `PASSES` passes do not
+    `assemble` makes a motor from the parameters; the rest is as in `free_run`. All is NaN if `MAX_PASSES` passes do not
     join the blocks, as for a motor that depends chaotically on its initial state.
     """
     own = own or RunUnknowns.as_recorded(tape)
     count = len(parameters)
-    every = count + LOCAL
+    all_columns = count + UNKNOWNS_PER_RUN
 
     def prepare(parameters: Float[Array, " parameters"]) -> Prepared:
         motor = assemble(parameters)
-        return motor, along_grids(motor, tape)
+        return motor, grid_propagators(motor, tape)
 
-    prepared, d_prepared = _along_columns(prepare, (parameters,), (jnp.eye(count),))
+    prepared, d_prepared = _value_and_derivatives(prepare, (parameters,), (jnp.eye(count),))
     motor = prepared[0]
-    d_motor = jax.tree.map(lambda leaf: _pad_columns(leaf, every), d_prepared[0])
-    ones = jnp.eye(LOCAL, every, count)[:, :, None]
-    d_own = RunUnknowns(*(jnp.broadcast_to(one, (every, tape.runs)) for one in ones))
-    begins, d_begins = _along_columns(
-        lambda motor, own: _begins(motor, own, tape), (motor, own), (d_motor, d_own)
+    d_motor = jax.tree.map(lambda leaf: _pad_columns(leaf, all_columns), d_prepared[0])
+    ones = jnp.eye(UNKNOWNS_PER_RUN, all_columns, count)[:, :, None]
+    d_own = RunUnknowns(*(jnp.broadcast_to(one, (all_columns, tape.runs)) for one in ones))
+    initial, d_initial = _value_and_derivatives(
+        lambda motor, own: _initial_states(motor, own, tape), (motor, own), (d_motor, d_own)
     )
-    states = begins.shape[1]
+    states = initial.shape[1]
     columns = count + 1 + states
     d_prepared = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_prepared)
 
     # joining takes several passes, with the columns of the start only; one more pass at the joined starts has all
-    still = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
-    starts, *_ = _join(prepared, still, tape, own, begins, PASSES)
-    passed = _pass(prepared, d_prepared, columns, tape, starts, own.load_offset)
-    joined, d_starts = _stitch_tangents(passed, tape, starts, begins, d_begins, count)
+    starts = _join_blocks(prepared, tape, own, initial, MAX_PASSES).joined
+    passed = _simulate_blocks(prepared, d_prepared, columns, tape, starts, own.load_offset)
+    joined, d_starts = _newton_correction_with_derivatives(
+        passed, tape, starts, initial, d_initial, count
+    )
 
     by_start = passed.d_seen[:, -states:]
     seen = passed.seen + jnp.einsum("sncb,bn->scb", by_start, joined - starts)
     through = jnp.einsum("sncb,bnp->scbp", by_start, d_starts)
-    direct = _among_columns(jnp.moveaxis(passed.d_seen[:, : count + 1], 1, -1), count)
+    direct = _in_all_columns(jnp.moveaxis(passed.d_seen[:, : count + 1], 1, -1), count)
     d_seen = (direct + through).transpose(2, 1, 0, 3)
     if motor.speed_delay() is None and tape.averaging is None:
         return seen.transpose(2, 1, 0), d_seen
-    seen, d_seen = _along_columns(
+    seen, d_seen = _value_and_derivatives(
         lambda motor, seen: reported(motor, tape, seen),
         (motor, seen.transpose(2, 1, 0)),
         (d_motor, jnp.moveaxis(d_seen, -1, 0)),
@@ -145,7 +145,7 @@ def sensitivities(
     return seen, jnp.moveaxis(d_seen, 0, -1)
 
 
-def _along_columns(
+def _value_and_derivatives(
     function: Callable[..., T], primals: tuple[Any, ...], tangents: tuple[Any, ...]
 ) -> tuple[T, T]:
     """A function's value, and its derivative along every column of the tangents."""
@@ -154,30 +154,30 @@ def _along_columns(
     )
 
 
-def _among_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "... columns"]:
+def _in_all_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "... columns"]:
     """Derivatives with respect to parameters and load offset, padded with zeros to all columns."""
     zero = jnp.zeros((*own.shape[:-1], 2))
     return jnp.concatenate([own[..., :count], zero, own[..., count:], zero], -1)
 
 
-def _begins(motor: Motor, own: RunUnknowns, tape: Tape) -> Starts:
+def _initial_states(motor: Motor, own: RunUnknowns, tape: Tape) -> Starts:
     """Initial state of the run of each block."""
     first = jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs))
     load = jnp.asarray(tape.load)[first, 0] + own.load_offset
     state = motor.initial_state(own.current, own.speed, load, own.angle)
-    wound = {
+    twisted = {
         e.spring_state: state.extra[e.spring_state] + own.twist
         for e in motor.effects
         if e.spring_state
     }
-    return _pack(state._replace(extra=state.extra | wound)).T[tape.run]
+    return _pack(state._replace(extra=state.extra | twisted)).T[tape.run]
 
 
-def _guess(motor: Motor, own: RunUnknowns, tape: Tape, begins: Starts) -> Starts:
+def _guessed_starts(motor: Motor, own: RunUnknowns, tape: Tape, initial: Starts) -> Starts:
     """Guessed starts of the blocks: current and speed as measured there, or else as the run begins, and the angle from
     the measured speed."""
     known = (tape.weight[:, :, 0] > 0).T
-    current, speed = jnp.where(known, tape.measured[:, :, 0].T, begins[:, :2].T)
+    current, speed = jnp.where(known, tape.measured[:, :, 0].T, initial[:, :2].T)
     length = jnp.asarray(tape.sample_time)[tape.grid]
     by_speed = tape.measured[:, 1] * tape.weight[:, 1] * length[:, None]
     turned = jnp.cumsum(jnp.where(jnp.isnan(tape.turn), by_speed, tape.turn).sum(-1))
@@ -186,56 +186,65 @@ def _guess(motor: Motor, own: RunUnknowns, tape: Tape, begins: Starts) -> Starts
     angle = own.angle[tape.run] + before[:-1] - before[first]
     load = jnp.asarray(tape.load)[:, 0] + own.load_offset[tape.run]
     guess = _pack(motor.initial_state(current, speed, load, angle)).T
-    return jnp.where(jnp.asarray(tape.begins)[:, None], begins, guess)
+    return jnp.where(jnp.asarray(tape.begins)[:, None], initial, guess)
 
 
-# Starts of the last pass, joined starts, that pass (None where only the shapes of its results are wanted), largest
-# relative gap that it left, and number of passes
-Joining = tuple[Starts, Starts, Any, Float[Array, ""], Int[Array, ""]]
+class Joining(NamedTuple):
+    """How far the blocks are joined."""
+
+    starts: Starts  # of the last pass
+    joined: Starts  # those at which every block begins where the one before it ended
+    last: Pass
+    gap: Float[Array, ""]  # largest relative gap that the last pass left
+    passes: Int[Array, ""]
 
 
-def _join(
+def _join_blocks(
     prepared: Prepared,
-    still: Prepared,
     tape: Tape,
     own: RunUnknowns,
-    begins: Starts,
-    most: int | None = None,
-) -> tuple[Starts, Starts, Pass]:
-    """Joined starts, at which every block begins where the one before it ended; starts of the last pass; and that pass.
+    initial: Starts,
+    max_passes: int | None = None,
+) -> Joining:
+    """Simulate all blocks until every block begins where the one before it ended.
 
-    `still` are the derivatives of the prepared motor with respect to the starts, all zero. The joined starts are NaN if
-    `most` passes are not enough.
+    The joined starts are NaN if `max_passes` are not enough.
     """
-    motor = prepared[0]
-    guess = _guess(motor, own, tape, begins)
+    motor, states = prepared[0], initial.shape[1]
+    # of the prepared motor with respect to the starts
+    no_derivatives = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
+    guess = _guessed_starts(motor, own, tape, initial)
     # the correction of a single pass joins a linear motor exactly; otherwise every pass makes at least one more block
     # of each run exact, so this ends for any motor
     exact = motor.affine and not motor.switches
-    passes = 1 if exact else min(most or len(guess) + 1, len(guess) + 1)
+    allowed = 1 if exact else min(max_passes or len(guess) + 1, len(guess) + 1)
 
-    def unjoined(carry: Joining) -> Bool[Array, ""]:
-        *_, gap, passed = carry
-        return (gap > JOINED) & (passed < passes)
+    def simulate(starts: Starts) -> Pass:
+        return _simulate_blocks(prepared, no_derivatives, states, tape, starts, own.load_offset)
 
-    def again(carry: Joining) -> Joining:
-        _, starts, _, _, passed = carry
-        run = _pass(prepared, still, begins.shape[1], tape, starts, own.load_offset)
-        size = jnp.max(jnp.abs(jnp.concatenate([starts, run.end])), axis=0) + 1e-6
-        joined = _stitch(run, tape, starts, begins, None if exact else (size, _recurrence(motor)))
-        return starts, joined, run, jnp.max(jnp.abs(joined - starts) / size), passed + 1
+    def unjoined(joining: Joining) -> Bool[Array, ""]:
+        return (joining.gap > MAX_RELATIVE_GAP) & (joining.passes < allowed)
 
-    shapes = jax.eval_shape(again, (guess, guess, None, 0.0, 0))[2]
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    carry = (guess, guess, nothing, jnp.asarray(jnp.inf), jnp.asarray(0))
-    starts, joined, run, gap, _ = jax.lax.while_loop(unjoined, again, carry)
-    if most is not None and not exact:
-        joined = jnp.where(gap > JOINED, jnp.nan, joined)
-    return joined, starts, run
+    def improve(joining: Joining) -> Joining:
+        starts = joining.joined
+        last = simulate(starts)
+        size = jnp.max(jnp.abs(jnp.concatenate([starts, last.end])), axis=0) + 1e-6
+        limits = None if exact else (size, _state_periods(motor))
+        joined = _newton_correction(last, tape, starts, initial, limits)
+        gap = jnp.max(jnp.abs(joined - starts) / size)
+        return Joining(starts, joined, last, gap, joining.passes + 1)
+
+    shapes = jax.eval_shape(simulate, guess)
+    none_yet = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    start = Joining(guess, guess, none_yet, jnp.asarray(jnp.inf), jnp.asarray(0))
+    end = jax.lax.while_loop(unjoined, improve, start)
+    if max_passes is None or exact:
+        return end
+    return end._replace(joined=jnp.where(end.gap > MAX_RELATIVE_GAP, jnp.nan, end.joined))
 
 
-@eqx.filter_jit  # one trace serves `_join` and other callers with as many columns
-def _pass(
+@eqx.filter_jit  # one trace serves `_join_blocks` and other callers with as many columns
+def _simulate_blocks(
     prepared: Prepared,
     d_prepared: Prepared,
     columns: int,
@@ -248,9 +257,9 @@ def _pass(
     d_motor, d_grids = d_prepared
     # if there is one grid only, all blocks share its matrices: a copy for each would be read at every step
     grid = tape.grid if tape.sample_time.shape[0] > 1 else jnp.zeros(1, int)
-    along, drive = pick_grid(grids, tape, grid)
-    along = _blocks_last(along, 0)
-    d_along = _blocks_last(jax.tree.map(lambda leaf: leaf[:, grid], d_grids), 1)
+    propagator, drive = pick_grid(grids, tape, grid)
+    propagator = _blocks_last(propagator, 0)
+    d_propagator = _blocks_last(jax.tree.map(lambda leaf: leaf[:, grid], d_grids), 1)
     states, steps = starts.shape[1], steps_in_sample(motor, tape)
     offset = load_offset[tape.run]
     d_load = jnp.zeros(columns)
@@ -261,22 +270,24 @@ def _pass(
     turn = jnp.asarray(tape.turn).T
     rise = None if tape.rise is None else jnp.asarray(tape.rise).T
 
-    def advance(carry: Walk, k: Int[Array, ""]) -> Walk:
+    def advance(carry: Carry, k: Int[Array, ""]) -> Carry:
         state, d_state = carry.state
         rises = None if rise is None else rise[k]
 
-        def look_and_step(
-            motor: Motor, along: Propagator, state: State, load: Float[Array, " blocks"]
+        def observe_and_step(
+            motor: Motor, propagator: Propagator, state: State, load: Float[Array, " blocks"]
         ) -> tuple[State, Float[Array, "outputs blocks"]]:
             acting = Input(drive, value[k], load, rises)
-            after, mean = held_step_and_mean(motor, along, acting, state, steps)
-            seen = outputs(motor, along, acting, state, steps, mean)
+            after, mean = held_step_and_mean(motor, propagator, acting, state, steps)
+            seen = outputs(motor, propagator, acting, state, steps, mean)
             return _turned(state, after, turn[k]), seen
 
-        (state, seen), (d_state, d_seen) = _along_columns(
-            look_and_step, (motor, along, state, load[k]), (d_motor, d_along, d_state, d_load)
+        (state, seen), (d_state, d_seen) = _value_and_derivatives(
+            observe_and_step,
+            (motor, propagator, state, load[k]),
+            (d_motor, d_propagator, d_state, d_load),
         )
-        return Walk((state, d_state), (seen, d_seen))
+        return Carry((state, d_state), (seen, d_seen))
 
     state = _unpack(motor, starts.T)
     identity = (
@@ -285,16 +296,16 @@ def _pass(
         .set(jnp.eye(states)[:, :, None])
     )
     d_state = jax.vmap(lambda column: _unpack(motor, column))(identity)
-    reports = reports_of(along)
+    reports = reports_of(propagator)
     seen = (jnp.zeros((reports, len(starts))), jnp.zeros((columns, reports, len(starts))))
     saveat = diffrax.SaveAt(
         subs=[
-            diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: y.seen),
+            diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: y.output),
             diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: y.state),
         ]
     )
-    (seen, d_seen), (end, d_end) = walk(
-        HeldInput(advance), Walk((state, d_state), seen), BLOCK, saveat
+    (seen, d_seen), (end, d_end) = take_steps(
+        StepSolver(advance), Carry((state, d_state), seen), BLOCK, saveat
     )
     end, d_end = jax.tree.map(lambda leaf: leaf[0], (end, d_end))
     return Pass(seen, d_seen, _pack(end).T, jax.vmap(_pack)(d_end).swapaxes(1, 2))
@@ -309,18 +320,18 @@ def _turned(before: State, after: State, turn: Float[Array, " blocks"]) -> State
     return after._replace(extra={**after.extra, "angle": angle})
 
 
-def _stitch(
+def _newton_correction(
     passed: Pass,
     tape: Tape,
     starts: Starts,
-    begins: Starts,
+    initial: Starts,
     limits: tuple[Start, Start] | None = None,
 ) -> Starts:
     """Newton's correction: each block starts where the corrected one before it ends.
 
     Far from the solution Newton's linear extrapolation overshoots. Therefore `limits`, the sizes and the periods of the
-    states (see `_recurrence`): a change of a start by whole periods is passed on to the end of the block unchanged, and
-    any other change may not grow along the block, because the influence of a start decays.
+    states (see `_state_periods`): a change of a start by whole periods is passed on to the end of the block unchanged,
+    and any other change may not grow along the block, because the influence of a start decays.
     """
     by_start = jnp.moveaxis(passed.d_end[-starts.shape[1] :], 0, -1)
 
@@ -336,14 +347,14 @@ def _stitch(
         size, period = limits
         whole = jnp.where(period > 0, jnp.round(change / jnp.where(period > 0, period, 1.0)), 0.0)
         part = change - whole * period
-        most = size * jnp.max(jnp.abs(part) / size)
-        return passed_end + whole * period + jnp.clip(jacobian @ part, -most, most), new
+        largest = size * jnp.max(jnp.abs(part) / size)
+        return passed_end + whole * period + jnp.clip(jacobian @ part, -largest, largest), new
 
-    blocks = (begins, jnp.asarray(tape.begins), passed.end, by_start, starts)
+    blocks = (initial, jnp.asarray(tape.begins), passed.end, by_start, starts)
     return jax.lax.scan(follow, jnp.zeros_like(starts[0]), blocks)[1]
 
 
-def _recurrence(motor: Motor) -> Float[Array, " states"]:
+def _state_periods(motor: Motor) -> Float[Array, " states"]:
     """Period of each state: a shift by it changes nothing else. Zero without one."""
     known = {name: p for effect in motor.effects for name, p in effect.repeats_after().items()}
     return jnp.stack(
@@ -352,47 +363,47 @@ def _recurrence(motor: Motor) -> Float[Array, " states"]:
 
 
 # State at the start or end of a block, and its derivatives with respect to all columns
-WithTangents = tuple[Start, Float[Array, "states columns"]]
+WithDerivatives = tuple[Start, Float[Array, "states columns"]]
 
 
-def _stitch_tangents(
+def _newton_correction_with_derivatives(
     passed: Pass,
     tape: Tape,
     starts: Starts,
-    begins: Starts,
-    d_begins: Float[Array, "columns blocks states"],
+    initial: Starts,
+    d_initial: Float[Array, "columns blocks states"],
     count: int,
 ) -> tuple[Starts, Float[Array, "blocks states columns"]]:
-    """`_stitch` without limits, and the derivatives of the starts with respect to all columns."""
+    """`_newton_correction` without limits, and the derivatives of the starts with respect to all columns."""
     states = starts.shape[1]
     by_column = jnp.moveaxis(passed.d_end, 0, -1)
     by_start = by_column[..., -states:]
-    by_own = _among_columns(by_column[..., : count + 1], count)
+    by_own = _in_all_columns(by_column[..., : count + 1], count)
 
     def follow(
-        carry: WithTangents,
+        carry: WithDerivatives,
         block: tuple[
             Bool[Array, ""],
-            WithTangents,
+            WithDerivatives,
             Start,
             Float[Array, "states states"],
             Start,
             Float[Array, "states columns"],
         ],
-    ) -> tuple[WithTangents, WithTangents]:
+    ) -> tuple[WithDerivatives, WithDerivatives]:
         first, begin, passed_end, jacobian, start, own = block
         new, d_new = jax.tree.map(lambda a, b: jnp.where(first, a, b), begin, carry)
         return (passed_end + jacobian @ (new - start), jacobian @ d_new + own), (new, d_new)
 
-    at_begin = (begins, jnp.moveaxis(d_begins, 0, -1))
+    at_begin = (initial, jnp.moveaxis(d_initial, 0, -1))
     blocks = (jnp.asarray(tape.begins), at_begin, passed.end, by_start, starts, by_own)
     nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), at_begin)
     return jax.lax.scan(follow, nothing, blocks)[1]
 
 
-def _blocks_last(along: Propagator, axis: int) -> Propagator:
+def _blocks_last(propagator: Propagator, axis: int) -> Propagator:
     # as the batch axis, which comes after the two axes of the matrices
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), along)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), propagator)
 
 
 def _pad_columns(leaf: Float[Array, "parameters ..."], columns: int) -> Float[Array, "columns ..."]:

@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 # Durations of a push, as shares of a step, at which its response is evaluated: Chebyshev nodes
 SHARES = (1 - np.cos(np.pi * (np.arange(6) + 0.5) / 6)) / 2
-TO_POWERS = np.linalg.inv(np.vander(SHARES, increasing=True))
+POWERS_FROM_NODES = np.linalg.inv(np.vander(SHARES, increasing=True))
 
 
 def computed_once(values: T, always: Bool[Array, ""]) -> T:
@@ -46,7 +46,7 @@ def contact_response(
     at = SHARES.reshape(-1, *[1] * A[0, 0].ndim)
     _, (_, phi1) = phi_functions(step * at * A[:, :, None], 1)
     pushed = step * (phi1 * push[None, :, None]).sum(1)
-    return jnp.einsum("pn,in...->pi...", TO_POWERS, pushed)
+    return jnp.einsum("pn,in...->pi...", POWERS_FROM_NODES, pushed)
 
 
 def contact_correction(
@@ -70,30 +70,35 @@ def contact_correction(
     touched = start.touch
     side = jnp.where(touched, start.side, effect.teeth(after).side)
 
-    def stand(state: State) -> Float[Array, "2 *#batch"]:
+    def overlap_and_compression(state: State) -> Float[Array, "2 *#batch"]:
         teeth = effect.teeth(state, side)
         return jnp.stack([teeth.overlap, teeth.compression])
 
-    first, slope = jax.jvp(stand, (before,), (rate,))
-    last, slope = stand(after), slope * step
-    bend = last - first - slope
+    first, slope = jax.jvp(overlap_and_compression, (before,), (rate,))
+    last, slope = overlap_and_compression(after), slope * step
+    quadratic = last - first - slope
     # teeth touch once overlap and compression have both risen through zero, and part once compression falls through it
-    way = jnp.where(touched, -1.0, 1.0)
-    goes = (way * first < 0) & (way * last > 0)
-    root = jnp.sqrt(jnp.where(goes, slope**2 - 4 * bend * first, 1.0))
-    whens = jnp.where(goes, -2 * way * first / jnp.where(goes, way * slope + root, 1.0), 0.0)
-    when = jnp.where(touched, whens[1], jnp.max(whens, axis=0))
+    # (if only overlap has fallen, compression has done so and risen again: such a graze is taken to part at the start)
+    direction = jnp.where(touched, -1.0, 1.0)
+    crosses = (direction * first < 0) & (direction * last > 0)
+    root = jnp.sqrt(jnp.where(crosses, slope**2 - 4 * quadratic * first, 1.0))
+    denominator = jnp.where(crosses, direction * slope + root, 1.0)
+    # shares of the step
+    instants = jnp.where(crosses, -2 * direction * first / denominator, 0.0)
+    instant = jnp.where(touched, instants[1], jnp.max(instants, axis=0))
+    remaining = 1 - instant
     switches = jnp.where(touched, jnp.any(last <= 0, axis=0), jnp.all(last > 0, axis=0))
-    left = 1 - when
-    new = jnp.where(switches, way * side, 0.0)
-    torque = new * (first[1] + when * (slope[1] + when * bend[1]))
-    rise, bend = new * (slope[1] + 2 * when * bend[1]), new * 2 * bend[1]
+    sign = jnp.where(switches, direction * side, 0.0)
+    torque = sign * (first[1] + instant * (slope[1] + instant * quadratic[1]))
+    torque_slope = sign * (slope[1] + 2 * instant * quadratic[1])
+    torque_curvature = sign * 2 * quadratic[1]
     # the torque varies as a parabola: the response to a constant one, integrated once for its slope and twice for its
     # curvature
-    sizes, power = [], left
+    sizes, power = [], remaining
     for p in range(1, len(contact) + 1):
-        sizes.append(power * (torque + left / (p + 1) * (rise + left / (p + 2) * bend)))
-        power = power * left
+        by_slope = torque_slope + remaining / (p + 2) * torque_curvature
+        sizes.append(power * (torque + remaining / (p + 1) * by_slope))
+        power = power * remaining
     sizes = computed_once(sizes, jnp.all(step > 0))
     by_state = jnp.moveaxis(contact, 1, 0)
     return tuple(
@@ -107,8 +112,8 @@ def stick_or_reverse(
     grips: tuple[Grip, Grip],
     before: tuple[Scalars, ...],
     after: tuple[Scalars, ...],
-    begun: Scalars,
-    push: Float[Array, "n *#batch"],
+    start_force: Scalars,
+    response: Float[Array, "n *#batch"],
     decay: Scalars,
 ) -> tuple[Scalars, ...]:
     """Correct a step in which the state that a dry element acts on reaches zero, or starts there.
@@ -117,9 +122,9 @@ def stick_or_reverse(
     within its limits, brings the state to zero at the end: if the limits allow it, the state sticks at exactly zero.
 
     **Arguments**: `row`, the index of the state; `grips`, the limits at zero and at the end of the step; `before`,
-    `after`, the state vector at both ends of the uncorrected step; `begun`, the driving torque (N m) or voltage (V) at
-    the start; `push`, what a unit of it over the whole step adds to the state vector; `decay`, the decay rate of the
-    state times the step.
+    `after`, the state vector at both ends of the uncorrected step; `start_force`, the driving torque (N m) or voltage
+    (V) at the start; `response`, what a unit of it over the whole step adds to the state vector; `decay`, the decay
+    rate of the state times the step.
 
     **Source**: time-stepping with set-valued forces, Moreau (1988), doi:10.1007/978-3-7091-2624-0_1, with the
     response of the exact linear step in place of h / J.
@@ -130,24 +135,26 @@ def stick_or_reverse(
     fall = jnp.where(crosses & (direction != 0), before[row] - after[row], 1.0)
     share = jnp.where(direction == 0, 0.0, before[row] / fall)
     # response to a push over the rest of the step, relative to one over the whole step: the motion is exponential
-    rest = jnp.maximum((1.0 - share) / (1.0 + jnp.expm1(-decay) * share), 1e-12)
+    rest_response = jnp.maximum((1.0 - share) / (1.0 + jnp.expm1(-decay) * share), 1e-12)
     # the force that has opposed the motion so far, and the one that would bring the state to zero at the end; beyond
     # the limits at zero the state slides on, with the mean of the limits at both ends
-    hold, (backward, forward) = grips[0], jax.tree.map(lambda a, b: (a + b) / 2, *grips)
-    acting = jnp.where(direction > 0, forward, jnp.where(direction < 0, -backward, 0.0))
-    needed = acting + after[row] / (push[row] * rest)
-    taken = jnp.where(needed > hold.forward, forward, needed)
-    taken = jnp.where(needed < -hold.backward, -backward, taken)
-    taken = jnp.where(direction == 0, needed - _breakaway_excess(hold, begun, needed), taken)
-    change = jnp.where(crosses, (acting - taken) * rest, 0.0)
-    sticks = crosses & (taken == needed)
+    at_rest, (backward, forward) = grips[0], jax.tree.map(lambda a, b: (a + b) / 2, *grips)
+    opposing = jnp.where(direction > 0, forward, jnp.where(direction < 0, -backward, 0.0))
+    needed = opposing + after[row] / (response[row] * rest_response)
+    exerted = jnp.where(needed > at_rest.forward, forward, needed)
+    exerted = jnp.where(needed < -at_rest.backward, -backward, exerted)
+    exerted = jnp.where(
+        direction == 0, needed - _breakaway_excess(at_rest, start_force, needed), exerted
+    )
+    change = jnp.where(crosses, (opposing - exerted) * rest_response, 0.0)
+    sticks = crosses & (exerted == needed)
     # the other states respond only through this one, so with the square of the remaining time
-    mended = [x + push[k] * change * rest for k, x in enumerate(after)]
-    mended[row] = jnp.where(sticks, 0.0, after[row] + push[row] * change)
-    return tuple(mended)
+    corrected = [x + response[k] * change * rest_response for k, x in enumerate(after)]
+    corrected[row] = jnp.where(sticks, 0.0, after[row] + response[row] * change)
+    return tuple(corrected)
 
 
-def mended_mean(before: Scalars, unmended: Scalars, mended: Scalars) -> Scalars:
+def mean_correction(before: Scalars, uncorrected: Scalars, corrected: Scalars) -> Scalars:
     """Change of the mean speed over a step due to the correction of its end.
 
     The change grows linearly from the instant at which the speed reaches zero, or from the middle of the step where
@@ -155,23 +162,23 @@ def mended_mean(before: Scalars, unmended: Scalars, mended: Scalars) -> Scalars:
 
     **Arguments**: the speed at the start of the step, and at its end without and with the correction.
     """
-    crosses = before * unmended <= 0
-    fall = jnp.where(crosses & (before != 0), before - unmended, 1.0)
-    left = jnp.where(crosses, 1.0 - before / fall, 0.5)
-    return left / 2 * (mended - unmended)
+    crosses = before * uncorrected <= 0
+    fall = jnp.where(crosses & (before != 0), before - uncorrected, 1.0)
+    remaining = jnp.where(crosses, 1.0 - before / fall, 0.5)
+    return remaining / 2 * (corrected - uncorrected)
 
 
-def _breakaway_excess(hold: Grip, begun: Scalars, mean: Scalars) -> Scalars:
+def _breakaway_excess(at_rest: Grip, start: Scalars, mean: Scalars) -> Scalars:
     """Mean over the step of a force on a state at rest, as far as it exceeds what holds the state there.
 
-    The force varies linearly, from `begun` at the start through `mean` in the middle of the step; the state breaks
+    The force varies linearly, from `start` at the start through `mean` in the middle of the step; the state breaks
     loose at the instant at which the force exceeds the limit.
     """
-    end = 2 * mean - begun
+    end = 2 * mean - start
     toward = jnp.sign(end)
-    limit = jnp.where(end > 0, hold.forward, hold.backward)
+    limit = jnp.where(end > 0, at_rest.forward, at_rest.backward)
     beyond = jnp.maximum(toward * end - limit, 0.0)
-    rise = jnp.where(beyond > 0, toward * (end - begun), 1.0)
+    rise = jnp.where(beyond > 0, toward * (end - start), 1.0)
     at_once = jnp.maximum(toward * mean - limit, 0.0)
     later = beyond**2 / (2 * jnp.where(rise > 0, rise, 1.0))
-    return toward * jnp.where(toward * begun < limit, later, at_once)
+    return toward * jnp.where(toward * start < limit, later, at_once)

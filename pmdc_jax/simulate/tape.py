@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..motor import Drive
 from ..recording import OVER_LAST
-from .uneven import flows_on, mean_and_rise, pieces_of
+from .uneven import mean_and_rise, pieces_of, varies_linearly
 
 if TYPE_CHECKING:
     from ..recording import Recording
@@ -80,8 +80,8 @@ class Tape(eqx.Module):
         rises = straight or any(recording.uneven is not None for recording in recordings)
         averaged = any(recording.averaging is not None for recording in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
-        spare = _power_of_two(len(runs)) - len(runs)
-        blocks = _round_up(sum(run.blocks for run in runs) + spare)
+        empty_runs = _power_of_two(len(runs)) - len(runs)
+        blocks = _round_up(sum(run.blocks for run in runs) + empty_runs)
         tape = {
             "value": np.zeros((blocks, BLOCK)),
             "load": np.zeros((blocks, BLOCK)),
@@ -89,33 +89,33 @@ class Tape(eqx.Module):
             "weight": np.zeros((blocks, 2, BLOCK)),
             "turn": np.full((blocks, BLOCK), np.nan),
             "rise": np.zeros((blocks, BLOCK)) if rises else None,
-            "run": np.full(blocks, len(runs) + spare - 1),
+            "run": np.full(blocks, len(runs) + empty_runs - 1),
             "begins": np.zeros(blocks, bool),
             "grid": np.full(blocks, grids.index(runs[-1].grid)),
         }
         first = 0
         for index, run in enumerate(runs):
             part = slice(first, first + run.blocks)
-            tape["value"][part] = run.fill(run.value, hold=True)
-            tape["load"][part] = run.fill(run.load, hold=True)
+            tape["value"][part] = run.to_blocks(run.value, hold=True)
+            tape["load"][part] = run.to_blocks(run.load, hold=True)
             for channel, samples in enumerate((run.current, run.speed)):
                 missing = np.isnan(samples)
-                tape["measured"][part, channel] = run.fill(np.where(missing, 0.0, samples))
-                tape["weight"][part, channel] = run.fill(np.where(missing, 0.0, 1.0))
+                tape["measured"][part, channel] = run.to_blocks(np.where(missing, 0.0, samples))
+                tape["weight"][part, channel] = run.to_blocks(np.where(missing, 0.0, 1.0))
             if rises:
-                tape["rise"][part] = run.fill(run.rise)
+                tape["rise"][part] = run.to_blocks(run.rise)
             if follow:
-                tape["turn"][part] = run.fill(run.turn(), hold=True)
+                tape["turn"][part] = run.to_blocks(run.turn(), hold=True)
             tape["run"][part], tape["grid"][part] = index, grids.index(run.grid)
             tape["begins"][first] = True
             first += run.blocks
-        tape["run"][first : first + spare] = np.arange(len(runs), len(runs) + spare)
+        tape["run"][first : first + empty_runs] = np.arange(len(runs), len(runs) + empty_runs)
         # every block of padding begins anew, so that joining the blocks never waits for it
         tape["begins"][first:], tape["turn"][first:] = True, 0.0
 
         def of_runs(values: Iterable[float | Sequence[float]]) -> np.ndarray:
             known = np.array(list(values))
-            return np.append(known, np.zeros((spare, *known.shape[1:]), known.dtype), axis=0)
+            return np.append(known, np.zeros((empty_runs, *known.shape[1:]), known.dtype), axis=0)
 
         kinds, free = np.array([drive for _, drive, _ in grids]), np.array([f for *_, f in grids])
         return cls(
@@ -125,7 +125,7 @@ class Tape(eqx.Module):
                 *(np.where(kinds == kind, 1.0, 0.0) for kind in Drive._fields[:3]),
                 free=np.where(free, 1.0, 0.0),
             ),
-            initial=np.array([run.initial for run in runs] + spare * [(0.0, 0.0)]),
+            initial=np.array([run.initial for run in runs] + empty_runs * [(0.0, 0.0)]),
             averaging=of_runs(r.averaging or (0.0, 0.0) for r in recordings) if averaged else None,
             load_unknown=of_runs(
                 r.load is None and not unloaded and not r.held for r in recordings
@@ -190,11 +190,11 @@ class _Run:
         if drive == "voltage" and recording.current is not None:
             self.current = recording.current
         value = getattr(recording, drive)
-        goes_on = straight or flows_on(recording)
+        linear = straight or varies_linearly(recording)
         if recording.uneven is not None:
             self.value, self.rise = mean_and_rise(recording, pieces_of(recording, straight))
         else:
-            self.rise = np.diff(value, append=value[-1]) if goes_on else np.zeros(self.length)
+            self.rise = np.diff(value, append=value[-1]) if linear else np.zeros(self.length)
             self.value = value + self.rise / 2
         # rounded: two runs of one clock must share a grid even if their time stamps differ in the last bits
         self.grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held)
@@ -208,9 +208,9 @@ class _Run:
             return sample_time * ahead
         return sample_time * (self.speed + ahead) / 2
 
-    def fill(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
-        spare = self.blocks * BLOCK - self.length
-        return np.pad(samples, (0, spare), mode="edge" if hold else "constant").reshape(-1, BLOCK)
+    def to_blocks(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
+        padding = self.blocks * BLOCK - self.length
+        return np.pad(samples, (0, padding), mode="edge" if hold else "constant").reshape(-1, BLOCK)
 
 
 def _first(samples: np.ndarray | None) -> float:

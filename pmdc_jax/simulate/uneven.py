@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from ..recording import Recording
 
 # Closer eigenvalues are moved apart to this relative distance, which is then the relative error, too
-NEAR = 1e-7
+MIN_EIGENVALUE_GAP = 1e-7
 # Below this size of the argument a series is more accurate than the quotient
-SMALL = 3e-3
+SERIES_LIMIT = 3e-3
 
 
 class Pieces(NamedTuple):
@@ -34,7 +34,7 @@ class Pieces(NamedTuple):
     load: Float[np.ndarray, " pieces"]  # N m, zero where unknown
 
 
-def flows_on(run: Recording) -> bool:
+def varies_linearly(run: Recording) -> bool:
     """Whether the drive always varies linearly from sample to sample, as a measured current does."""
     return run.drive == "current"
 
@@ -47,8 +47,8 @@ def pieces_of(run: Recording, straight: bool) -> Pieces:
     begins, length = edges[:-1], np.diff(edges)
     even = np.searchsorted(run.time, begins, "right") - 1
     recorded = np.searchsorted(record.time, begins, "right") - 1
-    goes_on = straight or flows_on(run)
-    slopes = np.append(np.diff(drive) / np.diff(record.time), 0.0) * goes_on
+    linear = straight or varies_linearly(run)
+    slopes = np.append(np.diff(drive) / np.diff(record.time), 0.0) * linear
     slope = slopes[recorded]
     value = drive[recorded] + slope * (begins - record.time[recorded])
     load = np.zeros(len(record)) if record.load is None else record.load
@@ -61,9 +61,9 @@ def mean_and_rise(run: Recording, pieces: Pieces) -> tuple[np.ndarray, np.ndarra
     _, begins, length, even, value, slope, _ = pieces
     step, rise = run.sample_time, slope * length
     middle = begins + length / 2 - step / 2
-    whole = length * (value + rise / 2)
-    moment = whole * middle + length**2 * rise / 12
-    mean, first = (np.bincount(even, x, len(run)) / step for x in (whole, moment))
+    integral = length * (value + rise / 2)
+    moment = integral * middle + length**2 * rise / 12
+    mean, first = (np.bincount(even, x, len(run)) / step for x in (integral, moment))
     return mean, 12 * first / step
 
 
@@ -80,58 +80,61 @@ def seen_at_record(
     The contribution of effects is taken to grow in proportion to time within an even sample.
     """
     pieces = pieces_of(even, straight)
-    time, begins, length, at, value, slope, loads = pieces
+    time, begins, length, index, value, slope, loads = pieces
     mean, rise = mean_and_rise(even, pieces)
-    step, line = even.sample_time, mean - rise / 2
+    step, line_start, line_slope = even.sample_time, mean - rise / 2, rise / even.sample_time
     A, B = map(np.asarray, motor.state_space(drive))
     load = np.zeros(len(even)) if even.load is None else even.load
-    after, held, rising = _advances(A, np.concatenate([[step], begins, length]))
+    transition, constant, growing = _phi_responses(A, np.concatenate([[step], begins, length]))
+    # by which time: that of an even sample, from its start to that of a piece, and from there to the end of the piece
+    whole, to_start, within = slice(0, 1), slice(1, len(index) + 1), slice(len(index) + 1, None)
 
     def moved(by: slice, of: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-        """Linear motion from even samples `of` on, along the straight line, by some of the `_advances`."""
-        rate = seen[of] @ A.T + np.outer(line[of], B[:, 0]) + np.outer(load[of], B[:, 1])
-        bend = np.outer(rise[of] / step, B[:, 0])
-        return seen[of] + _times(held[by], rate) + _times(rising[by], bend)
+        """Linear motion from even samples `of` on, along the straight line, by some of the `_phi_responses`."""
+        rate = seen[of] @ A.T + np.outer(line_start[of], B[:, 0]) + np.outer(load[of], B[:, 1])
+        rate_slope = np.outer(line_slope[of], B[:, 0])
+        return seen[of] + _times(constant[by], rate) + _times(growing[by], rate_slope)
 
-    whole, beginning, along = slice(0, 1), slice(1, len(at) + 1), slice(len(at) + 1, None)
-    missed = seen[1:] - moved(whole, np.arange(len(seen) - 1))
-    missed = np.append(missed, np.zeros((1, 2)), 0)[at] * (begins / step)[:, None]
+    by_effects = seen[1:] - moved(whole, np.arange(len(seen) - 1))
+    by_effects = np.append(by_effects, np.zeros((1, 2)), 0)[index] * (begins / step)[:, None]
     # the response to the drive's difference from the straight line: over the pieces of an even sample, and then from
     # sample to sample
-    apart = value - line[at] - rise[at] * begins / step
-    pushed = np.outer(apart, B[:, 0]) + np.outer(loads - load[at], B[:, 1])
-    pushed = _times(held[along], pushed)
-    pushed += _times(rising[along], np.outer(slope - rise[at] / step, B[:, 0]))
-    before, within = _through_pieces(at, after[along], pushed, len(even))
-    otherwise = np.append(np.zeros((1, 2)), _accumulated(after[0], within)[:-1], 0)
-    reached = moved(beginning, at) + missed + before + _times(after[beginning], otherwise[at])
+    difference = value - line_start[index] - rise[index] * begins / step
+    rate = np.outer(difference, B[:, 0]) + np.outer(loads - load[index], B[:, 1])
+    response = _times(constant[within], rate)
+    response += _times(growing[within], np.outer(slope - line_slope[index], B[:, 0]))
+    in_sample, at_end = _through_pieces(index, transition[within], response, len(even))
+    carried_over = np.append(np.zeros((1, 2)), _accumulated(transition[0], at_end)[:-1], 0)
+    carried_over = _times(transition[to_start], carried_over[index])
+    reached = moved(to_start, index) + by_effects + in_sample + carried_over
     return reached[np.searchsorted(time, even.recorded.time)]
 
 
 def _through_pieces(
-    at: Int[np.ndarray, " pieces"],
-    after: Float[np.ndarray, "pieces 2 2"],
-    pushed: Float[np.ndarray, "pieces 2"],
+    index: Int[np.ndarray, " pieces"],
+    transition: Float[np.ndarray, "pieces 2 2"],
+    response: Float[np.ndarray, "pieces 2"],
     samples: int,
 ) -> tuple[Float[np.ndarray, "pieces 2"], Float[np.ndarray, "samples 2"]]:
     """States before each piece and at the end of each even sample, from rest at the start of that sample."""
-    state, before = np.zeros((samples, 2)), np.empty((len(at), 2))
-    nth = np.arange(len(at)) - np.searchsorted(at, at)
+    state, before = np.zeros((samples, 2)), np.empty((len(index), 2))
+    # pieces that come nth in their even sample are independent of one another
+    nth = np.arange(len(index)) - np.searchsorted(index, index)
     for n in range(nth.max() + 1):
         (here,) = np.nonzero(nth == n)
-        before[here] = state[at[here]]
-        state[at[here]] = _times(after[here], before[here]) + pushed[here]
+        before[here] = state[index[here]]
+        state[index[here]] = _times(transition[here], before[here]) + response[here]
     return before, state
 
 
 def _accumulated(
-    after: Float[np.ndarray, "2 2"], pushed: Float[np.ndarray, "samples 2"]
+    transition: Float[np.ndarray, "2 2"], response: Float[np.ndarray, "samples 2"]
 ) -> Float[np.ndarray, "samples 2"]:
-    """x(k) = `after` x(k - 1) + `pushed`(k) from rest, by sums over a number of samples that doubles each time."""
-    total, count = pushed.copy(), 1
+    """x(k) = `transition` x(k - 1) + `response`(k) from rest, by sums over spans of samples that double in length."""
+    total, count = response.copy(), 1
     while count < len(total):
-        total[count:] += total[:-count] @ after.T
-        after, count = after @ after, 2 * count
+        total[count:] += total[:-count] @ transition.T
+        transition, count = transition @ transition, 2 * count
     return total
 
 
@@ -139,7 +142,7 @@ def _times(matrices: Float[np.ndarray, "#n 2 2"], x: Float[np.ndarray, "n 2"]) -
     return np.einsum("nij,nj->ni", np.broadcast_to(matrices, (len(x), 2, 2)), x)
 
 
-def _advances(A: Float[np.ndarray, "2 2"], length: np.ndarray) -> list[np.ndarray]:
+def _phi_responses(A: Float[np.ndarray, "2 2"], length: np.ndarray) -> list[np.ndarray]:
     """Response over each length of time h to an initial state, to a constant rate, and to a rate that grows from zero
     by 1/s: phi_0, h phi_1 and h^2 phi_2 of A h, each (lengths, 2, 2).
 
@@ -148,23 +151,23 @@ def _advances(A: Float[np.ndarray, "2 2"], length: np.ndarray) -> list[np.ndarra
     **Source**: Higham, "Functions of Matrices" (2008), definition 1.4.
     """
     one, other = np.linalg.eigvals(A).astype(complex)
-    if abs(one - other) < NEAR * abs(one + other):  # critically damped
-        other = one * (1 + NEAR)
-    apart = (one - other) or 1.0
-    advances = []
+    if abs(one - other) < MIN_EIGENVALUE_GAP * abs(one + other):  # critically damped
+        other = one * (1 + MIN_EIGENVALUE_GAP)
+    distance = (one - other) or 1.0
+    responses = []
     for k in range(3):
         at_one, at_other = _phi(one * length, k), _phi(other * length, k)
-        slope = (at_one - at_other) / apart
+        slope = (at_one - at_other) / distance
         whole = at_one[:, None, None] * np.eye(2) + slope[:, None, None] * (A - one * np.eye(2))
-        advances.append(whole.real * length[:, None, None] ** k)
-    return advances
+        responses.append(whole.real * length[:, None, None] ** k)
+    return responses
 
 
 def _phi(z: np.ndarray, k: int) -> np.ndarray:
     """sum_j z^j / (j + k)!, k up to 2."""
     if k == 0:
         return np.exp(z)
-    small = np.abs(z) < SMALL
+    small = np.abs(z) < SERIES_LIMIT
     safe = np.where(small, 1.0, z)
     first = np.where(small, 1 + z / 2 + z**2 / 6 + z**3 / 24 + z**4 / 120, np.expm1(safe) / safe)
     if k == 1:

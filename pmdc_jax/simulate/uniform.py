@@ -10,10 +10,10 @@ from ..clock import GAP, is_even
 from ..errors import InputError
 from ..recording import OVER_LAST, Recording
 
-# Most ticks of an even clock per recorded sample
-MOST = 20
+# More ticks of the even clock per recorded sample mean that the record has long gaps
+MAX_TICKS_PER_SAMPLE = 20
 # An even clock is good enough if this share of the samples has ticks of their own, relative to the best clock
-ALIKE = 0.98
+MIN_TICK_SHARE = 0.98
 
 
 def uniform(recording: Recording) -> Recording:
@@ -25,7 +25,7 @@ def uniform(recording: Recording) -> Recording:
     missing (NaN). The record is kept as `uneven`. A rotor that stands still throughout is taken as held, because its
     speed tells nothing.
 
-    **Raises**: `InputError` if gaps are so long that the grid has more than `MOST` ticks per sample.
+    **Raises**: `InputError` if gaps are so long that the grid has more than `MAX_TICKS_PER_SAMPLE` ticks per sample.
     """
     if recording.stands_still:
         recording = attrs.evolve(recording, speed=None, angle=None, held=True)
@@ -36,13 +36,13 @@ def uniform(recording: Recording) -> Recording:
             speed = np.diff(angle, prepend=np.nan) / recording.sample_time
             recording = attrs.evolve(recording, speed=speed, averaging=OVER_LAST)
         else:
-            recording = attrs.evolve(recording, speed=_slope(angle, time))
+            recording = attrs.evolve(recording, speed=_spline_derivative(angle, time))
     if even:
         return attrs.evolve(recording, time=np.linspace(time[0], time[-1], len(time)))
-    grid = _even_clock(time)
+    grid = _resampling_clock(time)
     held = {"voltage": recording.voltage, "load": recording.load, "torque": recording.torque}
     seen = {"current": recording.current, "speed": recording.speed}
-    if len(grid) > MOST * len(time):
+    if len(grid) > MAX_TICKS_PER_SAMPLE * len(time):
         steps = np.diff(time)
         longest = int(np.argmax(steps))
         raise InputError(
@@ -56,25 +56,29 @@ def uniform(recording: Recording) -> Recording:
         angle=None,
         temperature=None,
         uneven=recording,
-        **{k: _average(time, x, grid) for k, x in held.items() if x is not None},
+        **{k: _interval_means(time, x, grid) for k, x in held.items() if x is not None},
         **{k: _interpolate(time, x, grid) for k, x in seen.items() if x is not None},
     )
 
 
-def _even_clock(time: np.ndarray) -> np.ndarray:
+def _resampling_clock(time: np.ndarray) -> np.ndarray:
     """An even clock that starts at the first sample. Its step is the mean step of time without gaps, or the median,
     whichever gives more samples a tick of their own. The mean is rounded to two digits where that hardly matters, and
     otherwise to three like the median, so that runs of one clock share a grid."""
-    steps, passed = np.diff(time), time - time[0]
+    steps, elapsed = np.diff(time), time - time[0]
     typical = np.median(steps)
     mean = np.mean(steps[steps <= GAP * typical])
-    likely = [float(x) for x in (f"{mean:.2g}", f"{mean:.3g}", f"{typical:.3g}")]
-    own = [len(np.unique(np.rint(passed / step))) for step in likely]
-    step = next(x for x, ticks in zip(likely, own, strict=True) if ticks >= ALIKE * max(own))
-    return time[0] + step * np.arange(np.ceil(passed[-1] / step - 1e-9) + 1)
+    candidates = [float(x) for x in (f"{mean:.2g}", f"{mean:.3g}", f"{typical:.3g}")]
+    distinct = [len(np.unique(np.rint(elapsed / step))) for step in candidates]
+    step = next(
+        x
+        for x, ticks in zip(candidates, distinct, strict=True)
+        if ticks >= MIN_TICK_SHARE * max(distinct)
+    )
+    return time[0] + step * np.arange(np.ceil(elapsed[-1] / step - 1e-9) + 1)
 
 
-def _average(time: np.ndarray, held: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _interval_means(time: np.ndarray, held: np.ndarray, grid: np.ndarray) -> np.ndarray:
     integral = np.concatenate([[0.0], np.cumsum(held[:-1] * np.diff(time))])
     ends = np.append(grid, 2 * grid[-1] - grid[-2])
     total = np.interp(ends, time, integral) + held[-1] * np.maximum(ends - time[-1], 0.0)
@@ -86,13 +90,13 @@ def _interpolate(time: np.ndarray, samples: np.ndarray, grid: np.ndarray) -> np.
     values = np.interp(grid, time[known], samples[known])
     # the known samples on either side of each grid point must not be too far apart
     right = np.clip(np.searchsorted(time[known], grid), 1, known.sum() - 1)
-    apart = time[known][right] - time[known][right - 1]
+    interval = time[known][right] - time[known][right - 1]
     step = grid[1] - grid[0]
-    values[(apart > GAP * step) | (grid > time[-1] + 1e-9 * step)] = np.nan
+    values[(interval > GAP * step) | (grid > time[-1] + 1e-9 * step)] = np.nan
     return values
 
 
-def _slope(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
+def _spline_derivative(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
     """The derivative of a cubic spline, rad/s: a difference would be a mean over two steps, which looks like a lag."""
     from scipy.interpolate import CubicSpline  # here, because it is slow to import
 
