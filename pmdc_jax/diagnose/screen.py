@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special, stats
 
 from ..effects import EFFECTS
-from ..identify.noise_model import Series, Whitener, plain, whitener
+from ..identify.noise_model import Series, Whitener, scaling_whitener, whitener
 from ..simulate import LOCAL
 from .candidates import Candidate
 from .effect_relations import unbalances
@@ -73,7 +73,7 @@ def screen(model: Model, library: Library) -> Screen:
     blocks, count = blocks_of(orders, parameters), sum(order for order, _ in orders)
     changes = chain(library.changes(tape, path), of_curves)
     rows = gathered(model, library.bare, path, changes, count)
-    as_they_are = plain([run.fit.residual for run in rows])
+    as_they_are = scaling_whitener([run.fit.residual for run in rows])
     unfiltered = _evidence(rows, as_they_are)
     found = Screen(
         evidence=unfiltered,

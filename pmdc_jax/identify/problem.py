@@ -18,7 +18,7 @@ from .whitening import Whitening
 
 # Derivative of an output by an unknown, in noise standard deviations, from which a simulation counts as failed: it is
 # so sensitive that rounding errors make its derivatives meaningless
-WILD = 1e12
+MAX_SENSITIVITY = 1e12
 
 
 class Unknowns(NamedTuple):
@@ -118,12 +118,12 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
         # without whitening and nuisance, so that the simulation, slow to compile, is compiled only once
         bare = replace(problem, whitening=None, nuisance=None)
         simulated = (_evaluate if bare.parameters.effects else _evaluate_linear)(bare, unknowns)
-        return weighed(problem, _less_nuisance(problem, simulated))
+        return whitened(problem, _without_nuisance(problem, simulated))
 
 
-def weighed(problem: Problem, plain: Evaluation) -> Evaluation:
+def whitened(problem: Problem, plain: Evaluation) -> Evaluation:
     """The evaluation with whitened residuals and derivatives, if the problem has a whitening filter."""
-    return plain if problem.whitening is None else _whitened(problem, plain)
+    return plain if problem.whitening is None else _apply_whitening(problem, plain)
 
 
 def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
@@ -132,7 +132,7 @@ def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
     scale = tape.weight / problem.noise[:, None]
     jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]
     residuals = (seen - tape.measured) * scale
-    wild = ~jnp.all(jnp.abs(jacobian) < WILD, (1, 2, 3)) & problem.fitted_runs[tape.run]
+    wild = ~jnp.all(jnp.abs(jacobian) < MAX_SENSITIVITY, (1, 2, 3)) & problem.fitted_runs[tape.run]
     return Evaluation(seen, jnp.where(wild[:, None, None], jnp.inf, residuals), jacobian)
 
 
@@ -140,7 +140,7 @@ def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
 _evaluate, _evaluate_linear = compiled(_evaluated), quickly_compiled(_evaluated)
 
 
-def _less_nuisance(problem: Problem, plain: Evaluation) -> Evaluation:
+def _without_nuisance(problem: Problem, plain: Evaluation) -> Evaluation:
     """The evaluation with residuals and derivatives orthogonal to the responses to the nuisance parameters, if any."""
     return plain if problem.nuisance is None else _orthogonal(problem, plain)
 
@@ -166,7 +166,7 @@ def _orthogonal(problem: Problem, plain: Evaluation) -> Evaluation:
 
 
 @compiled
-def _whitened(problem: Problem, plain: Evaluation) -> Evaluation:
+def _apply_whitening(problem: Problem, plain: Evaluation) -> Evaluation:
     both = jnp.concatenate([plain.jacobian, plain.residuals[..., None]], -1)
     assert problem.whitening is not None
     both = problem.whitening(both * problem.noise[:, None, None], problem.tape.run)
@@ -182,12 +182,12 @@ def normal_matrix(
     both = jnp.concatenate([jacobian, r[..., None]], -1)
     of_block = jnp.einsum("bcsi,bcsj->bij", both, both)
     of_run = jax.ops.segment_sum(of_block, tape.run, tape.runs) * fitted_runs[:, None, None]
-    index = _columns(jacobian.shape[-1] - LOCAL, tape.runs)
+    index = _column_indices(jacobian.shape[-1] - LOCAL, tape.runs)
     size = index.max() + 1
     return jnp.zeros((size, size)).at[index[:, :, None], index[:, None, :]].add(of_run)
 
 
-def _columns(count: int, runs: int) -> np.ndarray:
+def _column_indices(count: int, runs: int) -> np.ndarray:
     """Indices of each run's columns among all unknowns and the residual."""
     own = count + LOCAL * np.arange(runs)[:, None] + np.arange(LOCAL)
     shared = np.broadcast_to(np.arange(count), (runs, count))

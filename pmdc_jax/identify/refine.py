@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from ..compiled import quickly_compiled
 from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
-STEPS = 60
+MAX_STEPS = 60
 
 
 class Optimum(NamedTuple):
@@ -85,7 +85,7 @@ def _levenberg_marquardt(
         optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),  # pyright: ignore[reportArgumentType]
         jnp.where(scale > 0, begun / jnp.where(scale > 0, scale, 1.0), 0.0),
         args=(problem, begun, scale, size),
-        max_steps=STEPS,
+        max_steps=MAX_STEPS,
         throw=False,
     )
     ended = _unscaled(problem, solution.value, begun, scale)

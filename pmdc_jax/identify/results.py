@@ -12,29 +12,29 @@ from ..motor import PARAMETERS, Motor
 from ..recording import OVER_BOTH, OVER_LAST, Recording
 from ..simulate import RunUnknowns, Tape
 from ..threads import side_by_side
-from .identifiability import SHARE, explain
+from .identifiability import MIN_SHARE, explain_directions
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import noise_of_sensor, white_noise
 from .parameters import Parameters, unit_of
 from .polish import Fit, fit_run_unknowns, polish
 from .prepare import Prepared
 from .problem import Problem
-from .profile import QUADRATIC, profile_interval
+from .profile import QUADRATIC_STDERR, profile_interval
 from .refine import Optimum
-from .solve import SAME, Solved
-from .uncertainty import FLAT, Information, information_of
+from .solve import FITNESS_TOLERANCE, Solved
+from .uncertainty import MIN_UNSEEN_STDERR, Information, information_of
 
 TIE_ITERATIONS = 3
 # Residuals this many times their white noise are reported
-MISSED = 2.0
+MAX_RESIDUAL_RATIO = 2.0
 # Units of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
 # Spans over which a speed may be averaged
-MEANS = {OVER_LAST: "the last sample", OVER_BOTH: "the last and the next sample"}
+AVERAGING_SPANS = {OVER_LAST: "the last sample", OVER_BOTH: "the last and the next sample"}
 # A parameter is unseen by itself if at least this share of it lies in unseen directions
-ALONE = 0.99
+MIN_UNSEEN_SHARE = 0.99
 # A parameter is visible if it changes the outputs by this share of what the most sensitive one does
-TO_SHOW = 0.3
+VISIBLE_SHARE = 0.3
 
 
 def results_of(given: Prepared, solved: Solved) -> Identification:
@@ -48,20 +48,20 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
     alike = [information_of(problem, fit) for fit in lifted if fit is not None]
     info = max(info, *alike, key=lambda i: i.unseen_share.sum()) if alike else info
     best = chosen.optimum
-    motor = _plain(parameters(best.unknowns.coordinates))
+    motor = _with_numpy_arrays(parameters(best.unknowns.coordinates))
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
     unknowns, ended = fit_run_unknowns(problem, best.unknowns)
-    fit = _fits(given.runs, given.roles, problem.tape, np.asarray(ended.seen), unknowns.runs)
+    fit = _run_fits(given.runs, given.roles, problem.tape, np.asarray(ended.seen), unknowns.runs)
     names, covariance = parameters.with_tied(info.covariance)
     noise = {
-        name: white_noise([left for _, left in _measured_and_left(fit, name)])
+        name: white_noise([left for _, left in _measured_and_residuals(fit, name)])
         for name in ("current", "speed")
     }
     return Identification(
         motor=motor,
         parameters=_estimates(parameters, best, info, given, _intervals(problem, best, info)),
-        unidentified_directions=explain(info.unseen, parameters, training),
+        unidentified_directions=explain_directions(info.unseen, parameters, training),
         fit=fit,
         noise={"current_A": noise["current"], "speed_rad_s": noise["speed"]},
         converged=best.converged,
@@ -72,7 +72,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
         covariance=covariance,
         covariance_names=names,
         messages=_messages(given, solved, chosen is not polished),
-        missed=_missed(fit),
+        missed=_large_residuals(fit),
     )
 
 
@@ -88,7 +88,7 @@ def _intervals(
         spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.interval_factor[k])
         # the refits of a profile would not reach as far along an unseen direction as the truth may lie
         hidden = info.unseen_variance[k] > info.covariance[k, k] / 2
-        sure = not problem.parameters.logarithmic[k] or spread < QUADRATIC
+        sure = not problem.parameters.logarithmic[k] or spread < QUADRATIC_STDERR
         if sure or hidden or leaps:
             return coordinates[k] - reach * spread, coordinates[k] + reach * spread
         return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
@@ -106,13 +106,17 @@ def _released_from_bounds(problem: Problem, polished: Fit) -> Fit:
 
     bound = polished.at_bound
     unseen = information_of(problem, released(())).unseen if bound else ()
-    several = [d for d in unseen if np.max(np.abs(d)) <= ALONE]
-    return released([k for k in bound if all(abs(d[k]) <= SHARE for d in several)])
+    several = [d for d in unseen if np.max(np.abs(d)) <= MIN_UNSEEN_SHARE]
+    return released([k for k in bound if all(abs(d[k]) <= MIN_SHARE for d in several)])
 
 
 def _invisible_alone(parameters: Parameters, info: Information) -> list[int]:
     """Positive parameters that change nothing by themselves, because they are nearly zero for example."""
-    return [int(k) for k in np.flatnonzero(info.unseen_share > ALONE) if parameters.logarithmic[k]]
+    return [
+        int(k)
+        for k in np.flatnonzero(info.unseen_share > MIN_UNSEEN_SHARE)
+        if parameters.logarithmic[k]
+    ]
 
 
 def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
@@ -125,7 +129,7 @@ def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
     jacobian = np.asarray(polished.evaluation.jacobian)[problem.fitted_blocks]
     lengths = np.sqrt(np.square(jacobian[..., : len(problem.free)]).sum((0, 1, 2)))
     coordinates = np.array(polished.coordinates)
-    coordinates[k] += np.log(TO_SHOW * lengths.max() / max(lengths[k], 1e-300))
+    coordinates[k] += np.log(VISIBLE_SHARE * lengths.max() / max(lengths[k], 1e-300))
     coordinates[k] = np.clip(
         coordinates[k], problem.parameters.lower[k], problem.parameters.upper[k]
     )
@@ -133,7 +137,7 @@ def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
     held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
     lifted = polish(held, polished.optimum._replace(unknowns=unknowns))
     # false where the simulation failed: its fitness is infinite
-    as_good = lifted.fitness <= polished.fitness * (1 + SAME)
+    as_good = lifted.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE)
     return polish(problem, lifted.optimum._replace(at_bound=()), steps=0) if as_good else None
 
 
@@ -158,10 +162,10 @@ def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit
         coordinates[k] = coordinates[b]
         unknowns = tidied.unknowns._replace(coordinates=jnp.asarray(coordinates))
         tidied = polish(held, tidied.optimum._replace(unknowns=unknowns))
-    return tidied if tidied.fitness <= best.fitness * (1 + SAME) else polished
+    return tidied if tidied.fitness <= best.fitness * (1 + FITNESS_TOLERANCE) else polished
 
 
-def _plain(motor: Motor) -> Motor:
+def _with_numpy_arrays(motor: Motor) -> Motor:
     return eqx.tree_at(
         lambda m: [getattr(m, name) for name in PARAMETERS],
         motor,
@@ -183,7 +187,7 @@ def _estimates(
     estimates = {}
     for name in names:
         unit, source = unit_of(name), ties.get(name, name)
-        if source in given.untouched and source not in given.known:
+        if source in given.irrelevant and source not in given.known:
             estimates[name] = Estimate(None, None, None, unit, "not_identifiable")
             continue
         value = parameters.value(name, coordinates)
@@ -209,12 +213,12 @@ def _estimates(
 def _status(k: int, best: Optimum, info: Information) -> Status:
     if k in best.at_bound:
         return "at_bound"
-    if info.unseen_share[k] > SHARE or np.sqrt(info.covariance[k, k]) > FLAT:
+    if info.unseen_share[k] > MIN_SHARE or np.sqrt(info.covariance[k, k]) > MIN_UNSEEN_STDERR:
         return "not_identifiable"
     return "identified"
 
 
-def _fits(
+def _run_fits(
     even: Sequence[Recording],
     roles: Sequence[Role],
     tape: Tape,
@@ -262,24 +266,27 @@ def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | 
     return float(100 * (1 - error / spread)) if spread > 0 else None
 
 
-def _measured_and_left(fit: Mapping[str, RunFit], name: str) -> list[tuple[np.ndarray, np.ndarray]]:
+def _measured_and_residuals(
+    fit: Mapping[str, RunFit], name: str
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """An output as measured and its residuals, in every training run that has it."""
     runs = [f for f in fit.values() if f.role == "train"]
     pairs = [(getattr(f, name), getattr(f, f"{name}_simulated")) for f in runs]
     return [(m, m - s) for m, s in pairs if m is not None and s is not None]
 
 
-def _missed(fit: Mapping[str, RunFit]) -> dict[str, float]:
-    """RMS of the residuals over the white noise of the runs, for the outputs for which it is above `MISSED`."""
+def _large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:
+    """RMS of the residuals over the white noise of the runs, for the outputs for which that exceeds
+    `MAX_RESIDUAL_RATIO`."""
     times = {}
     for name in ("current", "speed"):
         scaled = [
             left / noise
-            for measured, left in _measured_and_left(fit, name)
+            for measured, left in _measured_and_residuals(fit, name)
             if (noise := noise_of_sensor(measured, left))
         ]
         times[name] = _rms(np.concatenate(scaled)) if scaled else 0.0
-    return {name: much for name, much in times.items() if much > MISSED}
+    return {name: much for name, much in times.items() if much > MAX_RESIDUAL_RATIO}
 
 
 def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:
@@ -294,7 +301,8 @@ def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:
         messages.append(f"the voltage {acts}: it is taken for that")
     if given.averaging:
         messages.append(
-            f"the speed is a mean over {MEANS[given.averaging]}, as differences of an angle are: it is taken for that"
+            f"the speed is a mean over {AVERAGING_SPANS[given.averaging]}, as differences of an angle are: it is taken "
+            "for that"
         )
     if solved.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")

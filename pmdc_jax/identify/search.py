@@ -54,15 +54,15 @@ METHODS: Mapping[str, Method] = {
 }
 
 # A distribution starts from the best of this many candidates scattered over the bounds.
-SCATTERED = 256
+INITIAL_CANDIDATES = 256
 # ... with this standard deviation in the unit cube: the best of that many is not far from the optimum.
-SPREAD = 0.15
+INITIAL_SPREAD = 0.15
 
 # The search may stop once the best tenth of the population agree this well, in natural logarithms.
-AGREED = 0.1
+AGREEMENT = 0.1
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """The result of a search."""
 
     candidates: np.ndarray  # (kept, parameters) coordinates, best first
@@ -82,7 +82,7 @@ def search(
     population: int | None = None,
     generations: int | None = None,
     progress: ReportProgress | None = None,
-) -> Found:
+) -> SearchResult:
     """Search the bounds of `parameters` for motors that reproduce the tape.
 
     The fitness is the paper's equation (10), F1 + a F2 (mean square speed error plus a times mean square current
@@ -105,25 +105,25 @@ def search(
     fitness_of = _Fitness(parameters, tape, noise)
 
     kind, seeds = Kind(method, size, len(low)), np.asarray(seed)
-    start = _scattered(seed, SCATTERED if chosen.distribution else size, len(low))
+    start = _scattered(seed, INITIAL_CANDIDATES if chosen.distribution else size, len(low))
     seen = [(start, fitness_of.scattered(low + (high - low) * start, size))]
     if chosen.distribution:
-        asked, state = _begin(kind, seeds, start[np.argmin(seen[0][1])])
+        asked, state = _first_points(kind, seeds, start[np.argmin(seen[0][1])])
     else:
-        asked, state = _begin(kind, seeds, start, seen[0][1])
+        asked, state = _first_points(kind, seeds, start, seen[0][1])
 
     interrupted = False
     try:
         for generation in range(1, rounds):
             cube = np.asarray(asked)
             fitness = fitness_of(low + (high - low) * cube)
-            asked, state = _go_on(kind, seeds, np.asarray(generation), cube, fitness, state)
+            asked, state = _next_points(kind, seeds, np.asarray(generation), cube, fitness, state)
             seen.append((cube, fitness))
             if progress:
                 best = min(f.min() for _, f in seen)
                 progress(f"searching, generation {generation}", float(best), generation / rounds)
             elite = cube[np.argsort(fitness)[: size // 10 + 1]]
-            if generation > 10 and np.all(np.ptp((high - low) * elite, axis=0) < AGREED):
+            if generation > 10 and np.all(np.ptp((high - low) * elite, axis=0) < AGREEMENT):
                 break
     except KeyboardInterrupt:
         interrupted = True
@@ -149,14 +149,14 @@ Asked = tuple[Float[Array, "population dimensions"], Leaves]
 
 
 @quickly_compiled
-def _begin(kind: Kind, seed: Value, *start: Value) -> Asked:
+def _first_points(kind: Kind, seed: Value, *start: Value) -> Asked:
     """The first points of the unit cube to evaluate, (population, dimensions), and the state of the algorithm."""
     algorithm, settings = _algorithm(kind)
-    return _asked(kind, seed, 1, algorithm.init(jax.random.key(seed), *start, settings))
+    return _ask(kind, seed, 1, algorithm.init(jax.random.key(seed), *start, settings))
 
 
 @quickly_compiled
-def _go_on(
+def _next_points(
     kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Value, state: Leaves
 ) -> Asked:
     """The next points to evaluate, given the fitness of those of the `cube`, and the state of the algorithm."""
@@ -165,10 +165,10 @@ def _go_on(
     like = algorithm.init(jax.random.key(0), *start, settings)
     whole = jax.tree.unflatten(jax.tree.structure(like), state)
     whole, _ = algorithm.tell(_keys(seed, generation)[1], cube, fitness, whole, settings)
-    return _asked(kind, seed, generation + 1, whole)
+    return _ask(kind, seed, generation + 1, whole)
 
 
-def _asked(kind: Kind, seed: Value, generation: Value | int, state: State) -> Asked:
+def _ask(kind: Kind, seed: Value, generation: Value | int, state: State) -> Asked:
     algorithm, settings = _algorithm(kind)
     asked, state = algorithm.ask(_keys(seed, generation)[0], state, settings)
     return jnp.clip(asked, 0.0, 1.0), tuple(map(_strongly_typed, jax.tree.leaves(state)))
@@ -185,7 +185,7 @@ def _algorithm(kind: Kind) -> tuple[EvolutionaryAlgorithm, Params]:
     with jax.ensure_compile_time_eval():  # called within a trace, it must not cache tracers
         algorithm = method.algorithm()(kind.population, jnp.zeros(kind.dimensions))
         default = algorithm.default_params
-    return algorithm, default.replace(std_init=SPREAD) if method.distribution else default
+    return algorithm, default.replace(std_init=INITIAL_SPREAD) if method.distribution else default
 
 
 def _strongly_typed(leaf: Array) -> Array:
@@ -224,11 +224,11 @@ def _scattered(seed: int, size: int, dimensions: int) -> np.ndarray:
     return (strata + rng.random(strata.shape)) / size
 
 
-def _collect(seen: list, low: np.ndarray, high: np.ndarray, interrupted: bool) -> Found:
+def _collect(seen: list, low: np.ndarray, high: np.ndarray, interrupted: bool) -> SearchResult:
     cubes = np.concatenate([cube for cube, _ in seen])
     fitness = np.concatenate([f for _, f in seen])
     order = np.argsort(fitness, kind="stable")[:2000]
-    return Found(
+    return SearchResult(
         candidates=low + (high - low) * cubes[order],
         fitness=fitness[order],
         best=np.minimum.accumulate([f.min() for _, f in seen]),
