@@ -13,8 +13,8 @@ from .columns import QUANTITIES, Column, likely_quantity, match_columns, mixed_a
 from .errors import InputError
 from .files import replacing
 from .recording import (
-    DRIVES,
-    OUTPUTS_TOO,
+    NEEDED_TO_IDENTIFY,
+    NEEDED_TO_SIMULATE,
     Fault,
     Finding,
     Recording,
@@ -109,9 +109,9 @@ def _refuse_too_little(
         mend = f"Name it time_s, or map it by --column time=HEADER:UNIT; {seen}"
         raise InputError(where, "there is no time column", mend)
     if to_simulate and not is_driven(found):
-        what, needed, lacking = "nothing drives the motor in", DRIVES, "voltage"
+        what, needed, lacking = "nothing drives the motor in", NEEDED_TO_SIMULATE, "voltage"
     elif not to_simulate and not is_identifiable_from(found):
-        what, needed, lacking = "nothing to identify from", OUTPUTS_TOO, "speed"
+        what, needed, lacking = "nothing to identify from", NEEDED_TO_IDENTIFY, "speed"
     else:
         return
     mend = f"Needed beside time: {needed}. Map others by --column {lacking}=HEADER:UNIT; {seen}"

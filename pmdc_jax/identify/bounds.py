@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,12 +31,13 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
     R and the time constants that the sampling can show, or from that balance if it is larger there.
     """
     R, Kb, L = _crude_armature(recordings)
-    torque, speed, change, step, duration = _motion(recordings, Kb)
-    inertia = torque * np.sqrt(step * duration) / change
-    friction = torque / speed
+    typical = _typical_magnitudes(recordings, Kb)
+    time_constant = np.sqrt(typical.sample_time * typical.duration)
+    inertia = typical.torque * time_constant / typical.speed_change
+    friction = typical.torque / typical.speed
     return {
         "R": _crude_range(R),
-        "L": (R * step / 300, max(R * np.sqrt(step * duration), CRUDE_L_FACTOR * L)),
+        "L": (R * typical.sample_time / 300, max(R * time_constant, CRUDE_L_FACTOR * L)),
         "Kb": _crude_range(Kb),
         "Kt": _crude_range(Kb),
         "J": (inertia / CRUDE_FACTOR**2, inertia * CRUDE_FACTOR**2),
@@ -50,12 +52,12 @@ def effect_bounds(
     the recordings, and time constants that their length and sampling can show. Parameters in other units, or in that
     of a signal that was not recorded, keep the range of their table."""
     _, Kb, _ = _crude_armature(recordings)
-    torque, speed, _, step, duration = _motion(recordings, Kb)
+    typical = _typical_magnitudes(recordings, Kb)
     volts, amperes = (max(_largest_rms(recordings, n), 1e-9) for n in ("voltage", "current"))
     scales = {
-        "N m": 3 * torque,
-        "N m s^2/rad^2": 3 * torque / speed**2,
-        "rad/s": speed,
+        "N m": 3 * typical.torque,
+        "N m s^2/rad^2": 3 * typical.torque / typical.speed**2,
+        "rad/s": typical.speed,
         "V": volts,
         "A": amperes,
         "1/W": 1 / (volts * amperes),
@@ -69,10 +71,11 @@ def effect_bounds(
                 high = min(high, scales[given.unit])
                 low = max(low, high / DYNAMIC_RANGE if given.scale == "log" else -high)
             elif given.unit == "s":
-                low, high = max(low, step / 5), min(high, 3 * duration)
+                low, high = max(low, typical.sample_time / 5), min(high, 3 * typical.duration)
             # the range is empty if no signal of this unit was recorded
-            shown = (low, high) if low < high else (given.lower, given.upper)
-            bounds[f"{effect.name}.{field}"] = shown
+            bounds[f"{effect.name}.{field}"] = (
+                (low, high) if low < high else (given.lower, given.upper)
+            )
     return bounds
 
 
@@ -96,24 +99,33 @@ def _crude_armature(recordings: Sequence[Recording]) -> tuple[float, float, floa
         # a short-circuited motor shows only the ratio of R to Kb
         steady = (np.linalg.norm(voltage) or TYPICAL_KB * scale[1]) / scale
         # one that only stalls or only runs without load shows one of the two: the other is a guess
-        unseen = steady[1] if np.any(inputs[:, 1]) else TYPICAL_KB
-        return (R if R > 0 else steady[0]), (Kb if Kb > 0 else unseen), max(L, 0.0)
-    gains = [
+        guess = steady[1] if np.any(inputs[:, 1]) else TYPICAL_KB
+        return (R if R > 0 else steady[0]), (Kb if Kb > 0 else guess), max(L, 0.0)
+    volts_per_speed = [
         _rms(r.voltage) / _rms(r.speed)
         for r in recordings
         if r.voltage is not None and r.speed is not None
     ]
-    loads = [
+    volts_per_ampere = [
         _rms(r.voltage) / _rms(r.current)
         for r in recordings
         if r.voltage is not None and r.current is not None
     ]
-    Kb = float(np.median(gains)) if gains else TYPICAL_KB
-    return (float(np.median(loads)) / 3 if loads else 1.0), Kb, 0.0
+    Kb = float(np.median(volts_per_speed)) if volts_per_speed else TYPICAL_KB
+    return (float(np.median(volts_per_ampere)) / 3 if volts_per_ampere else 1.0), Kb, 0.0
 
 
-def _motion(recordings: Sequence[Recording], Kt: float) -> tuple[float, float, float, float, float]:
-    """Typical torque N m, speed rad/s and change of speed rad/s, shortest sample time s and longest duration s."""
+class _Typical(NamedTuple):
+    """Typical magnitudes of the recordings, the shortest sample time and the longest duration."""
+
+    torque: float  # N m
+    speed: float  # rad/s
+    speed_change: float  # rad/s
+    sample_time: float  # s
+    duration: float  # s
+
+
+def _typical_magnitudes(recordings: Sequence[Recording], Kt: float) -> _Typical:
     torque, speed, change = [1e-9], [1e-9], [1e-9]
     for run in recordings:
         if run.torque is not None:
@@ -128,9 +140,9 @@ def _motion(recordings: Sequence[Recording], Kt: float) -> tuple[float, float, f
         elif run.voltage is not None and not run.held:  # no-load speed
             speed.append(_rms(run.voltage) / Kt)
             change.append(_rms(run.voltage) / Kt)
-    step = min(run.sample_time for run in recordings)
-    duration = max(run.time[-1] - run.time[0] for run in recordings)
-    return max(torque), max(speed), max(change), step, duration
+    sample_time = min(run.sample_time for run in recordings)
+    duration = max(run.duration for run in recordings)
+    return _Typical(max(torque), max(speed), max(change), sample_time, duration)
 
 
 def _crude_range(value: float) -> tuple[float, float]:

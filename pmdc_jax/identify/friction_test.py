@@ -102,7 +102,7 @@ def _regression_columns(given: Prepared, fit: Fit) -> list[Series]:
         _, outputs = residual.kind
         friction = _load_response(filters[tape.grid_of(run)], np.sign(speed))
         if (averaging := given.runs[run].averaging) is not None:
-            friction[:, 1] = averaging.of(friction[:, 1])
+            friction[:, 1] = averaging.applied_to(friction[:, 1])
         friction = friction[:, list(outputs)]
         derivatives = series_of(tape, run, J).values
         columns = (derivatives[..., :count], friction, derivatives[..., count:], residual.values)

@@ -36,25 +36,25 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     bounds = {name: (value, value) for name, value in values.items() if name in PARAMETERS}
     for name, factor in factors.items():
         effect, _, field = name.partition(".")
-        its = next(e for e in parameters.effects if e.name == effect).ranges[field]
+        limits = next(e for e in parameters.effects if e.name == effect).ranges[field]
         bounds[name] = (
-            max(values[name] / factor, its.lower),
-            min(values[name] * factor, its.upper),
+            max(values[name] / factor, limits.lower),
+            min(values[name] * factor, limits.upper),
         )
     known = {name: float(value) for name, value in parameters.known.items()}
     known |= {name: value for name, value in values.items() if name not in factors}
-    sought = Parameters.of(bounds, parameters.effects, known, parameters.ties)
+    free = Parameters.of(bounds, parameters.effects, known, parameters.ties)
     # a fit that cannot be simulated has no finite noise
     noise = np.where(np.isfinite(fit.noise), fit.noise, problem.noise)
     found = search(
-        sought,
+        free,
         _worst_fitted_runs(problem, fit),
         noise,
         seed=seed,
         population=POPULATION,
         generations=GENERATIONS,
     )
-    places = [parameters.names.index(name) for name in sought.names]
+    places = [parameters.names.index(name) for name in free.names]
     for rank in TRIED_RANKS:
         coordinates[places] = found.candidates[rank]
         unknowns = fit.unknowns._replace(coordinates=jnp.asarray(coordinates))

@@ -17,7 +17,7 @@ from ..clock import evenly_stamped
 from ..effects import AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS
-from ..recording import OUTPUTS_TOO, Averaging, Finding, Recording
+from ..recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
 from ..recording_file import Runs, recordings_of
 from ..simulate import Tape, uniform
 from ..unmeasured import without_unmeasured
@@ -118,7 +118,7 @@ def prepare(
         raise InputError(
             "--known",
             "with every parameter known nothing is left to identify",
-            "Leave one out, R say: it then stays near its value, or tells that something is amiss",
+            "Leave one out, R say: it then stays near its value, or is_identifiable that something is amiss",
         )
     # hold-out runs are on the tape too, but only their own unknowns may be fitted to them
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True))
@@ -153,9 +153,11 @@ def _check_arguments(
     if not recordings:
         raise InputError("RUN", "there is no recording to fit", "Name at least one")
     for run in (*recordings, *holdout):
-        if not run.tells:
+        if not run.is_identifiable:
             what = f"nothing to identify from {', '.join(run.columns())}"
-            raise InputError(run.source or run.name, what, f"Needed beside time: {OUTPUTS_TOO}")
+            raise InputError(
+                run.source or run.name, what, f"Needed beside time: {NEEDED_TO_IDENTIFY}"
+            )
     names = [r.name for r in (*recordings, *holdout)]
     for name in names:
         if names.count(name) > 1:

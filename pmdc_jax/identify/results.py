@@ -33,20 +33,20 @@ UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
 AVERAGING_SPANS = {OVER_LAST: "the last sample", OVER_BOTH: "the last and the next sample"}
 # A parameter is unseen by itself if at least this share of it lies in unseen directions
 MIN_UNSEEN_SHARE = 0.99
-# A parameter is visible if it changes the outputs by this share of what the most sensitive one does
+# A refit makes a parameter visible: it then changes the outputs by this share of what the most sensitive one does
 VISIBLE_SHARE = 0.3
 
 
 def results_of(given: Prepared, solved: Solved) -> Identification:
     """The result of a fit: estimates with uncertainty and status, and the fit of every run."""
     problem, training = given.problem, given.training
-    polished = _released_from_bounds(problem, solved.fit)
+    released = _released_from_bounds(problem, solved.fit)
     parameters = problem.parameters
-    info = information_of(problem, polished)
-    chosen = _with_Kt_equal_Kb(problem, polished, info)
-    lifted = [_refit_with_visible(problem, chosen, k) for k in _invisible_alone(parameters, info)]
-    alike = [information_of(problem, fit) for fit in lifted if fit is not None]
-    info = max(info, *alike, key=lambda i: i.unseen_share.sum()) if alike else info
+    info = information_of(problem, released)
+    chosen = _with_Kt_equal_Kb(problem, released, info)
+    visible = [_refit_with_visible(problem, chosen, k) for k in _invisible_alone(parameters, info)]
+    others = [information_of(problem, fit) for fit in visible if fit is not None]
+    info = max([info, *others], key=lambda i: i.unseen_share.sum())
     best = chosen.optimum
     motor = _with_numpy_arrays(parameters(best.unknowns.coordinates))
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
@@ -71,7 +71,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
         findings=given.findings,
         covariance=covariance,
         covariance_names=names,
-        messages=_messages(given, solved, chosen is not polished),
+        messages=_messages(given, solved, Kt_set_to_Kb=chosen is not released),
         missed=_large_residuals(fit),
     )
 
@@ -82,14 +82,14 @@ def _intervals(
     """The 95 % intervals of the identified coordinates, in parallel on all cores."""
     coordinates = np.asarray(best.unknowns.coordinates)
     # teeth that meet at another moment change all that follows: the sum of squares jumps, and no profile is smooth
-    leaps = problem.parameters(best.unknowns.coordinates).toothed is not None
+    jumps = problem.parameters(best.unknowns.coordinates).toothed is not None
 
     def interval(k: int) -> tuple[float, float]:
         spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.interval_factor[k])
         # the refits of a profile would not reach as far along an unseen direction as the truth may lie
         hidden = info.unseen_variance[k] > info.covariance[k, k] / 2
-        sure = not problem.parameters.logarithmic[k] or spread < QUADRATIC_STDERR
-        if sure or hidden or leaps:
+        quadratic = not problem.parameters.logarithmic[k] or spread < QUADRATIC_STDERR
+        if quadratic or hidden or jumps:
             return coordinates[k] - reach * spread, coordinates[k] + reach * spread
         return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
 
@@ -135,10 +135,10 @@ def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
     )
     unknowns = polished.unknowns._replace(coordinates=jnp.asarray(coordinates))
     held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
-    lifted = polish(held, polished.optimum._replace(unknowns=unknowns))
+    refitted = polish(held, polished.optimum._replace(unknowns=unknowns))
     # false where the simulation failed: its fitness is infinite
-    as_good = lifted.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE)
-    return polish(problem, lifted.optimum._replace(at_bound=()), steps=0) if as_good else None
+    as_good = refitted.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE)
+    return polish(problem, refitted.optimum._replace(at_bound=()), steps=0) if as_good else None
 
 
 def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit:
@@ -147,7 +147,7 @@ def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit
     The direction is straight only locally, so all other free parameters are refined again; a fit that is worse then is
     rejected.
     """
-    names, best = problem.parameters.names, polished.optimum
+    names = problem.parameters.names
     if "Kt" not in names or "Kb" not in names:
         return polished
     k, b = names.index("Kt"), names.index("Kb")
@@ -155,14 +155,14 @@ def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit
     if not along:
         return polished
     held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
-    tidied = polished
+    moved = polished
     for _ in range(TIE_ITERATIONS):  # Kb moves a little as well
-        coordinates = np.array(tidied.coordinates)
+        coordinates = np.array(moved.coordinates)
         coordinates += along[0] * (coordinates[b] - coordinates[k]) / along[0][k]
         coordinates[k] = coordinates[b]
-        unknowns = tidied.unknowns._replace(coordinates=jnp.asarray(coordinates))
-        tidied = polish(held, tidied.optimum._replace(unknowns=unknowns))
-    return tidied if tidied.fitness <= best.fitness * (1 + FITNESS_TOLERANCE) else polished
+        unknowns = moved.unknowns._replace(coordinates=jnp.asarray(coordinates))
+        moved = polish(held, moved.optimum._replace(unknowns=unknowns))
+    return moved if moved.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE) else polished
 
 
 def _with_numpy_arrays(motor: Motor) -> Motor:
@@ -219,19 +219,19 @@ def _status(k: int, best: Optimum, info: Information) -> Status:
 
 
 def _run_fits(
-    even: Sequence[Recording],
+    runs: Sequence[Recording],
     roles: Sequence[Role],
     tape: Tape,
-    seen: np.ndarray,
+    simulated: np.ndarray,
     own: RunUnknowns,
 ) -> dict[str, RunFit]:
     # the speed as it was fitted: corrected for what the sensor added, without samples that do not count
     fitted = np.where(np.asarray(tape.weight) > 0, tape.measured, np.nan)[:, 1]
     fits = {}
-    for index, (run, role) in enumerate(zip(even, roles, strict=True)):
-        current, speed = (tape.samples_of(index, seen[:, c], len(run.time)) for c in range(2))
+    for index, (run, role) in enumerate(zip(runs, roles, strict=True)):
+        current, speed = (tape.samples_of(index, simulated[:, c], len(run)) for c in range(2))
         driven = run.drive == "voltage"
-        measured = None if run.speed is None else tape.samples_of(index, fitted, len(run.time))
+        measured = None if run.speed is None else tape.samples_of(index, fitted, len(run))
         fits[run.name] = RunFit(
             role=role,
             current_rmse=_rmse(run.current, current) if driven else None,
@@ -278,18 +278,18 @@ def _measured_and_residuals(
 def _large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:
     """RMS of the residuals over the white noise of the runs, for the outputs for which that exceeds
     `MAX_RESIDUAL_RATIO`."""
-    times = {}
+    ratios = {}
     for name in ("current", "speed"):
         scaled = [
             left / noise
             for measured, left in _measured_and_residuals(fit, name)
             if (noise := noise_of_sensor(measured, left))
         ]
-        times[name] = _rms(np.concatenate(scaled)) if scaled else 0.0
-    return {name: much for name, much in times.items() if much > MAX_RESIDUAL_RATIO}
+        ratios[name] = _rms(np.concatenate(scaled)) if scaled else 0.0
+    return {name: ratio for name, ratio in ratios.items() if ratio > MAX_RESIDUAL_RATIO}
 
 
-def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:
+def _messages(given: Prepared, solved: Solved, Kt_set_to_Kb: bool) -> tuple[str, ...]:
     messages = [
         f"{run.name}: the {run.drive} holds {given.input_noise[run.name]:.3g} {UNITS[run.drive]} of noise that the "
         "motor did not feel: it was taken out"
@@ -306,6 +306,6 @@ def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:
         )
     if solved.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
-    if tied:
+    if Kt_set_to_Kb:
         messages.append("Kt was set equal to Kb, as they are in SI, and J and f go with it")
     return tuple(messages)

@@ -42,7 +42,7 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
     tape, seen = problem.tape, np.asarray(fit.evaluation.seen)
     rotor = np.asarray(rotor_outputs(problem, fit))
     turn, run = np.array(tape.turn), np.asarray(tape.run)
-    length = np.asarray(tape.sample_time)[np.asarray(tape.grid)]
+    sample_time = np.asarray(tape.sample_time)[np.asarray(tape.grid)]
     for index in range(tape.runs):
         mine = (run == index) & ~np.isnan(turn).all(1)
         measured, weight = (
@@ -55,13 +55,14 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
         end = known[-1] + 1
         error = np.where(weight[:end] > 0, measured[:end] - simulated[:end], 0.0)
         speed = rotor[mine, 1].reshape(-1).copy()
-        time = np.cumsum(np.repeat(length[mine], turn.shape[1]))[:end]
-        missed = motion_in(error)
+        time = np.cumsum(np.repeat(sample_time[mine], turn.shape[1]))[:end]
+        unmodelled = motion_in(error)
         for effect in motor.effects:
-            missed = effect.speed_before_sensor(missed, time)
-        speed[:end] += missed
-        ahead = np.append(speed[1:], speed[-1])
-        turn[mine] = ((speed + ahead) / 2).reshape(turn[mine].shape) * length[mine, None]
+            unmodelled = effect.speed_before_sensor(unmodelled, time)
+        speed[:end] += unmodelled
+        following = np.append(speed[1:], speed[-1])
+        mean = ((speed + following) / 2).reshape(turn[mine].shape)
+        turn[mine] = mean * sample_time[mine, None]
     return eqx.tree_at(lambda p: p.tape.turn, problem, jnp.asarray(turn))
 
 

@@ -15,7 +15,7 @@ from .polish import Fit
 from .problem import Problem
 
 Z_95 = NormalDist().inv_cdf(0.975)  # of a 95 % interval, in standard errors
-# A direction with at least this standard error, of a logarithm, counts as unseen.
+# A direction with at least this standard error, of a logarithm, counts as unseen
 MIN_UNSEEN_STDERR = 0.5
 # Stretches into which a run is summed for its long-run variance. Measured on white and on three kinds of slow noise,
 # 60 x 6 runs of 5,000 samples each: 2,000 and 500 miss slow noise (standard errors down to a fifth), 50 scatters.
@@ -26,7 +26,7 @@ JACKKNIFE_PARTS = 10
 MAX_PART_SHARE = 0.9
 # Probability that white noise alone makes the parts disagree so much that the intervals follow them
 SIGNIFICANCE = 0.05
-# Standard deviation of a logarithm along an unseen direction: a factor of twenty
+# Largest standard error of a logarithm along an unseen direction: a factor of twenty
 MAX_UNSEEN_STDERR = 3.0
 
 
@@ -91,33 +91,41 @@ def information(
     scores: list[np.ndarray] = []
     parts: list[Part] = []
     for index in range(runs):
-        J = jacobian[run == index]
-        r = residuals[run == index]
-        own = J[..., count:].reshape(-1, LOCAL)
-        across = J[..., :count].reshape(-1, count)
-        # project the run's own unknowns out
-        taken = np.linalg.pinv(own.T @ own, hermitian=True) @ (own.T @ across)
-        across = (across - own @ taken).reshape(*J.shape[:-1], count)
+        J = _without_own_unknowns(jacobian[run == index])
         # samples in order, both outputs of an instant together
-        across = np.moveaxis(across, 1, 2).reshape(-1, 2, count)
-        scores.append(np.einsum("sci,sc->si", across, np.moveaxis(r, 1, 2).reshape(-1, 2)))
-        for J, score in zip(
-            *(np.array_split(x, JACKKNIFE_PARTS) for x in (across, scores[-1])), strict=True
-        ):
+        J, r = (np.moveaxis(x, 1, 2) for x in (J, residuals[run == index]))
+        J = J.reshape(-1, 2, count)
+        scores.append(np.einsum("sci,sc->si", J, r.reshape(-1, 2)))
+        split = (np.array_split(x, JACKKNIFE_PARTS) for x in (J, scores[-1]))
+        for J, score in zip(*split, strict=True):
             J = J.reshape(-1, count)
             parts.append(Part(J.T @ J, score.sum(0)))
     hessian = np.sum([part.hessian for part in parts], 0)
-    unseen, root, left_open = _split_by_visibility(hessian, free)
+    unseen, root, unseen_covariance = _split_by_visibility(hessian, free)
     inverse = root @ root.T
-    spread = np.asarray(sum(long_run_variance(score @ inverse) for score in scores))
+    long_run = np.asarray(sum(long_run_variance(score @ inverse) for score in scores))
     white = np.diag(inverse)
-    by_parts, reach = _jackknife(parts, root)
-    variance = np.maximum(np.maximum(np.diag(spread), white), by_parts)
-    stretch = np.sqrt(_ratio_or_one(variance, np.diag(spread)))
-    covariance = spread * stretch[:, None] * stretch
+    jackknife, interval_factor = _jackknife(parts, root)
+    variance = np.maximum(np.maximum(np.diag(long_run), white), jackknife)
+    stretch = np.sqrt(_ratio_or_one(variance, np.diag(long_run)))
     return Information(
-        covariance + left_open, _ratio_or_one(variance, white), reach, np.diag(left_open), unseen
+        covariance=long_run * stretch[:, None] * stretch + unseen_covariance,
+        inflation=_ratio_or_one(variance, white),
+        interval_factor=interval_factor,
+        unseen_variance=np.diag(unseen_covariance),
+        unseen=unseen,
     )
+
+
+def _without_own_unknowns(
+    jacobian: Float[np.ndarray, "blocks 2 samples columns"],
+) -> Float[np.ndarray, "blocks 2 samples parameters"]:
+    """Derivatives by the coordinates in a run, with those by the run's own unknowns projected out."""
+    count = jacobian.shape[-1] - LOCAL
+    own = jacobian[..., count:].reshape(-1, LOCAL)
+    shared = jacobian[..., :count].reshape(-1, count)
+    projection = np.linalg.pinv(own.T @ own, hermitian=True) @ (own.T @ shared)
+    return (shared - own @ projection).reshape(*jacobian.shape[:-1], count)
 
 
 def _ratio_or_one(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -151,7 +159,7 @@ def _split_by_visibility(
     Float[np.ndarray, "parameters seen"],
     Float[np.ndarray, "parameters parameters"],
 ]:
-    """The unseen directions; a root R of the inverse on the others, R R'; and the variance due to the unseen ones."""
+    """The unseen directions; a root R of the inverse on the others, R R'; and the covariance due to the unseen ones."""
     index = np.flatnonzero(free)
     values, vectors = np.linalg.eigh(hessian[np.ix_(index, index)])
     seen = values > max(1 / MIN_UNSEEN_STDERR**2, 1e-13 * values.max(initial=0.0))
@@ -159,9 +167,9 @@ def _split_by_visibility(
     full[index] = vectors
     root = full[:, seen] / np.sqrt(values[seen])
     # even a small component along an unseen direction adds to the variance of a parameter
-    open_ended = np.minimum(1 / np.maximum(values[~seen], 1e-300), MAX_UNSEEN_STDERR**2)
-    blind = (full[:, ~seen] * open_ended) @ full[:, ~seen].T
-    return tuple(full[:, k] for k in np.flatnonzero(~seen)), root, blind
+    variances = np.minimum(1 / np.maximum(values[~seen], 1e-300), MAX_UNSEEN_STDERR**2)
+    covariance = (full[:, ~seen] * variances) @ full[:, ~seen].T
+    return tuple(full[:, k] for k in np.flatnonzero(~seen)), root, covariance
 
 
 def long_run_variance(terms: Float[np.ndarray, "samples n"]) -> Float[np.ndarray, "n n"]:

@@ -120,7 +120,7 @@ def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
     """
     if run.drive != "voltage":
         return run.recorded
-    even = run.uneven is None
+    even = run.resampled_from is None
     voltage = tape.samples_of(k, tape.value, len(run)) if even else run.recorded.voltage
     run, last = run.recorded, len(run.recorded) - 1
     rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)

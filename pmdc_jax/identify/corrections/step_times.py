@@ -77,7 +77,12 @@ def with_step_times(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 def steps_of(run: Recording) -> Steps:
     """The voltage steps of a run that stand out, placed at samples."""
     at, height = np.zeros(0, int), np.zeros(0)
-    if run.drive == "voltage" and run.voltage is not None and run.uneven is None and len(run) > 3:
+    if (
+        run.drive == "voltage"
+        and run.voltage is not None
+        and run.resampled_from is None
+        and len(run) > 3
+    ):
         rise = np.diff(run.voltage)
         size = np.abs(rise)
         padded = np.pad(size, 1)
@@ -153,7 +158,7 @@ def _responses(
         begun = expm(A * step * np.clip(share, 0.0, 1.0)) @ B[:, 0] * step * height
         responses[at:, :, k] = after[: length - at] @ begun
     if tape.averaging is not None:
-        responses[:, 1] = Averaging(*np.asarray(tape.averaging)[run]).of(responses[:, 1])
+        responses[:, 1] = Averaging(*np.asarray(tape.averaging)[run]).applied_to(responses[:, 1])
     return np.moveaxis(responses.reshape(length // BLOCK, BLOCK, 2, len(steps.at)), 1, 2)
 
 

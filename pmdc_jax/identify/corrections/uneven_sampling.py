@@ -30,7 +30,7 @@ MAX_STEP_RATIO = 0.9
 def with_even_clock(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with every sample of an uneven clock shifted to the nearest even sample along the simulated motion, and
     the fit to them; both unchanged where all clocks are even."""
-    uneven = any(run.uneven is not None for run in given.runs)
+    uneven = any(run.resampled_from is not None for run in given.runs)
     last = None
     for _ in range(MAX_REFITS if uneven else 0):
         before, given = given, _shifted(given, fit)
@@ -68,7 +68,7 @@ def _shifted(given: Prepared, fit: Fit) -> Prepared:
     motor = given.problem.parameters(fit.coordinates)
     runs = []
     for k, run in enumerate(given.runs):
-        if run.uneven is not None:
+        if run.resampled_from is not None:
             now = np.stack([tape.samples_of(k, seen[:, c], len(run)) for c in range(2)], 1)
             then = seen_at_record(motor, tape.drive_of(k), run, now, given.straight)
             run = _nearest_samples(run, now, then)
