@@ -119,7 +119,7 @@ class Model:
     @property
     def misses(self) -> float:
         """Its residuals over what was measured, as root mean squares, for the output where that is larger."""
-        sizes = self.given.problem.sizes
+        sizes = self.given.problem.measured_rms
         there = sizes > 0
         return float(np.max(self.fit.noise[there] / sizes[there], initial=0.0))
 
@@ -146,7 +146,7 @@ def refit_from(effects: tuple[str, ...], given: Prepared, start: Optimum, white:
 
 def model_of(effects: tuple[str, ...], given: Prepared, polished: Fit) -> Model:
     """A fitted model, its rotor turned in each sample as recordings and fit together tell."""
-    if not given.problem.angular:  # with an effect of the angle, the fit has done this
+    if not given.problem.depends_on_angle:  # with an effect of the angle, the fit has done this
         given = given._replace(problem=with_rotor_angle(given.problem, polished))
     return Model(effects, given, polished)
 

@@ -362,7 +362,7 @@ def _turns(model: Model, effect: str) -> list[np.ndarray | None]:
     others = [e for e in model.motor.effects if "angle" in e.states and e.name != effect]
     count = round(2 * np.pi / float(others[0].repeats_after()["angle"])) if others else 0
     whole = 2 * np.pi * np.arange(count) / count if count else None
-    turnable = np.asarray(model.given.problem.turnable)
+    turnable = np.asarray(model.given.problem.angle_unknown)
     return [whole if turnable[run] else np.zeros(1) for run in model.training]
 
 

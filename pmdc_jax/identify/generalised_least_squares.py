@@ -43,7 +43,7 @@ def last_fit(given: Prepared, plain_fit: Fit, start: Fit, white: Whitener) -> tu
 def _is_exact(given: Prepared, fit: Fit) -> bool:
     """Whether the residuals are only rounding errors, as in a fit to a simulation without noise."""
     measured = given.problem.samples > 0
-    least = MIN_RELATIVE_NOISE * given.problem.sizes
+    least = MIN_RELATIVE_NOISE * given.problem.measured_rms
     return bool(np.all(fit.noise[measured] < 2 * least[measured]))
 
 

@@ -75,9 +75,9 @@ def _worst_fitted_runs(problem: Problem, fit: Fit) -> Tape:
     samples = np.cumsum(blocks[order]) * tape.value.shape[1]
     worst = runs[order[: max(1, np.searchsorted(samples, MAX_SAMPLES, side="right"))]]
     offset = jnp.where(tape.load_unknown, unknowns.runs.load_offset, 0.0)[tape.run]
-    begun = replace(
+    from_fit = replace(
         tape,
         load=tape.load + offset[:, None],
         initial=jnp.stack([unknowns.runs.current, unknowns.runs.speed], 1),
     )
-    return begun.of_runs(worst.tolist())
+    return from_fit.of_runs(worst.tolist())

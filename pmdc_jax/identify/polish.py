@@ -175,8 +175,8 @@ def _evaluate_weighted(
     return _WeightedPoint(unknowns, scaled, noise, matrix, cost, fitness)
 
 
-def best_backlash_start(problem: Problem, unknowns: Unknowns, begun: RunUnknowns) -> Unknowns:
-    """Each run's own unknowns as they are, or `begun` with the teeth of its gear elsewhere within the backlash,
+def best_backlash_start(problem: Problem, unknowns: Unknowns, start: RunUnknowns) -> Unknowns:
+    """Each run's own unknowns as they are, or `start` with the teeth of its gear elsewhere within the backlash,
     whichever fits the run best.
 
     No gradient leads there: the moment at which the teeth first meet changes all that follows, and a run that begins
@@ -184,8 +184,8 @@ def best_backlash_start(problem: Problem, unknowns: Unknowns, begun: RunUnknowns
     """
     motor = problem.parameters(unknowns.coordinates)
     play = sum(float(effect.play()) for effect in motor.effects)
-    middle = jnp.zeros_like(begun.twist)
-    trials = [begun._replace(twist=middle + share * play) for share in BACKLASH_STARTS if play]
+    middle = jnp.zeros_like(start.twist)
+    trials = [start._replace(twist=middle + share * play) for share in BACKLASH_STARTS if play]
     return _best_run_unknowns(problem, unknowns, trials)
 
 
@@ -197,7 +197,7 @@ def best_initial_angle(problem: Problem, unknowns: Unknowns) -> Unknowns:
     """
     waves = [e.repeats_after() for e in problem.parameters(unknowns.coordinates).effects]
     periods = [float(wave["angle"]) for wave in waves if "angle" in wave]
-    turnable = np.asarray(problem.turnable & ~jnp.asarray(problem.fitted_runs))
+    turnable = np.asarray(problem.angle_unknown & ~jnp.asarray(problem.fitted_runs))
     if not periods or not turnable.any():
         return unknowns
     count = min(round(ANGLES_PER_PERIOD * max(periods) / min(periods)), MAX_ANGLES)
@@ -205,8 +205,8 @@ def best_initial_angle(problem: Problem, unknowns: Unknowns) -> Unknowns:
     if len(periods) > 1:
         turns += [np.arange(1, round(2 * np.pi / period)) * period for period in periods]
     for some in turns:
-        begun = unknowns.runs
-        trials = [begun._replace(angle=begun.angle + turn * turnable) for turn in some]
+        own = unknowns.runs
+        trials = [own._replace(angle=own.angle + turn * turnable) for turn in some]
         unknowns = _best_run_unknowns(problem, unknowns, trials)
     return unknowns
 
@@ -336,6 +336,6 @@ def _residual_noise(
         return np.asarray(problem.noise), np.ones(2)
     noise = np.asarray(problem.noise)
     ratio = np.sqrt(squares / np.maximum(problem.samples, 1.0))
-    ratio = np.maximum(ratio, MIN_RELATIVE_NOISE * problem.sizes / noise)
+    ratio = np.maximum(ratio, MIN_RELATIVE_NOISE * problem.measured_rms / noise)
     ratio = np.where(ratio == 0, 1.0, ratio)
     return noise * ratio, 1 / ratio

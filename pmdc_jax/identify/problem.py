@@ -64,13 +64,13 @@ class Problem(eqx.Module):
         return max(float(self.samples.max()), 1.0)
 
     @property
-    def sizes(self) -> Float[np.ndarray, "2"]:
+    def measured_rms(self) -> Float[np.ndarray, "2"]:
         """Root mean square of each output as measured in the training runs; zero where it was not measured."""
         squares = np.square(np.asarray(self.tape.measured)[self.fitted_blocks]).sum((0, 2))
         return np.sqrt(squares / np.maximum(self.samples, 1.0))
 
     @property
-    def angular(self) -> bool:
+    def depends_on_angle(self) -> bool:
         """Whether a torque depends on the rotor's angle."""
         return any("angle" in effect.states for effect in self.parameters.effects)
 
@@ -80,7 +80,7 @@ class Problem(eqx.Module):
         return any(effect.spring_state for effect in self.parameters.effects)
 
     @property
-    def turnable(self) -> Bool[Array, " runs"]:
+    def angle_unknown(self) -> Bool[Array, " runs"]:
         """Which runs have an unknown initial rotor angle."""
         tape, known = self.tape, jnp.asarray(self.tape.angle_known)
         # if no angle is known, that of the first run is the reference for the phases
@@ -88,12 +88,12 @@ class Problem(eqx.Module):
         measured = jax.ops.segment_sum(jnp.sum(tape.weight, (1, 2)), tape.run, tape.runs) > 0
         return measured & ~known & ~zero
 
-    def moves(self) -> Bool[Array, "runs columns"]:
+    def determinable(self) -> Bool[Array, "runs columns"]:
         """Which coordinates and which of its own unknowns each run can determine."""
         tape = self.tape
         first = jnp.argmax(jnp.asarray(tape.run)[None, :] == jnp.arange(tape.runs)[:, None], axis=1)
         drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid][first] > 0, tape.drive)
-        angle = self.turnable & self.angular
+        angle = self.angle_unknown & self.depends_on_angle
         load = jnp.asarray(tape.load_unknown)
         twist = self.has_spring & drive.free
         own = jnp.stack([drive.voltage, drive.free, load, angle, twist], 1)
@@ -130,7 +130,7 @@ def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
     tape = problem.tape
     seen, jacobian = sensitivities(problem.parameters, unknowns.coordinates, tape, unknowns.runs)
     scale = tape.weight / problem.noise[:, None]
-    jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]
+    jacobian = jacobian * scale[..., None] * problem.determinable()[tape.run][:, None, None, :]
     residuals = (seen - tape.measured) * scale
     wild = ~jnp.all(jnp.abs(jacobian) < MAX_SENSITIVITY, (1, 2, 3)) & problem.fitted_runs[tape.run]
     return Evaluation(seen, jnp.where(wild[:, None, None], jnp.inf, residuals), jacobian)

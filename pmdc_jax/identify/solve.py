@@ -144,7 +144,7 @@ def polish_with_angle(
 ) -> tuple[Prepared, Fit]:
     """Polish; where a torque depends on the rotor angle, update the angle from the fit and repeat while that helps."""
     polished = polish(given.problem, end, known=known)
-    for _ in range(ANGLE_ITERATIONS if given.problem.angular else 0):
+    for _ in range(ANGLE_ITERATIONS if given.problem.depends_on_angle else 0):
         again = given._replace(problem=with_rotor_angle(given.problem, polished))
         better = polish(again.problem, polished.optimum)
         if not better.fitness < (1 - MIN_ANGLE_GAIN) * polished.fitness:

@@ -155,8 +155,8 @@ def _responses(
     after = _matrix_powers(expm(A * step), length)
     responses = np.zeros((length, 2, len(steps.at)))
     for k, (at, height, share) in enumerate(zip(*steps, strict=True)):
-        begun = expm(A * step * np.clip(share, 0.0, 1.0)) @ B[:, 0] * step * height
-        responses[at:, :, k] = after[: length - at] @ begun
+        at_sample = expm(A * step * np.clip(share, 0.0, 1.0)) @ B[:, 0] * step * height
+        responses[at:, :, k] = after[: length - at] @ at_sample
     if tape.averaging is not None:
         responses[:, 1] = Averaging(*np.asarray(tape.averaging)[run]).applied_to(responses[:, 1])
     return np.moveaxis(responses.reshape(length // BLOCK, BLOCK, 2, len(steps.at)), 1, 2)
