@@ -67,10 +67,10 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
 
     **Arguments**: `residuals`, one `Series` per run, `values` (samples, outputs).
     """
-    of_kind = {}
+    by_kind = {}
     for kind in dict.fromkeys(series.kind for series in residuals):
-        of_kind[kind] = _autoregression([s for s in residuals if s.kind == kind])
-    filters = [of_kind[series.kind] for series in residuals]
+        by_kind[kind] = _autoregression([s for s in residuals if s.kind == kind])
+    filters = [by_kind[series.kind] for series in residuals]
     scales = _scales(residuals, filters)
     slow = [
         _slow_power(_filtered(series, A, S))
@@ -113,17 +113,18 @@ def _scales(
 
 
 def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order outputs outputs"]:
-    """Coefficients A_k of r(t) = sum_k A_k r(t - k) + white noise, of the order with the lowest criterion.
+    """Coefficients A_k of r(t) = sum_k A_k r(t - k) + white noise, of the order with the lowest Bayesian
+    information criterion.
 
     Each run is weighted by the inverse of its variance, because noise may differ between runs.
     """
     outputs, longest = residuals[0].values.shape[1], max(ORDERS)
     lagged = [_lagged(series, longest) for series in residuals]
-    units = np.sqrt(np.mean(np.square(np.concatenate(lagged)), axis=0))[:outputs] + 1e-300
+    rms = np.sqrt(np.mean(np.square(np.concatenate(lagged)), axis=0))[:outputs] + 1e-300
     size, rows = outputs * (longest + 1), sum(len(x) for x in lagged)
     gram = np.zeros((size, size))
     for x in lagged:
-        scaled = x / np.tile(units, longest + 1)
+        scaled = x / np.tile(rms, longest + 1)
         gram += scaled.T @ scaled / (np.mean(np.square(scaled)) + 1e-300)
     best = rows * np.linalg.slogdet(gram[:outputs, :outputs] / max(rows, 1))[1]
     chosen = np.zeros((0, outputs, outputs))
@@ -133,12 +134,12 @@ def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order out
         now, past = slice(0, outputs), slice(outputs, outputs * (order + 1))
         ridge = 1e-9 * np.trace(gram[past, past]) * np.eye(order * outputs) / (order * outputs)
         coefficients = np.linalg.solve(gram[past, past] + ridge, gram[past, now])
-        left = gram[now, now] - gram[now, past] @ coefficients
-        criterion = rows * np.linalg.slogdet(left / rows)[1] + order * outputs**2 * np.log(rows)
-        if criterion < best:
-            best = criterion
+        innovations = (gram[now, now] - gram[now, past] @ coefficients) / rows
+        bic = rows * np.linalg.slogdet(innovations)[1] + order * outputs**2 * np.log(rows)
+        if bic < best:
+            best = bic
             chosen = coefficients.reshape(order, outputs, outputs).transpose(0, 2, 1)
-    return chosen * units[:, None] / units
+    return chosen * rms[:, None] / rms
 
 
 def _lagged(series: Series, order: int) -> Float[np.ndarray, "rows lags"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -58,8 +58,11 @@ INITIAL_CANDIDATES = 256
 # ... with this standard deviation in the unit cube: the best of that many is not far from the optimum.
 INITIAL_SPREAD = 0.15
 
-# The search may stop once the best tenth of the population agree this well, in natural logarithms.
-AGREEMENT = 0.1
+# The search may stop after some generations, once the best tenth of the population agree this well, in natural
+# logarithms.
+MIN_GENERATIONS, AGREEMENT = 10, 0.1
+# Most candidates that are kept
+MAX_CANDIDATES = 2000
 
 
 class SearchResult(NamedTuple):
@@ -71,6 +74,13 @@ class SearchResult(NamedTuple):
     median: np.ndarray  # (generations,)
     evaluations: int
     interrupted: bool
+
+
+class _Generation(NamedTuple):
+    """Evaluated points of the unit cube, and their fitness."""
+
+    cube: np.ndarray
+    fitness: np.ndarray
 
 
 def search(
@@ -106,11 +116,10 @@ def search(
 
     kind, seeds = Kind(method, size, len(low)), np.asarray(seed)
     start = _scattered(seed, INITIAL_CANDIDATES if chosen.distribution else size, len(low))
-    seen = [(start, fitness_of.scattered(low + (high - low) * start, size))]
-    if chosen.distribution:
-        asked, state = _first_points(kind, seeds, start[np.argmin(seen[0][1])])
-    else:
-        asked, state = _first_points(kind, seeds, start, seen[0][1])
+    first = _Generation(start, fitness_of.scattered(low + (high - low) * start, size))
+    begins_with = (start[np.argmin(first.fitness)],) if chosen.distribution else first
+    asked, state = _first_points(kind, seeds, *begins_with)
+    evaluated = [first]
 
     interrupted = False
     try:
@@ -118,16 +127,18 @@ def search(
             cube = np.asarray(asked)
             fitness = fitness_of(low + (high - low) * cube)
             asked, state = _next_points(kind, seeds, np.asarray(generation), cube, fitness, state)
-            seen.append((cube, fitness))
+            evaluated.append(_Generation(cube, fitness))
             if progress:
-                best = min(f.min() for _, f in seen)
+                best = min(each.fitness.min() for each in evaluated)
                 progress(f"searching, generation {generation}", float(best), generation / rounds)
             elite = cube[np.argsort(fitness)[: size // 10 + 1]]
-            if generation > 10 and np.all(np.ptp((high - low) * elite, axis=0) < AGREEMENT):
+            if generation > MIN_GENERATIONS and np.all(
+                np.ptp((high - low) * elite, axis=0) < AGREEMENT
+            ):
                 break
     except KeyboardInterrupt:
         interrupted = True
-    return _collect(seen, low, high, interrupted)
+    return _collect(evaluated, low, high, interrupted)
 
 
 Value = Array | np.ndarray
@@ -224,15 +235,17 @@ def _scattered(seed: int, size: int, dimensions: int) -> np.ndarray:
     return (strata + rng.random(strata.shape)) / size
 
 
-def _collect(seen: list, low: np.ndarray, high: np.ndarray, interrupted: bool) -> SearchResult:
-    cubes = np.concatenate([cube for cube, _ in seen])
-    fitness = np.concatenate([f for _, f in seen])
-    order = np.argsort(fitness, kind="stable")[:2000]
+def _collect(
+    evaluated: Sequence[_Generation], low: np.ndarray, high: np.ndarray, interrupted: bool
+) -> SearchResult:
+    cubes = np.concatenate([each.cube for each in evaluated])
+    fitness = np.concatenate([each.fitness for each in evaluated])
+    order = np.argsort(fitness, kind="stable")[:MAX_CANDIDATES]
     return SearchResult(
         candidates=low + (high - low) * cubes[order],
         fitness=fitness[order],
-        best=np.minimum.accumulate([f.min() for _, f in seen]),
-        median=np.array([np.median(f) for _, f in seen]),
+        best=np.minimum.accumulate([each.fitness.min() for each in evaluated]),
+        median=np.array([np.median(each.fitness) for each in evaluated]),
         evaluations=len(fitness),
         interrupted=interrupted,
     )

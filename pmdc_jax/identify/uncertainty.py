@@ -182,9 +182,9 @@ def long_run_variance(terms: Float[np.ndarray, "samples n"]) -> Float[np.ndarray
     stretch = max(1, len(terms) // STRETCHES)
     whole = len(terms) // stretch * stretch
     sums = terms[:whole].reshape(-1, stretch, terms.shape[1]).sum(1)
-    memory = np.clip(_autoregression(sums), -0.97, 0.97)
-    whitened = sums[1:] - memory * sums[:-1]
-    rest = np.clip(_autoregression(whitened), -0.97, 0.97)
+    ar1 = np.clip(_ar1_coefficients(sums), -0.97, 0.97)
+    whitened = sums[1:] - ar1 * sums[:-1]
+    rest = np.clip(_ar1_coefficients(whitened), -0.97, 0.97)
     slow = np.sum(4 * rest**2 / (1 - rest) ** 8) / np.sum((1 - rest) ** -4.0)
     bandwidth = 1.3221 * max(slow * len(whitened), 1e-12) ** 0.2
     lags = np.arange(1, min(len(whitened) - 1, int(8 * bandwidth) + 2))
@@ -197,11 +197,11 @@ def long_run_variance(terms: Float[np.ndarray, "samples n"]) -> Float[np.ndarray
         one_sided = kernel @ cross[lags]
         variance[i] += one_sided
         variance[:, i] += one_sided
-    recolour = 1 / (1 - memory)
-    return variance * recolour[:, None] * recolour * (len(sums) / len(whitened))
+    recolouring = 1 / (1 - ar1)
+    return variance * recolouring[:, None] * recolouring * (len(sums) / len(whitened))
 
 
-def _autoregression(series: np.ndarray) -> np.ndarray:
+def _ar1_coefficients(series: np.ndarray) -> np.ndarray:
     return np.sum(series[1:] * series[:-1], 0) / (np.sum(series[:-1] ** 2, 0) + 1e-300)
 
 
