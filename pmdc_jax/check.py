@@ -21,6 +21,7 @@ from .recording import Finding, Recording, place_of_sample
 from .unmeasured import clipped_extremes
 
 MAX_JITTER = 0.02  # of a step, root mean square
+MAX_MISSING_AS_NOTE = 0.05  # share of missing samples beyond which they are worth a warning
 MAX_JUMP = 0.2  # from sample to sample, of the range of a current that drives
 
 
@@ -89,7 +90,7 @@ def missing_samples(run: Recording) -> Iterator[Finding]:
             yield Finding(
                 run.name,
                 quantity,
-                "warning" if absent.mean() > 0.05 else "note",
+                "warning" if absent.mean() > MAX_MISSING_AS_NOTE else "note",
                 f"{absent.sum()} of {len(values)} values are missing",
                 f"first at {place_of_sample(run, int(np.argmax(absent)))}",
                 "They are left out of the fit",

@@ -25,16 +25,16 @@ UNSIGNED = ("current", "speed")  # channels of which some sensors give no sign
 MAX_UNEXPLAINED = 0.2  # share of the voltage that these may leave, if they are given its sign
 MAX_NEGATIVE = 0.02  # share of its range to which a channel that has no sign may be negative
 MIN_CLARITY = 3.0  # a term is seen when it moves the fit by this many residuals
-RPM = 30 / np.pi  # in a rad/s
-DEGREES = 180 / np.pi  # in a rad
-TOP_SPEED = 6000.0  # rad/s, 57,000 rpm: no brushed motor turns faster
-TOP_VOLTAGE = 3000.0  # V, of the largest traction motors
+RPM_PER_RAD_S = 30 / np.pi
+DEGREES_PER_RAD = 180 / np.pi
+MAX_SPEED = 6000.0  # rad/s, 57,000 rpm: no brushed motor turns faster
+MAX_VOLTAGE = 3000.0  # V, of the largest traction motors
 KB_RANGE = (5e-5, 200.0)  # V s/rad, a factor of 20 beyond what is built
-LEAST_R = 5e-4  # ohm, below that of any brushes
+MIN_R = 5e-4  # ohm, below that of any brushes
 # What Kt / Kb, in SI about 1, comes out as if a column is in another unit than it is read in
-MISREAD = {
-    RPM: ("speed", "rpm", "rad/s"),
-    DEGREES: ("speed", "deg/s", "rad/s"),
+KT_OVER_KB_IF_MISREAD = {
+    RPM_PER_RAD_S: ("speed", "rpm", "rad/s"),
+    DEGREES_PER_RAD: ("speed", "deg/s", "rad/s"),
     1e3: ("load", "mN*m", "N m"),
     1e-3: ("current", "mA", "A"),
 }
@@ -70,18 +70,19 @@ def lost_signs(run: Recording) -> Iterator[Finding]:
     if not np.quantile(w["voltage"], 0.05) < 0 < np.quantile(w["voltage"], 0.95):
         return
 
-    def missed(*turned: str) -> float:
+    def unexplained(*unsigned: str) -> float:
         """Share of the voltage that R i + Kb w does not explain, if some have the sign of the voltage."""
-        way = np.sign(w["voltage"])
-        terms = {name: w[name] * (way if name in turned else 1.0) for name in UNSIGNED}
+        sign = np.sign(w["voltage"])
+        terms = {name: w[name] * (sign if name in unsigned else 1.0) for name in UNSIGNED}
         return 1 - regress(w["voltage"], terms, intercept=False)[1]
 
-    one_way = [name for name in UNSIGNED if np.min(w[name]) > -MAX_NEGATIVE * np.max(w[name])]
+    positive = [name for name in UNSIGNED if np.min(w[name]) > -MAX_NEGATIVE * np.max(w[name])]
     least, lost = min(
-        ((missed(*some), some) for k in (1, 2) for some in combinations(one_way, k)),
+        ((unexplained(*some), some) for k in (1, 2) for some in combinations(positive, k)),
         default=(1.0, ()),
     )
-    if least < min(MAX_UNEXPLAINED, missed() / 2) and missed() > MAX_UNEXPLAINED / 2:
+    as_recorded = unexplained()
+    if least < min(MAX_UNEXPLAINED, as_recorded / 2) and as_recorded > MAX_UNEXPLAINED / 2:
         for column in lost:
             what = "it is never negative although the voltage is: its sign is missing"
             mend = "Record it with its sign, or run the motor in one direction only"
@@ -131,9 +132,9 @@ def angle_against_speed(run: Recording) -> Iterator[Finding]:
     if explained < 0.98 or 0.9 < ratio < 1.1:
         return
     reasons = {
-        1 / RPM: ", as if the speed were in rpm",
-        1 / DEGREES: ", as if the speed were in deg/s",
-        DEGREES: ", as if the angle were in degrees",
+        1 / RPM_PER_RAD_S: ", as if the speed were in rpm",
+        1 / DEGREES_PER_RAD: ", as if the speed were in deg/s",
+        DEGREES_PER_RAD: ", as if the angle were in degrees",
         1 / (2 * np.pi): ", as if the angle were in turns",
         -1.0: ", as if one of them had the wrong sign",
     }
@@ -149,7 +150,7 @@ def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
     In SI the torque constant equals that of the back-EMF. Kt shows where the load is known and
     varies, within a run or from run to run.
     """
-    wrong = [finding for run in runs for finding in _beyond_any_motor(run)]
+    wrong = [finding for run in runs for finding in _impossible_values(run)]
     yield from wrong
     names = ", ".join(run.name for run in runs if run.load is not None)
     constants = max(
@@ -165,7 +166,7 @@ def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
     if not Kt.positive:
         return
     ratio = Kt.value / Kb.value
-    for scale, (column, unit, read) in MISREAD.items():
+    for scale, (column, unit, read) in KT_OVER_KB_IF_MISREAD.items():
         if 0.8 < ratio / scale < 1.25 and not any(finding.column == "voltage" for finding in wrong):
             what = f"Kt is {ratio:.3g} times Kb, as if the {column} were in {unit}, not {read}"
             mend = f"If so, write [{unit}] in the header, or use --column {column}=HEADER:{unit}"
@@ -192,7 +193,7 @@ def _constants(runs: Sequence[Recording], longer: int) -> _Constants:
     return _Constants(*_electrical_balance(w), mechanical["current"], explained)
 
 
-def _beyond_any_motor(run: Recording) -> Iterator[Finding]:
+def _impossible_values(run: Recording) -> Iterator[Finding]:
     """Values, and what they make of R and Kb, that no brushed motor has."""
     w = _windows(run)
 
@@ -200,18 +201,20 @@ def _beyond_any_motor(run: Recording) -> Iterator[Finding]:
         mend = f"Check the unit: write {units} in the header, or map the column with --column"
         return Finding(run.name, column, "warning", what, "whole run", mend)
 
-    top = {name: float(np.max(np.abs(w[name]))) for name in ("speed", "voltage") if name in w}
-    if top.get("voltage", 0.0) > TOP_VOLTAGE:
-        yield wrong("voltage", f"{top['voltage']:.4g} V is too high for a brushed motor", "[mV]")
-    elif top.get("speed", 0.0) > TOP_SPEED:
-        what = f"{top['speed']:.4g} rad/s is too fast for a brushed motor"
+    largest = {name: float(np.max(np.abs(w[name]))) for name in ("speed", "voltage") if name in w}
+    if largest.get("voltage", 0.0) > MAX_VOLTAGE:
+        yield wrong(
+            "voltage", f"{largest['voltage']:.4g} V is too high for a brushed motor", "[mV]"
+        )
+    elif largest.get("speed", 0.0) > MAX_SPEED:
+        what = f"{largest['speed']:.4g} rad/s is too fast for a brushed motor"
         yield wrong("speed", what, "[rpm] or [deg/s]")
     elif {"voltage", "current", "speed"} <= set(w):
         R, Kb = _electrical_balance(w)
         if Kb.positive and not KB_RANGE[0] < Kb.value < KB_RANGE[1]:
             what = f"with the voltage it gives Kb = {Kb.value:.3g} V s/rad, unlike any real motor"
             yield wrong("speed", what, "[rpm] or [deg/s]")
-        if R.positive and R.value < LEAST_R:
+        if R.positive and R.value < MIN_R:
             what = f"with the voltage it gives R = {R.value:.3g} ohm, less than any real motor has"
             yield wrong("current", what, "[mA]")
 
@@ -262,7 +265,8 @@ def _windows(run: Recording, longer: int = 1) -> dict[str, np.ndarray]:
     def mean(values: np.ndarray) -> np.ndarray:
         return (values * steps).reshape(count, size).sum(1) / length
 
-    def middle(values: np.ndarray) -> np.ndarray:
+    def mean_of_line(values: np.ndarray) -> np.ndarray:
+        """The mean of a signal that is linear between samples instead of held."""
         return mean((values[1 : ends[-1] + 1] + values[: ends[-1]]) / 2)
 
     speed = speed_of(run)
@@ -272,9 +276,9 @@ def _windows(run: Recording, longer: int = 1) -> dict[str, np.ndarray]:
             found[name] = mean(values[: ends[-1]])
     for name, values in (("current", run.current), ("speed", speed)):
         if values is not None:
-            found |= {name: middle(values), f"{name}_rate": np.diff(values[ends]) / length}
+            found |= {name: mean_of_line(values), f"{name}_rate": np.diff(values[ends]) / length}
     if speed is not None:
-        found["direction"] = middle(np.sign(speed))
+        found["direction"] = mean_of_line(np.sign(speed))
     if run.angle is not None:
         found["angle_rate"] = np.diff(unwrapped(run.angle)[0][ends]) / length
     good = (length < 1.5 * np.median(length)) & np.isfinite(sum(found.values()))

@@ -20,8 +20,10 @@ MIN_SAMPLES = 10
 MAX_MISSING = 0.2  # share of an output's samples that may be missing
 OUTPUTS = ("speed", "angle", "current")
 # Columns needed besides time: to simulate, and to identify
-DRIVES = "voltage, current or torque"
-OUTPUTS_TOO = "voltage with current, speed or angle; or current or torque with speed or angle"
+NEEDED_TO_SIMULATE = "voltage, current or torque"
+NEEDED_TO_IDENTIFY = (
+    "voltage with current, speed or angle; or current or torque with speed or angle"
+)
 
 
 @frozen
@@ -50,14 +52,14 @@ class Averaging(NamedTuple):
     last: float
     next: float
 
-    def known_of(self, speed: np.ndarray) -> np.ndarray:
+    def with_ends_missing(self, speed: np.ndarray) -> np.ndarray:
         """`speed`, NaN at the ends whose averaging interval lies outside the record."""
         known = speed.copy()
         known[: 1 if self.last else 0] = np.nan
         known[len(known) - 1 if self.next else len(known) :] = np.nan
         return known
 
-    def of(self, speed: np.ndarray) -> np.ndarray:
+    def applied_to(self, speed: np.ndarray) -> np.ndarray:
         """The recorded speed for an instantaneous speed, (samples, ...), that is linear between samples."""
         means = (speed[:-1] + speed[1:]) / 2
         last, coming = np.concatenate([speed[:1], means]), np.concatenate([means, speed[-1:]])
@@ -81,8 +83,8 @@ class Recording:
     **Fields**: `name`, shown in results; `time`, s, (samples,), strictly increasing from any start. The following have
     the same shape, and are None where not recorded: `voltage` V, `current` A, `speed` rad/s, `load` N m, `angle` rad,
     `temperature` degrees C, `torque` N m. `held`, whether the rotor was locked; `source`, the file; `ignored`, headers
-    not used; `notes`, assumptions made while reading; `uneven`, the original record if this one was resampled to an
-    even clock, else None; `averaging`, the averaging of the speed, None for an instantaneous speed.
+    not used; `notes`, assumptions made while reading; `resampled_from`, the original record if this one was resampled
+    to an even clock, else None; `averaging`, the averaging of the speed, None for an instantaneous speed.
 
     **Raises**: `InputError` if no recorded quantity drives the motor, or the arrays are faulty (see `faults`).
     """
@@ -100,12 +102,12 @@ class Recording:
     source: str | None = field(default=None, kw_only=True)
     ignored: tuple[str, ...] = field(default=(), kw_only=True)
     notes: tuple[Finding, ...] = field(default=(), kw_only=True)
-    uneven: Recording | None = field(default=None, kw_only=True)
+    resampled_from: Recording | None = field(default=None, kw_only=True)
     averaging: Averaging | None = field(default=None, kw_only=True)
 
     def __attrs_post_init__(self) -> None:
         # the original of a resampled record has already been checked
-        for fault in faults(self.columns()) if self.uneven is None else ():
+        for fault in faults(self.columns()) if self.resampled_from is None else ():
             sample = "" if fault.row is None else f"sample {fault.row + 1}"
             column = fault.quantity and f"column {fault.quantity}"
             where = ", ".join(filter(None, (self.source or self.name, sample, column)))
@@ -127,7 +129,7 @@ class Recording:
     @property
     def recorded(self) -> Recording:
         """The original record, before any resampling to an even clock."""
-        return self if self.uneven is None else self.uneven
+        return self if self.resampled_from is None else self.resampled_from
 
     @property
     def drive(self) -> Literal["voltage", "current", "torque"]:
@@ -137,7 +139,7 @@ class Recording:
         return "current" if self.torque is None else "torque"
 
     @property
-    def tells(self) -> bool:
+    def is_identifiable(self) -> bool:
         """Whether the recorded quantities suffice to identify a motor; see `is_identifiable_from`."""
         return is_identifiable_from(self.columns())
 
@@ -175,7 +177,7 @@ def faults(columns: Mapping[str, np.ndarray]) -> Iterator[Fault]:
     """Every fault that makes these columns unusable, the most basic first."""
     if not is_driven(columns):
         what = f"no input column, only {', '.join(columns)}"
-        yield Fault(None, None, what, f"Needed besides time: {DRIVES}")
+        yield Fault(None, None, what, f"Needed besides time: {NEEDED_TO_SIMULATE}")
     time = columns["time"]
     for quantity, values in columns.items():
         if values.ndim != 1 or len(values) != len(time):
@@ -187,8 +189,8 @@ def faults(columns: Mapping[str, np.ndarray]) -> Iterator[Fault]:
         yield Fault(None, None, what if len(time) else "it has no rows", "Record a longer run")
         return
     for quantity, values in columns.items():
-        yield from _not_finite(quantity, values, columns)
-    yield from _time_order(time)
+        yield from _faults_of_values(quantity, values, columns)
+    yield from _faults_of_time(time)
 
 
 def is_driven(columns: Mapping[str, object]) -> bool:
@@ -202,7 +204,7 @@ def is_identifiable_from(columns: Mapping[str, object]) -> bool:
     return moves and ("current" in columns or "torque" in columns)
 
 
-def _not_finite(
+def _faults_of_values(
     quantity: str, values: np.ndarray, columns: Mapping[str, np.ndarray]
 ) -> Iterator[Fault]:
     bad = ~np.isfinite(values)
@@ -227,7 +229,7 @@ def _not_finite(
         yield Fault(quantity, first, what, mend)
 
 
-def _time_order(time: np.ndarray) -> Iterator[Fault]:
+def _faults_of_time(time: np.ndarray) -> Iterator[Fault]:
     steps = np.diff(time)
     if (steps > 0).all():
         return

@@ -13,8 +13,8 @@ from .columns import QUANTITIES, Column, likely_quantity, match_columns, mixed_a
 from .errors import InputError
 from .files import replacing
 from .recording import (
-    DRIVES,
-    OUTPUTS_TOO,
+    NEEDED_TO_IDENTIFY,
+    NEEDED_TO_SIMULATE,
     Fault,
     Finding,
     Recording,
@@ -109,9 +109,13 @@ def _refuse_too_little(
         mend = f"Name it time_s, or map it with --column time=HEADER:UNIT; {seen}"
         raise InputError(where, "there is no time column", mend)
     if to_simulate and not is_driven(found):
-        what, needed, lacking = "no input column, only", DRIVES, "voltage"
+        what, needed, lacking = "no input column, only", NEEDED_TO_SIMULATE, "voltage"
     elif not to_simulate and not is_identifiable_from(found):
-        what, needed, lacking = "too few columns to identify a motor, only", OUTPUTS_TOO, "speed"
+        what, needed, lacking = (
+            "too few columns to identify a motor, only",
+            NEEDED_TO_IDENTIFY,
+            "speed",
+        )
     else:
         return
     mend = f"Needed besides time: {needed}. Map columns with --column {lacking}=HEADER:UNIT; {seen}"

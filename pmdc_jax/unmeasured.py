@@ -33,19 +33,21 @@ def without_unmeasured(run: Recording) -> Recording:
         signal = getattr(run, name)
         if signal is None:
             continue
-        spikes = _spikes(signal) & _steady(run)
+        spikes = _spikes(signal) & _drive_is_steady(run)
         if 0 < spikes.sum() <= MAX_SPIKES * len(run):
-            run = _without(run, name, spikes, "has a single-sample spike")
+            run = _with_missing_samples(run, name, spikes, "has a single-sample spike")
         signal = getattr(run, name)
         ends = [extreme for extreme, *_ in clipped_extremes(signal)]
         clipped = np.isin(signal, ends)
         missing = np.mean(clipped | np.isnan(signal))
         if ends and missing <= MAX_MISSING:
-            run = _without(run, name, clipped, "looks clipped")
+            run = _with_missing_samples(run, name, clipped, "looks clipped")
     return run
 
 
-def _without(run: Recording, name: str, lost: Bool[np.ndarray, " samples"], how: str) -> Recording:
+def _with_missing_samples(
+    run: Recording, name: str, lost: Bool[np.ndarray, " samples"], how: str
+) -> Recording:
     """The run with the `lost` samples of an output set to NaN, and a note that says `how` they were recognised."""
     signal, rows = getattr(run, name), np.flatnonzero(lost)
     others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
@@ -64,17 +66,17 @@ def _without(run: Recording, name: str, lost: Bool[np.ndarray, " samples"], how:
 def _spikes(signal: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
     before, after = np.diff(signal)[:-1], -np.diff(signal)[1:]
     size = np.where(before * after > 0, np.minimum(np.abs(before), np.abs(after)), 0.0)
-    apart = np.abs(signal[2:] - signal[:-2])
+    aside = np.abs(signal[2:] - signal[:-2])
     low, high = np.nanquantile(signal, [0.02, 0.98])
     least = max(SPIKE_RATIO * np.nanmedian(np.abs(np.diff(signal, 2))), MIN_SPIKE * (high - low))
-    return np.pad((size > least) & (apart < MAX_STEP_ASIDE * size), 1)
+    return np.pad((size > least) & (aside < MAX_STEP_ASIDE * size), 1)
 
 
-def _steady(run: Recording) -> Bool[np.ndarray, " samples"]:
+def _drive_is_steady(run: Recording) -> Bool[np.ndarray, " samples"]:
     """Samples around which the driving signal does not step, so that it cannot have caused a spike."""
     drive = np.asarray(getattr(run, run.drive))
-    leaps = np.abs(np.diff(drive, prepend=drive[0])) > MAX_STEP_OF_DRIVE * np.ptp(drive)
-    return ~(leaps | np.roll(leaps, 1) | np.roll(leaps, -1))
+    steps = np.abs(np.diff(drive, prepend=drive[0])) > MAX_STEP_OF_DRIVE * np.ptp(drive)
+    return ~(steps | np.roll(steps, 1) | np.roll(steps, -1))
 
 
 def clipped_extremes(

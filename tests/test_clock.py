@@ -93,7 +93,7 @@ def test_what_goes_straight_between_uneven_stamps_has_its_mean_and_first_moment(
         drive = np.interp(begin + even.sample_time * share, run.time, run.voltage)
         assert mean[k] == pytest.approx(drive.mean(), abs=1e-4)
         assert rise[k] == pytest.approx(12 * np.mean((share - 0.5) * drive), abs=1e-3)
-    fine, unloaded = 400, attrs.evolve(even, load=None, uneven=attrs.evolve(run, load=None))
+    fine, unloaded = 400, attrs.evolve(even, load=None, resampled_from=attrs.evolve(run, load=None))
     line = expm(rates() * even.sample_time / fine)
     straight, true = np.zeros((2, len(even) * fine + 1, 4))
     middles = (np.arange(fine) + 0.5) / fine

@@ -11,7 +11,12 @@ from scipy.signal import lsim
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import Motor, identify
-from pmdc_jax.identify.friction_test import Missing, _load_filter, _response, of_friction
+from pmdc_jax.identify.friction_test import (
+    MissingFriction,
+    _load_filter,
+    _load_response,
+    friction_messages,
+)
 from pmdc_jax.identify.identification import Identification
 from pmdc_jax.recording import Recording
 from pmdc_jax.simulate import Tape
@@ -70,7 +75,7 @@ def test_friction_is_told_where_a_parameter_makes_up_for_it_or_far_more_than_noi
     found = Mock(spec=Identification)
     found.covariance, found.covariance_names = np.diag([1.0, error**2]), ("J", "f")
     found.missed = missed
-    messages = list(of_friction(Missing(0.01, 27.0, np.array([0.01, -0.6])), found))
+    messages = list(friction_messages(MissingFriction(0.01, 27.0, np.array([0.01, -0.6])), found))
     assert len(messages) == bool(told)
     assert all(f"(27 standard errors){told}" in message for message in messages)
 
@@ -80,7 +85,7 @@ def test_the_response_to_a_load_is_that_of_the_linear_motor(x64):
     (run, _) = recorded(0.0, seed=1)
     motor = Motor(*(getattr(PAPER, name) for name in vb.SIX))
     load = np.sign(np.sin(7 * run.time))
-    found = _response(_load_filter(motor, Tape.from_recordings([run]), 0), load)
+    found = _load_response(_load_filter(motor, Tape.from_recordings([run]), 0), load)
     A, B = map(np.asarray, motor.state_space())
     system = (A, B[:, 1:], np.eye(2), np.zeros((2, 1)))
     _, expected, _ = lsim(system, load, run.time, interp=False)

@@ -28,7 +28,7 @@ from pmdc_jax.identify.bounds import effect_bounds
 from pmdc_jax.identify.generalised_least_squares import last_fit, residuals_of
 from pmdc_jax.identify.identification import Identification
 from pmdc_jax.identify.nearby import best_nearby
-from pmdc_jax.identify.noise import is_coarse, quantum, resolution, white_noise
+from pmdc_jax.identify.noise import common_divisor, is_coarse, quantum, white_noise
 from pmdc_jax.identify.noise_model import whitener
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.polish import fit_run_unknowns, polish
@@ -37,7 +37,7 @@ from pmdc_jax.identify.problem import Problem, Unknowns, _evaluated, evaluate
 from pmdc_jax.identify.refine import Optimum, refine
 from pmdc_jax.identify.results import results_of
 from pmdc_jax.identify.rotor_angle import with_rotor_angle
-from pmdc_jax.identify.search import METHODS, Found, search
+from pmdc_jax.identify.search import METHODS, SearchResult, search
 from pmdc_jax.identify.solve import _distinct, solve
 from pmdc_jax.identify.uncertainty import information, long_run_variance
 from pmdc_jax.identify.whitening import Whitening
@@ -453,7 +453,7 @@ def test_a_smooth_or_a_noisy_signal_has_no_quantum():
     ],
 )
 def test_a_converter_resolves_what_all_values_are_multiples_of(values, step):
-    assert resolution(np.array(values)) == pytest.approx(step, rel=1e-6)
+    assert common_divisor(np.array(values)) == pytest.approx(step, rel=1e-6)
 
 
 def test_whitening_is_its_formula_sample_by_sample():
@@ -515,7 +515,7 @@ def test_one_start_has_a_middling_inductance():
     parameters = Parameters.of(dict.fromkeys(PARAMETERS, (1e-08, 100000000.0)))
     stuck = np.log([[0.2, 1e-7, 0.05, 0.05, 5e-4, 2e-4], [0.3, 2e-7, 0.05, 0.05, 5e-4, 2e-4]])
     nothing = np.zeros(2)
-    found = Found(stuck, nothing, nothing, nothing, 2, False)
+    found = SearchResult(stuck, nothing, nothing, nothing, 2, False)
     starts = np.exp(_distinct(found, parameters))
     assert starts[0, 1] == pytest.approx(1.0)
     assert np.allclose(np.delete(starts[0], 1), np.delete(np.exp(stuck[0]), 1))

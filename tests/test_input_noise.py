@@ -10,7 +10,7 @@ from scipy.signal import cont2discrete
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax import identify
-from pmdc_jax.identify.corrections.input_noise import smoothed
+from pmdc_jax.identify.corrections.input_noise import denoised
 from pmdc_jax.recording import Recording
 
 NOISE = 0.1  # V
@@ -25,13 +25,13 @@ def wave(samples: int = 2000) -> np.ndarray:
     return 10.0 * np.sin(2 * np.pi * np.arange(samples) / 200)
 
 
-# of steps a quarter was left of the noise before `DEPARTURE` was made smaller, for bends came out rounded
+# of steps a quarter was left of the noise before `CONFIDENCE_HALF_WIDTH` was made smaller, for bends came out rounded
 @pytest.mark.parametrize(
     ("signal", "left"), [(steps(), 0.27), (wave(), 0.6)], ids=["steps", "sine"]
 )
 def test_noise_goes_and_steps_stay(signal, left):
     seen = signal + NOISE * np.random.default_rng(3).standard_normal(len(signal))
-    error = smoothed(seen) - signal
+    error = denoised(seen) - signal
     assert np.std(error) < left * NOISE
     assert np.max(np.abs(error)) < 4.5 * NOISE  # nowhere near a step's height
 
@@ -40,7 +40,7 @@ def test_noise_goes_and_steps_stay(signal, left):
 def test_what_has_no_noise_stays_as_it_is(levels, hold, rest):
     """A voltage of steps without noise, of any length, is not touched."""
     signal = np.repeat(levels, hold)[rest:]
-    np.testing.assert_array_equal(smoothed(signal), signal)
+    np.testing.assert_array_equal(denoised(signal), signal)
 
 
 def recorded(felt: float, unfelt: float) -> list[Recording]:

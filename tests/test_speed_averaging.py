@@ -11,7 +11,11 @@ from scipy.interpolate import CubicSpline
 from benchmarks.naming.plant import Plant, simulate
 from benchmarks.virtual_bench import prbs, staircase
 from pmdc_jax import diagnose, identify
-from pmdc_jax.identify.corrections.speed_averaging import _in_counts, counted_over, differenced_over
+from pmdc_jax.identify.corrections.speed_averaging import (
+    _in_counts,
+    averaging_of_counts,
+    averaging_of_differences,
+)
 from pmdc_jax.identify.noise import quantum
 from pmdc_jax.recording import OVER_BOTH, OVER_LAST, Recording
 
@@ -116,12 +120,12 @@ def test_counts_show_by_their_noise_what_they_are_the_mean_of():
     rng = np.random.default_rng(3)
     speed = 300 * ndimage.gaussian_filter1d(rng.standard_normal(12000), 20.0)
     counts = np.floor(np.cumsum(speed))
-    assert counted_over([np.diff(counts)]) == (OVER_LAST, -np.inf)
-    mean, enough = counted_over([counts[2:] - counts[:-2]])
+    assert averaging_of_counts([np.diff(counts)]) == (OVER_LAST, -np.inf)
+    mean, enough = averaging_of_counts([counts[2:] - counts[:-2]])
     assert mean == OVER_BOTH and enough < 0
-    assert counted_over([np.round(speed)])[0] is None
+    assert averaging_of_counts([np.round(speed)])[0] is None
     # noise may be as strong, but is so at all frequencies: the motion itself must tell
-    mean, enough = counted_over([np.round(speed + NOISE * rng.standard_normal(12000))])
+    mean, enough = averaging_of_counts([np.round(speed + NOISE * rng.standard_normal(12000))])
     assert mean == OVER_LAST and np.isfinite(enough)
 
 
@@ -129,10 +133,10 @@ def test_only_differences_over_two_samples_have_nothing_at_the_highest_frequency
     rng = np.random.default_rng(4)
     speed = 300 * ndimage.gaussian_filter1d(rng.standard_normal(4000), 2.0)
     angle = np.cumsum(speed) + rng.standard_normal(4000)
-    assert differenced_over([angle[2:] - angle[:-2]])[0] == OVER_BOTH
+    assert averaging_of_differences([angle[2:] - angle[:-2]])[0] == OVER_BOTH
     for other in (np.diff(angle), speed + rng.standard_normal(4000), np.repeat(speed[::20], 20)):
-        assert differenced_over([other])[0] is None
-    assert differenced_over([])[0] is None
+        assert averaging_of_differences([other])[0] is None
+    assert averaging_of_differences([])[0] is None
 
 
 def test_counts_without_a_current_may_be_late_by_an_inductance():

@@ -101,7 +101,7 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     noise = np.sqrt(explained + (volt * unfelt) ** 2)
     drop = volt * brushes * np.sign(mean[:, :1])
     by_parameters = np.concatenate([volt * mean, drop, change], axis=1)
-    even = given.runs[run].uneven is None
+    even = given.runs[run].resampled_from is None
     return _Balance(rest[pairs] / noise, by_parameters[pairs] / noise, even)
 
 

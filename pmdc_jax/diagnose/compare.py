@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..identify.generalised_least_squares import residuals_of, sharpened, squares_of
+from ..identify.generalised_least_squares import fit_whitened, residuals_of, sum_of_squares
 from ..identify.noise_model import Whitener, whitener
 from .effect_relations import is_within
 from .model import Model
@@ -53,8 +53,8 @@ class Comparison:
         """A model fitted to its residuals whitened by a filter."""
         key = model, white
         if key not in self._fitted:
-            given, polished = sharpened(model.given, model.fit, white, WORTH)
-            squares = squares_of(given, polished)
+            given, polished = fit_whitened(model.given, model.fit, white, WORTH)
+            squares = sum_of_squares(given, polished)
             samples = given.problem.samples.sum()
             price = len(given.problem.parameters.names) * np.log(samples)
             self._fitted[key] = Fitted(model, squares, squares + price)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ..compiled import quickly_compiled
 from ..effects import EFFECTS, AbstractEffect
-from ..identify.noise import is_coarse, quantum, resolution
+from ..identify.noise import common_divisor, is_coarse, quantum
 from ..motor import Motor
 from ..recording import Recording
 from ..simulate import Tape, free_run
@@ -165,7 +165,7 @@ def _traces(base: Model) -> dict[str, float]:
 
 def _rounded_to(volts: np.ndarray) -> float:
     """The step, in V, to which a converter rounds or truncates; zero for a programme's far coarser round numbers."""
-    step = resolution(volts)
+    step = common_divisor(volts)
     return step if step < OF_CONVERTER * np.max(np.abs(volts)) else 0.0
 
 

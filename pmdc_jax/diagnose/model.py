@@ -13,16 +13,16 @@ from ..identify.generalised_least_squares import (
     last_fit,
     residuals_of,
     series_of,
-    training_runs,
-    whitened,
+    training_indices,
+    with_whitening,
 )
 from ..identify.noise_model import Series, Whitener
 from ..identify.polish import Fit, polish, reweighted
 from ..identify.prepare import Prepared
 from ..identify.refine import Optimum
-from ..identify.rotor_angle import of_rotor, with_rotor_angle
+from ..identify.rotor_angle import rotor_outputs, with_rotor_angle
 from ..identify.solve import polish_with_angle
-from ..identify.uncertainty import FLAT
+from ..identify.uncertainty import MIN_UNSEEN_STDERR
 from ..motor import Motor
 from .response import Path, path_of
 
@@ -76,14 +76,19 @@ class Model:
 
     @property
     def lost(self) -> set[str]:
-        """The parameters to which no run is sensitive (standard error above `FLAT`), so that no gradient leads back."""
+        """The parameters to which no run is sensitive (standard error above `MIN_UNSEEN_STDERR`), so that no gradient
+        leads back."""
         problem = self.given.problem
         names = problem.parameters.names
         # columns of each run's own unknowns follow those of the parameters
         jacobian = np.asarray(self.fit.evaluation.jacobian)
         columns = jacobian[problem.fitted_blocks][..., : len(names)]
         seen = np.square(columns).reshape(-1, len(names)).sum(axis=0)
-        return {name for name, square in zip(names, seen, strict=True) if square < 1 / FLAT**2}
+        return {
+            name
+            for name, square in zip(names, seen, strict=True)
+            if square < 1 / MIN_UNSEEN_STDERR**2
+        }
 
     @property
     def dry(self) -> float:
@@ -111,12 +116,12 @@ class Model:
         held = "speed" in {EFFECTS[name].holds for name in self.effects}
         problem = self.given.problem
         begun = self.fit.unknowns.runs.angle
-        return path_of(of_rotor(problem, self.fit), problem.tape, begun, held)
+        return path_of(rotor_outputs(problem, self.fit), problem.tape, begun, held)
 
     @property
     def misses(self) -> float:
         """Its residuals over what was measured, as root mean squares, for the output where that is larger."""
-        sizes = self.given.problem.sizes
+        sizes = self.given.problem.measured_rms
         there = sizes > 0
         return float(np.max(self.fit.noise[there] / sizes[there], initial=0.0))
 
@@ -128,12 +133,12 @@ class Model:
     @property
     def training(self) -> list[int]:
         """The runs that it was fitted to."""
-        return training_runs(self.given)
+        return training_indices(self.given)
 
 
 def refit_from(effects: tuple[str, ...], given: Prepared, start: Optimum, white: Whitener) -> Model:
     """A model fitted from a start to whitened residuals; its `fit` is evaluated without the filter."""
-    given, ended = polish_with_angle(whitened(given, white), start)
+    given, ended = polish_with_angle(with_whitening(given, white), start)
     given = given._replace(problem=replace(given.problem, whitening=None))
     # no step: the unfiltered residuals at the same point
     plain = polish(given.problem, ended.optimum, steps=0)
@@ -143,7 +148,7 @@ def refit_from(effects: tuple[str, ...], given: Prepared, start: Optimum, white:
 
 def model_of(effects: tuple[str, ...], given: Prepared, polished: Fit) -> Model:
     """A fitted model, its rotor turned in each sample as recordings and fit together tell."""
-    if not given.problem.angular:  # with an effect of the angle, the fit has done this
+    if not given.problem.depends_on_angle:  # with an effect of the angle, the fit has done this
         given = given._replace(problem=with_rotor_angle(given.problem, polished))
     return Model(effects, given, polished)
 

@@ -12,7 +12,7 @@ from scipy import stats
 from ..compiled import free_memory_maps
 from ..effects import EFFECTS
 from ..identify.identification import Identification, Role, RunFit
-from ..identify.noise import FLOOR
+from ..identify.noise import MIN_RELATIVE_NOISE
 from ..identify.prepare import prepare
 from ..identify.results import results_of
 from ..identify.solve import Solved, solve
@@ -276,10 +276,10 @@ def _gaps(base: Identification, final: Identification, share: float) -> dict[str
     """By run, the misfit before and after, over the noise.
 
     The noise is the final model's residuals in the training runs times `share`, below 1 where part of them is no noise,
-    and at least `FLOOR` times what was measured; all as root mean squares of each channel.
+    and at least `MIN_RELATIVE_NOISE` times what was measured; all as root mean squares of each channel.
     """
     noise = {
-        c: max(share * _rms_residual(final, c), FLOOR * _size(final, c))
+        c: max(share * _rms_residual(final, c), MIN_RELATIVE_NOISE * _size(final, c))
         for c in ("current", "speed")
     }
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects import EFFECTS
-from ..identify.generalised_least_squares import residuals_of, whitened
+from ..identify.generalised_least_squares import residuals_of, with_whitening
 from ..identify.identifiability import moved_by
 from ..identify.nearby import best_nearby
 from ..identify.noise_model import Whitener, whitener
@@ -18,7 +18,7 @@ from ..identify.polish import best_backlash_start, polish
 from ..identify.prepare import Prepared
 from ..identify.problem import Unknowns
 from ..identify.refine import Optimum
-from ..identify.solve import POOR, Solved, searched
+from ..identify.solve import POOR_FIT, Solved, search_and_refine
 from ..identify.uncertainty import information_of
 from ..progress import ReportProgress
 from ..threads import map_in_threads_until
@@ -128,7 +128,7 @@ class Refits:
         def search() -> Model:
             given = current.given.with_effects([EFFECTS[e] for e in effects])
             method, seed = self.solved.search.method, self.solved.seed
-            given, found = searched(given, method, seed, searches=1)
+            given, found = search_and_refine(given, method, seed, searches=1)
             return model_of(effects, given, found.fit)
 
         if (key := frozenset(effects)) in self.models:
@@ -202,7 +202,7 @@ class Refits:
     def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener) -> Model:
         """The best refit from several starts of the last effect.
 
-        Short refits are made until the best reaches the noise (`POOR`) or two agree on it (`AGREED`); it is then
+        Short refits are made until the best reaches the noise (`POOR_FIT`) or two agree on it (`AGREED`); it is then
         refitted in full. With `Trial.factors`, populations search around each start first, and around the end.
         """
         given, seed = starts[0][0], self.solved.seed
@@ -213,7 +213,7 @@ class Refits:
 
         def enough(ends: list[Optimum]) -> bool:
             least, *others = sorted(end.fitness for end in ends)
-            good = least < POOR * given.problem.outputs
+            good = least < POOR_FIT * given.problem.outputs
             return bool(good or (others and others[0] < AGREED * least))
 
         ends = map_in_threads_until(_roughly, starts, enough)
@@ -337,7 +337,7 @@ def _best_around(
     """The better of two refits, by the whitening filter of the residuals at the start: one from there, and one from the
     best of a population around where that ended."""
     white = whitener(residuals_of(given, polish(given.problem, begun, steps=0)))
-    sharp = whitened(given, white).problem
+    sharp = with_whitening(given, white).problem
 
     def left(model: Model) -> float:
         return polish(sharp, model.fit.optimum, steps=0).fitness
@@ -362,7 +362,7 @@ def _turns(model: Model, effect: str) -> list[np.ndarray | None]:
     others = [e for e in model.motor.effects if "angle" in e.states and e.name != effect]
     count = round(2 * np.pi / float(others[0].repeats_after()["angle"])) if others else 0
     whole = 2 * np.pi * np.arange(count) / count if count else None
-    turnable = np.asarray(model.given.problem.turnable)
+    turnable = np.asarray(model.given.problem.angle_unknown)
     return [whole if turnable[run] else np.zeros(1) for run in model.training]
 
 

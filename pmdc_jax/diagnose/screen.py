@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from ..identify.noise_model import Series, Whitener, plain, whitener
+from ..identify.noise_model import Series, Whitener, scaling_whitener, whitener
 from ..simulate import UNKNOWNS_PER_RUN
 from .evidence import Evidence, blocks_of, products
 from .library import Curve, Library, curves_over
@@ -31,7 +31,7 @@ def screen(model: Model, library: Library) -> Screen:
     blocks, count = blocks_of(orders, parameters), sum(order for order, _ in orders)
     changes = chain(library.changes(tape, path), of_curves)
     rows = gathered(model, library.bare, path, changes, count)
-    as_they_are = plain([run.fit.residual for run in rows])
+    as_they_are = scaling_whitener([run.fit.residual for run in rows])
     unfiltered = _evidence(rows, as_they_are)
     found = Screen(
         evidence=unfiltered,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,15 +11,15 @@ from ..effects import AbstractEffect
 from ..recording import Recording
 
 # How far a crude estimate may be off, as a factor either way. Wide: the search is cheap.
-CRUDE = 30.0
+CRUDE_FACTOR = 30.0
 # The same for L where the rise of the current is sampled finely, as by an oscilloscope
-FINELY = 5.0
+CRUDE_L_FACTOR = 5.0
 # Samples in a stretch that is averaged, and least number of stretches: in short runs they are shorter
-STRETCH, STRETCHES = 20, 30
+STRETCH_SAMPLES, MIN_STRETCHES = 20, 30
 # Back-EMF constant, V s/rad, where the recordings do not show it
-USUAL = 0.05
+TYPICAL_KB = 0.05
 # How much smaller than the signals of the motor an effect may be and still show
-DECADES = 1e3
+DYNAMIC_RANGE = 1e3
 
 
 def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, float]]:
@@ -29,17 +30,18 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
     speed); Kt equals Kb in SI; J and f follow from typical values of torque, change of speed and speed; L follows from
     R and the time constants that the sampling can show, or from that balance if it is larger there.
     """
-    R, Kb, L = _armature(recordings)
-    torque, speed, change, step, duration = _motion(recordings, Kb)
-    inertia = torque * np.sqrt(step * duration) / change
-    friction = torque / speed
+    R, Kb, L = _crude_armature(recordings)
+    typical = _typical_magnitudes(recordings, Kb)
+    time_constant = np.sqrt(typical.sample_time * typical.duration)
+    inertia = typical.torque * time_constant / typical.speed_change
+    friction = typical.torque / typical.speed
     return {
-        "R": _around(R),
-        "L": (R * step / 300, max(R * np.sqrt(step * duration), FINELY * L)),
-        "Kb": _around(Kb),
-        "Kt": _around(Kb),
-        "J": (inertia / CRUDE**2, inertia * CRUDE**2),
-        "f": (friction / CRUDE**3, friction * CRUDE / 3),
+        "R": _crude_range(R),
+        "L": (R * typical.sample_time / 300, max(R * time_constant, CRUDE_L_FACTOR * L)),
+        "Kb": _crude_range(Kb),
+        "Kt": _crude_range(Kb),
+        "J": (inertia / CRUDE_FACTOR**2, inertia * CRUDE_FACTOR**2),
+        "f": (friction / CRUDE_FACTOR**3, friction * CRUDE_FACTOR / 3),
     }
 
 
@@ -49,13 +51,13 @@ def effect_bounds(
     """Search bounds of effect parameters by unit: three decades up to about the torque, speed, voltage or current of
     the recordings, and time constants that their length and sampling can show. Parameters in other units, or in that
     of a signal that was not recorded, keep the range of their table."""
-    _, Kb, _ = _armature(recordings)
-    torque, speed, _, step, duration = _motion(recordings, Kb)
-    volts, amperes = (max(_largest(recordings, n), 1e-9) for n in ("voltage", "current"))
+    _, Kb, _ = _crude_armature(recordings)
+    typical = _typical_magnitudes(recordings, Kb)
+    volts, amperes = (max(_largest_rms(recordings, n), 1e-9) for n in ("voltage", "current"))
     scales = {
-        "N m": 3 * torque,
-        "N m s^2/rad^2": 3 * torque / speed**2,
-        "rad/s": speed,
+        "N m": 3 * typical.torque,
+        "N m s^2/rad^2": 3 * typical.torque / typical.speed**2,
+        "rad/s": typical.speed,
         "V": volts,
         "A": amperes,
         "1/W": 1 / (volts * amperes),
@@ -67,53 +69,63 @@ def effect_bounds(
             low, high = given.lower, given.upper
             if given.unit in scales:
                 high = min(high, scales[given.unit])
-                low = max(low, high / DECADES if given.scale == "log" else -high)
+                low = max(low, high / DYNAMIC_RANGE if given.scale == "log" else -high)
             elif given.unit == "s":
-                low, high = max(low, step / 5), min(high, 3 * duration)
+                low, high = max(low, typical.sample_time / 5), min(high, 3 * typical.duration)
             # the range is empty if no signal of this unit was recorded
-            shown = (low, high) if low < high else (given.lower, given.upper)
-            bounds[f"{effect.name}.{field}"] = shown
+            bounds[f"{effect.name}.{field}"] = (
+                (low, high) if low < high else (given.lower, given.upper)
+            )
     return bounds
 
 
-def _largest(recordings: Sequence[Recording], name: str) -> float:
+def _largest_rms(recordings: Sequence[Recording], name: str) -> float:
     return max(_rms(getattr(run, name)) for run in recordings)
 
 
-def _armature(recordings: Sequence[Recording]) -> tuple[float, float, float]:
+def _crude_armature(recordings: Sequence[Recording]) -> tuple[float, float, float]:
     """R, Kb and L by least squares on means over short stretches; L is zero where the recordings do not show it."""
     rows = []
     for run in recordings:
         speed = np.zeros(len(run)) if run.held else run.speed
         if run.voltage is not None and run.current is not None and speed is not None:
             columns = np.stack([run.voltage, run.current, speed])
-            rows.append(_stretches(columns[:, ~np.isnan(columns).any(0)], run.sample_time))
+            rows.append(_stretch_means(columns[:, ~np.isnan(columns).any(0)], run.sample_time))
     if rows:
         voltage, *inputs = np.concatenate(rows, axis=1)
         inputs = np.stack(inputs, 1)
         scale = np.linalg.norm(inputs, axis=0) + 1e-300
         R, Kb, L = np.linalg.lstsq(inputs / scale, voltage, rcond=1e-6)[0] / scale
         # a short-circuited motor shows only the ratio of R to Kb
-        steady = (np.linalg.norm(voltage) or USUAL * scale[1]) / scale
+        steady = (np.linalg.norm(voltage) or TYPICAL_KB * scale[1]) / scale
         # one that only stalls or only runs without load shows one of the two: the other is a guess
-        unseen = steady[1] if np.any(inputs[:, 1]) else USUAL
-        return (R if R > 0 else steady[0]), (Kb if Kb > 0 else unseen), max(L, 0.0)
-    gains = [
+        guess = steady[1] if np.any(inputs[:, 1]) else TYPICAL_KB
+        return (R if R > 0 else steady[0]), (Kb if Kb > 0 else guess), max(L, 0.0)
+    volts_per_speed = [
         _rms(r.voltage) / _rms(r.speed)
         for r in recordings
         if r.voltage is not None and r.speed is not None
     ]
-    loads = [
+    volts_per_ampere = [
         _rms(r.voltage) / _rms(r.current)
         for r in recordings
         if r.voltage is not None and r.current is not None
     ]
-    Kb = float(np.median(gains)) if gains else USUAL
-    return (float(np.median(loads)) / 3 if loads else 1.0), Kb, 0.0
+    Kb = float(np.median(volts_per_speed)) if volts_per_speed else TYPICAL_KB
+    return (float(np.median(volts_per_ampere)) / 3 if volts_per_ampere else 1.0), Kb, 0.0
 
 
-def _motion(recordings: Sequence[Recording], Kt: float) -> tuple[float, float, float, float, float]:
-    """Typical torque N m, speed rad/s and change of speed rad/s, shortest sample time s and longest duration s."""
+class _Typical(NamedTuple):
+    """Typical magnitudes of the recordings, the shortest sample time and the longest duration."""
+
+    torque: float  # N m
+    speed: float  # rad/s
+    speed_change: float  # rad/s
+    sample_time: float  # s
+    duration: float  # s
+
+
+def _typical_magnitudes(recordings: Sequence[Recording], Kt: float) -> _Typical:
     torque, speed, change = [1e-9], [1e-9], [1e-9]
     for run in recordings:
         if run.torque is not None:
@@ -128,18 +140,18 @@ def _motion(recordings: Sequence[Recording], Kt: float) -> tuple[float, float, f
         elif run.voltage is not None and not run.held:  # no-load speed
             speed.append(_rms(run.voltage) / Kt)
             change.append(_rms(run.voltage) / Kt)
-    step = min(run.sample_time for run in recordings)
-    duration = max(run.time[-1] - run.time[0] for run in recordings)
-    return max(torque), max(speed), max(change), step, duration
+    sample_time = min(run.sample_time for run in recordings)
+    duration = max(run.duration for run in recordings)
+    return _Typical(max(torque), max(speed), max(change), sample_time, duration)
 
 
-def _around(value: float) -> tuple[float, float]:
-    return value / CRUDE, value * CRUDE
+def _crude_range(value: float) -> tuple[float, float]:
+    return value / CRUDE_FACTOR, value * CRUDE_FACTOR
 
 
-def _stretches(columns: np.ndarray, sample_time: float) -> np.ndarray:
+def _stretch_means(columns: np.ndarray, sample_time: float) -> np.ndarray:
     """Means of voltage, current and speed over short stretches, and the rate of change of the current in each, A/s."""
-    length = max(2, min(STRETCH, columns.shape[1] // STRETCHES))
+    length = max(2, min(STRETCH_SAMPLES, columns.shape[1] // MIN_STRETCHES))
     whole = columns.shape[1] // length
     parts = columns[:, : whole * length].reshape(len(columns), whole, length)
     change = parts[1, :, -1] - parts[1, :, 0]

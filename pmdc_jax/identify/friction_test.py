@@ -18,87 +18,89 @@ from scipy.signal import lfilter, ss2tf
 
 from ..motor import Motor
 from ..simulate import UNKNOWNS_PER_RUN, Tape
-from .generalised_least_squares import residuals_of, series_of, training_runs
+from .generalised_least_squares import residuals_of, series_of, training_indices
 from .identification import Identification
-from .noise_model import Series, Whitener, plain, whitener
+from .noise_model import Series, Whitener, scaling_whitener, whitener
 from .polish import Fit
 from .prepare import Prepared
 
-# Standard errors above zero at which friction is significant
-CLEARLY = 5.0
-# Shift of a parameter, in its own standard errors, with which it compensates for friction
-MAKES_UP = 2.0
+# Standard errors above zero from which friction is significant
+MIN_Z_SCORE = 5.0
+# Shift of a parameter, in its own standard errors, from which it is said to compensate for friction
+MIN_BIAS = 2.0
 # The effect to suggest
-DRY = "coulomb_friction"
+FRICTION = "coulomb_friction"
 # Least eigenvalue of a normalised normal matrix, over the largest, of a direction that the rows determine
-VISIBLE = 1e-9
+RANK_TOLERANCE = 1e-9
 
 # Numerators for current and speed, and the common denominator
 LoadFilter = tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "3"]]
 
 
-class Missing(NamedTuple):
+class MissingFriction(NamedTuple):
     """Dry friction that a fit lacks."""
 
     friction_Nm: float
-    errors: float  # its value in standard errors
-    moved: Float[np.ndarray, " parameters"]  # how far the coordinates would move with it
+    z_score: float  # its value in standard errors
+    bias: Float[np.ndarray, " parameters"]  # of the coordinates for want of it
 
 
-def missing_friction(given: Prepared, fit: Fit) -> Missing | None:
+def missing_friction(given: Prepared, fit: Fit) -> MissingFriction | None:
     """The dry friction that a fit to the training runs lacks; None if it has some already or lacks none clearly."""
     problem, count = given.problem, len(given.problem.free)
     if any(effect.holds == "speed" for effect in problem.parameters.effects):
         return None
-    rows = _rows(given, fit)
+    rows = _regression_columns(given, fit)
     residuals = [series._replace(values=series.values[..., -1]) for series in rows]
-    found = _regressed(rows, plain(residuals), count)
-    if found.score(count) <= CLEARLY:  # too large rather than too small where the noise is coloured
+    found = _regress(rows, scaling_whitener(residuals), count)
+    if (
+        found.z_score(count) <= MIN_Z_SCORE
+    ):  # too large rather than too small where the noise is coloured
         return None
-    found = _regressed(rows, whitener(found.left), count)
-    score = found.score(count)
-    friction, moved = float(found.coefficients[count]), found.coefficients[:count]
-    return Missing(friction, score, moved) if score > CLEARLY else None
+    found = _regress(rows, whitener(found.residuals), count)
+    z_score = found.z_score(count)
+    friction, bias = float(found.coefficients[count]), found.coefficients[:count]
+    return MissingFriction(friction, z_score, bias) if z_score > MIN_Z_SCORE else None
 
 
-def of_friction(missing: Missing | None, found: Identification) -> Iterator[str]:
-    """A message on the friction that a fit lacks, if a parameter compensates for it by more than `MAKES_UP` of its
+def friction_messages(missing: MissingFriction | None, found: Identification) -> Iterator[str]:
+    """A message on the friction that a fit lacks, if a parameter compensates for it by more than `MIN_BIAS` of its
     standard errors, or if the residuals are far larger than the noise, so that no standard error is reliable."""
     if missing is None or found.covariance is None:
         return
     # of the free parameters, which come before the tied ones
-    errors = np.sqrt(np.diag(found.covariance))[: len(missing.moved)]
-    moved = np.abs(missing.moved) / np.where(errors > 0, errors, np.inf)
-    most = int(np.argmax(moved))
-    if moved[most] > MAKES_UP:
-        wrong = f", and without it {found.covariance_names[most]} is biased by more than its standard error"
+    errors = np.sqrt(np.diag(found.covariance))[: len(missing.bias)]
+    bias = np.abs(missing.bias) / np.where(errors > 0, errors, np.inf)
+    worst = int(np.argmax(bias))
+    if bias[worst] > MIN_BIAS:
+        wrong = f", and without it {found.covariance_names[worst]} is biased by more than its standard error"
     elif found.missed:
         wrong = ""
     else:
         return
     yield (
         f"dry friction of about {missing.friction_Nm:.2g} N m would explain part of the residuals "
-        f"({missing.errors:.0f} standard errors){wrong}: add `--effect {DRY}`, or run `pmdc diagnose` to find what "
-        "is missing"
+        f"({missing.z_score:.0f} standard errors){wrong}: add `--effect {FRICTION}`, or run `pmdc diagnose` to find "
+        "what is missing"
     )
 
 
-def _rows(given: Prepared, fit: Fit) -> list[Series]:
+def _regression_columns(given: Prepared, fit: Fit) -> list[Series]:
     """Columns of the regression for each training run, in A and rad/s: the derivatives with respect to the motor's
     parameters, the response to 1 N m of dry friction, the derivatives with respect to the run's own unknowns, and last
     the residual."""
     problem, tape = given.problem, given.problem.tape
     motor, count = problem.parameters(fit.coordinates), len(problem.free)
-    of_grid = {tape.grid_of(run): run for run in training_runs(given)}
+    of_grid = {tape.grid_of(run): run for run in training_indices(given)}
     filters = {grid: _load_filter(motor, tape, run) for grid, run in of_grid.items()}
     J = np.asarray(fit.evaluation.jacobian) * fit.noise[:, None, None]
     rows = []
-    for run, residual in zip(training_runs(given), residuals_of(given, fit), strict=True):
+    for run, residual in zip(training_indices(given), residuals_of(given, fit), strict=True):
         speed = np.asarray(fit.evaluation.seen)[tape.blocks_of(run), 1].ravel()
         _, outputs = residual.kind
-        friction = _response(filters[tape.grid_of(run)], np.sign(speed))
+        friction = _load_response(filters[tape.grid_of(run)], np.sign(speed))
         if (averaging := given.runs[run].averaging) is not None:
-            friction[:, 1] = averaging.of(friction[:, 1])
+            friction[:, 1] = averaging.applied_to(friction[:, 1])
         friction = friction[:, list(outputs)]
         derivatives = series_of(tape, run, J).values
         columns = (derivatives[..., :count], friction, derivatives[..., count:], residual.values)
@@ -115,7 +117,7 @@ def _load_filter(motor: Motor, tape: Tape, run: int) -> LoadFilter:
     return numerators, np.asarray(denominator)
 
 
-def _response(
+def _load_response(
     of_load: LoadFilter, load: Float[np.ndarray, " samples"]
 ) -> Float[np.ndarray, "samples 2"]:
     numerators, denominator = of_load
@@ -126,40 +128,42 @@ class _Regression(NamedTuple):
     """Least squares of the residuals on the columns shared by all runs and on each run's own."""
 
     coefficients: Float[np.ndarray, " shared"]
-    errors: Float[np.ndarray, " shared"]
-    left: list[Series]
+    # for residuals of unit variance, as a whitener scales them
+    standard_errors: Float[np.ndarray, " shared"]
+    residuals: list[Series]  # of the regression, before whitening
 
-    def score(self, k: int) -> float:
+    def z_score(self, k: int) -> float:
         """A coefficient in standard errors; zero where no row depends on it."""
-        return float(self.coefficients[k] / self.errors[k]) if self.errors[k] > 0 else 0.0
+        error = self.standard_errors[k]
+        return float(self.coefficients[k] / error) if error > 0 else 0.0
 
 
-def _regressed(rows: Sequence[Series], white: Whitener, count: int) -> _Regression:
+def _regress(rows: Sequence[Series], whiten: Whitener, count: int) -> _Regression:
     shared = [*range(count + 1), -1]  # the motor's columns, that of friction, and the residual
     own = slice(count + 1, count + 1 + UNKNOWNS_PER_RUN)
-    total, of_own = np.zeros((len(shared), len(shared))), []
+    normal, projections = np.zeros((len(shared), len(shared))), []
     for run, series in enumerate(rows):
-        made = white(run, series)
-        kept, alone = made[:, shared], made[:, own]
-        solved = _inverse(alone.T @ alone) @ alone.T @ kept
-        kept = kept - alone @ solved
-        total += kept.T @ kept
-        of_own.append(solved)
-    inverse = _inverse(total[:-1, :-1])
-    coefficients = inverse @ total[:-1, -1]
-    left = [
+        white = whiten(run, series)
+        of_all, of_run = white[:, shared], white[:, own]
+        projection = _inverse(of_run.T @ of_run) @ of_run.T @ of_all
+        orthogonal = of_all - of_run @ projection
+        normal += orthogonal.T @ orthogonal
+        projections.append(projection)
+    inverse = _inverse(normal[:-1, :-1])
+    coefficients = inverse @ normal[:-1, -1]
+    residuals = [
         series._replace(
             values=series.values[..., -1]
             - series.values[..., shared[:-1]] @ coefficients
-            - series.values[..., own] @ (solved[:, -1] - solved[:, :-1] @ coefficients)
+            - series.values[..., own] @ (projection[:, -1] - projection[:, :-1] @ coefficients)
         )
-        for series, solved in zip(rows, of_own, strict=True)
+        for series, projection in zip(rows, projections, strict=True)
     ]
-    return _Regression(coefficients, np.sqrt(np.maximum(np.diag(inverse), 0.0)), left)
+    return _Regression(coefficients, np.sqrt(np.maximum(np.diag(inverse), 0.0)), residuals)
 
 
 def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """The inverse on the directions that the rows determine."""
     lengths = np.sqrt(np.diag(matrix))
     units = np.outer(*2 * [np.where(lengths > 0, lengths, 1.0)])
-    return np.linalg.pinv(matrix / units, VISIBLE, hermitian=True) / units
+    return np.linalg.pinv(matrix / units, RANK_TOLERANCE, hermitian=True) / units

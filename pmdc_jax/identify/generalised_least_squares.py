@@ -14,59 +14,61 @@ from dataclasses import replace
 import numpy as np
 
 from ..simulate import Tape
-from .noise import FLOOR
+from .noise import MIN_RELATIVE_NOISE
 from .noise_model import Series, Whitener
-from .polish import WORTH, Fit, polish, reweighted
+from .polish import TOLERANCE, Fit, polish, reweighted
 from .prepare import Prepared
 from .whitening import Whitening
 
 # Gauss-Newton steps at most from a plain fit to one with whitened residuals
-STEPS = 8
+MAX_STEPS = 8
 # Largest sum of plain squared residuals of the whitened fit, over that of plain least squares
-NEAR = 1.1
+MAX_FITNESS_RATIO = 1.1
 
 
-def last_fit(given: Prepared, plainly: Fit, near: Fit, white: Whitener) -> tuple[Prepared, Fit]:
-    """The fit with whitened residuals, started from a fit `near` it; the plain fit if its residuals are white already.
+def last_fit(given: Prepared, plain_fit: Fit, start: Fit, white: Whitener) -> tuple[Prepared, Fit]:
+    """The fit with whitened residuals, from a `start` near it; the plain fit if its residuals are white already.
 
     The plain fit is also kept where the other one reproduces the runs clearly worse, because the motor has an effect
     that the model lacks or a formula is only approximate: the filter then takes what is missing for noise.
     """
-    if white.is_white or _is_exact(given, plainly):
-        return given, plainly
-    sharp = sharpened(given, near, white)
-    as_it_is = polish(given.problem, sharp[1].optimum, steps=0).fitness
-    return sharp if as_it_is < NEAR * plainly.fitness else (given, plainly)
+    if white.is_white or _is_exact(given, plain_fit):
+        return given, plain_fit
+    problem, fit = fit_whitened(given, start, white)
+    fitness = polish(given.problem, fit.optimum, steps=0).fitness  # without whitening
+    keeps = fitness < MAX_FITNESS_RATIO * plain_fit.fitness
+    return (problem, fit) if keeps else (given, plain_fit)
 
 
 def _is_exact(given: Prepared, fit: Fit) -> bool:
     """Whether the residuals are only rounding errors, as in a fit to a simulation without noise."""
-    there = given.problem.samples > 0
-    return bool(np.all(fit.noise[there] < 2 * FLOOR * given.problem.sizes[there]))
+    measured = given.problem.samples > 0
+    least = MIN_RELATIVE_NOISE * given.problem.measured_rms
+    return bool(np.all(fit.noise[measured] < 2 * least[measured]))
 
 
-def sharpened(
-    given: Prepared, near: Fit, white: Whitener, worth: float = WORTH
+def fit_whitened(
+    given: Prepared, start: Fit, white: Whitener, tolerance: float = TOLERANCE
 ) -> tuple[Prepared, Fit]:
     """The problem with whitened residuals, and its solution started from a plain fit nearby."""
-    given = whitened(given, white)
-    known = reweighted(given.problem, near)
-    return given, polish(given.problem, near.optimum, STEPS, worth, known)
+    given = with_whitening(given, white)
+    known = reweighted(given.problem, start)
+    return given, polish(given.problem, start.optimum, MAX_STEPS, tolerance, known)
 
 
-def squares_of(given: Prepared, polished: Fit) -> float:
+def sum_of_squares(given: Prepared, polished: Fit) -> float:
     """The sum of squared residuals of a fit over the training runs."""
     residuals = np.asarray(polished.evaluation.residuals)
     return float(np.square(residuals[given.problem.fitted_blocks]).sum())
 
 
-def whitened(given: Prepared, white: Whitener) -> Prepared:
+def with_whitening(given: Prepared, white: Whitener) -> Prepared:
     """The problem with whitened residuals."""
     tape, noise = given.problem.tape, np.asarray(given.problem.noise)
     filters = [np.zeros((0, 2, 2))] * tape.runs
     # hold-out runs have no filter, only the scale of the noise
     scales = [np.diag(1 / noise)] * tape.runs
-    for run, A, S in zip(training_runs(given), white.filters, white.scales, strict=True):
+    for run, A, S in zip(training_indices(given), white.filters, white.scales, strict=True):
         both = np.ix_(*2 * [_outputs(tape, run)])
         filters[run], scales[run] = np.zeros((len(A), 2, 2)), np.zeros((2, 2))
         filters[run][:, *both], scales[run][both] = A, S
@@ -74,7 +76,7 @@ def whitened(given: Prepared, white: Whitener) -> Prepared:
     return given._replace(problem=replace(given.problem, whitening=whitening))
 
 
-def training_runs(given: Prepared) -> list[int]:
+def training_indices(given: Prepared) -> list[int]:
     """Indices of the training runs."""
     return [run for run, role in enumerate(given.roles) if role == "train"]
 
@@ -82,7 +84,7 @@ def training_runs(given: Prepared) -> list[int]:
 def residuals_of(given: Prepared, fit: Fit) -> list[Series]:
     """Measured minus simulated outputs, A and rad/s, of each training run in the order of time."""
     signal = -np.asarray(fit.evaluation.residuals) * fit.noise[:, None]
-    return [series_of(given.problem.tape, run, signal) for run in training_runs(given)]
+    return [series_of(given.problem.tape, run, signal) for run in training_indices(given)]
 
 
 def series_of(tape: Tape, run: int, signal: np.ndarray) -> Series:

@@ -11,15 +11,15 @@ from .identification import Direction
 from .parameters import Parameters
 
 # A parameter belongs to an unseen direction if it makes up at least this share of it.
-SHARE = 0.05
+MIN_SHARE = 0.05
 
 
 def moved_by(direction: np.ndarray, parameters: Parameters) -> tuple[str, ...]:
     """The parameters that belong to a direction."""
-    return tuple(n for n, x in zip(parameters.names, direction, strict=True) if abs(x) > SHARE)
+    return tuple(n for n, x in zip(parameters.names, direction, strict=True) if abs(x) > MIN_SHARE)
 
 
-def explain(
+def explain_directions(
     unseen: Sequence[np.ndarray], parameters: Parameters, recordings: Sequence[Recording]
 ) -> tuple[Direction, ...]:
     """For each unseen direction: which parameters it moves together, why the data do not determine it, and a remedy."""

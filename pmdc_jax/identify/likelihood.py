@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from .generalised_least_squares import series_of, training_runs
+from .generalised_least_squares import series_of, training_indices
 from .noise_model import Series, whitener
 from .polish import Fit
 from .prepare import Prepared
 
 # Gain in log-likelihood from which a recording is interpreted in another way than by default
-LIKELIER = 30.0
+MIN_LOG_LIKELIHOOD_GAIN = 30.0
 
 
 def negative_log_likelihood(given: Prepared, fit: Fit) -> float:
@@ -22,7 +22,7 @@ def negative_log_likelihood(given: Prepared, fit: Fit) -> float:
     **Source**: Ljung, "System Identification", 2nd edition, section 7.4.
     """
     tape, seen, total = given.problem.tape, np.asarray(fit.evaluation.seen), 0.0
-    for run in training_runs(given):
+    for run in training_indices(given):
         measured = series_of(tape, run, np.asarray(tape.measured))
         simulated = series_of(tape, run, seen).values
         residual = Series(measured.values - simulated, measured.known, measured.kind)

@@ -19,9 +19,9 @@ from .search import search
 # As fast to evaluate as a smaller one: the time goes into walking through the samples one after another
 POPULATION, GENERATIONS = 64, 20
 # Ranks of the candidates, best first, that are tried until one can be evaluated with derivatives in all runs
-RANKS = (0, 1, 3, 7, 15, 31)
+TRIED_RANKS = (0, 1, 3, 7, 15, 31)
 # Samples that suffice to determine a few parameters (at least one run is used)
-ENOUGH = 2**13
+MAX_SAMPLES = 2**13
 
 
 def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: int) -> Optimum:
@@ -36,26 +36,26 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     bounds = {name: (value, value) for name, value in values.items() if name in PARAMETERS}
     for name, factor in factors.items():
         effect, _, field = name.partition(".")
-        its = next(e for e in parameters.effects if e.name == effect).ranges[field]
+        limits = next(e for e in parameters.effects if e.name == effect).ranges[field]
         bounds[name] = (
-            max(values[name] / factor, its.lower),
-            min(values[name] * factor, its.upper),
+            max(values[name] / factor, limits.lower),
+            min(values[name] * factor, limits.upper),
         )
     known = {name: float(value) for name, value in parameters.known.items()}
     known |= {name: value for name, value in values.items() if name not in factors}
-    sought = Parameters.of(bounds, parameters.effects, known, parameters.ties)
+    free = Parameters.of(bounds, parameters.effects, known, parameters.ties)
     # a fit that cannot be simulated has no finite noise
     noise = np.where(np.isfinite(fit.noise), fit.noise, problem.noise)
     found = search(
-        sought,
-        _telling_runs(problem, fit),
+        free,
+        _worst_fitted_runs(problem, fit),
         noise,
         seed=seed,
         population=POPULATION,
         generations=GENERATIONS,
     )
-    places = [parameters.names.index(name) for name in sought.names]
-    for rank in RANKS:
+    places = [parameters.names.index(name) for name in free.names]
+    for rank in TRIED_RANKS:
         coordinates[places] = found.candidates[rank]
         unknowns = fit.unknowns._replace(coordinates=jnp.asarray(coordinates))
         best = Optimum(unknowns, np.inf, (), False)
@@ -64,7 +64,7 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     return fit.optimum
 
 
-def _telling_runs(problem: Problem, fit: Fit) -> Tape:
+def _worst_fitted_runs(problem: Problem, fit: Fit) -> Tape:
     """The few runs with the largest residuals per block, with the initial state and load of their own unknowns."""
     tape, unknowns = problem.tape, fit.unknowns
     run = np.asarray(tape.run)[problem.fitted_blocks]
@@ -73,11 +73,11 @@ def _telling_runs(problem: Problem, fit: Fit) -> Tape:
     left = np.bincount(of_run, np.square(residuals).sum((1, 2))) / blocks
     order = np.argsort(-left, kind="stable")
     samples = np.cumsum(blocks[order]) * tape.value.shape[1]
-    telling = runs[order[: max(1, np.searchsorted(samples, ENOUGH, side="right"))]]
+    worst = runs[order[: max(1, np.searchsorted(samples, MAX_SAMPLES, side="right"))]]
     offset = jnp.where(tape.load_unknown, unknowns.runs.load_offset, 0.0)[tape.run]
-    begun = replace(
+    from_fit = replace(
         tape,
         load=tape.load + offset[:, None],
         initial=jnp.stack([unknowns.runs.current, unknowns.runs.speed], 1),
     )
-    return begun.of_runs(telling.tolist())
+    return from_fit.of_runs(worst.tolist())

@@ -9,12 +9,14 @@ from jaxtyping import Float
 
 from ..differences import noise_by_differences
 
-# Least noise of an output, as a share of its root mean square: a simulation without noise needs some scale, too.
-FLOOR = 1e-5
+# Least noise of an output, as a share of its root mean square: a simulation without noise needs some scale, too. For an
+# output that is zero throughout, the least in its unit.
+MIN_RELATIVE_NOISE, MIN_NOISE = 1e-5, 1e-12
 # Steps below this share of the largest one are rounding errors
-ROUNDING = 1e-9
-# Remainders below this share of the largest number are zero; a common divisor below this share (20 bits) is none
-MULTIPLE, RESOLVED = 1e-8, 1e-6
+ROUNDING_ERROR = 1e-9
+# Euclid's algorithm, as shares of the largest number: remainders below this are zero, and a common divisor below this
+# (20 bits) is none
+ZERO_REMAINDER, MIN_DIVISOR = 1e-8, 1e-6
 
 
 def white_noise(signals: Sequence[np.ndarray]) -> float | None:
@@ -28,7 +30,7 @@ def white_noise(signals: Sequence[np.ndarray]) -> float | None:
         return None
     size = np.sqrt(np.mean([np.nanmean(np.square(s)) for s in signals]))
     spread = noise_by_differences(2, *known)
-    return float(max(spread, resolution_noise(known), FLOOR * size, 1e-12))
+    return float(max(spread, resolution_noise(known), MIN_RELATIVE_NOISE * size, MIN_NOISE))
 
 
 def noise_of_sensor(measured: np.ndarray, left: np.ndarray) -> float:
@@ -51,16 +53,16 @@ def resolution_noise(signals: Sequence[np.ndarray]) -> float:
     return quantum(np.concatenate([np.diff(s) for s in signals])) / np.sqrt(12.0)
 
 
-def resolution(values: Float[np.ndarray, " values"]) -> float:
+def common_divisor(values: Float[np.ndarray, " values"]) -> float:
     """The largest number of which all values are multiples, zero if there is none: by Euclid's algorithm, with
     remainders of either sign."""
     sizes = np.unique(np.abs(values))
-    least, found = MULTIPLE * sizes[-1], 0.0
+    least, found = ZERO_REMAINDER * sizes[-1], 0.0
     for size in sizes[sizes > least]:
         rest = float(size)
         while rest > least:
             found, rest = rest, abs(found - rest * np.round(found / rest))
-        if found < RESOLVED * sizes[-1]:
+        if found < MIN_DIVISOR * sizes[-1]:
             return 0.0
     return found
 
@@ -69,19 +71,19 @@ def quantum(steps: Float[np.ndarray, " steps"]) -> float:
     """The step of which (nearly) all steps are multiples, zero if there is none; NaN are ignored."""
     sizes = np.abs(steps[~np.isnan(steps)])
     # differences of equal values that were computed by division may be a rounding error instead of zero
-    sizes = sizes[sizes > ROUNDING * np.max(sizes, initial=0.0)]
+    sizes = sizes[sizes > ROUNDING_ERROR * np.max(sizes, initial=0.0)]
     if not len(sizes):
         return 0.0
     # the smallest step may be an outlier, a quantile may be a multiple of the quantum
     for smallest in (np.quantile(sizes, 0.01), np.min(sizes)):
-        step = _of_multiples(sizes, float(smallest))
+        step = _refined_quantum(sizes, float(smallest))
         off = np.abs(sizes / step - np.round(sizes / step))
         if np.mean(off < 0.02) > 0.95:
             return step
     return 0.0
 
 
-def _of_multiples(sizes: Float[np.ndarray, " steps"], step: float) -> float:
+def _refined_quantum(sizes: Float[np.ndarray, " steps"], step: float) -> float:
     """The step of which the sizes are multiples, refined from a rough one: larger multiples determine it better."""
     for reach in (10, 100, np.inf):
         near = sizes[sizes < reach * step]

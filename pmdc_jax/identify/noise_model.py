@@ -17,14 +17,14 @@ import numpy as np
 from attrs import frozen
 from jaxtyping import Bool, Float
 
-from .whitening import band, remembered
+from .whitening import band_matrix, with_history
 
 # Orders that are tried, none above `CHUNK`; the Bayesian information criterion chooses.
 ORDERS = (1, 2, 4, 8, 12, 20, 30)
 # Noise of different runs is equal if its logarithm differs by less
-ALIKE = 0.2
+MAX_LOG_NOISE_SPREAD = 0.2
 # Number of frequencies of a run, from the lowest on, that count as slow
-SLOWEST = 15
+SLOW_FREQUENCIES = 15
 
 Rows = Float[np.ndarray, "samples outputs *columns"]
 
@@ -50,7 +50,10 @@ class Whitener:
         sizes: dict[tuple[int, ...], list[np.ndarray]] = {}
         for S in self.scales:
             sizes.setdefault(S.shape, []).append(np.sqrt(np.diag(np.linalg.inv(S @ S.T))))
-        alike = all(np.ptp(np.log(of_kind), axis=0).max() < ALIKE for of_kind in sizes.values())
+        alike = all(
+            np.ptp(np.log(of_kind), axis=0).max() < MAX_LOG_NOISE_SPREAD
+            for of_kind in sizes.values()
+        )
         return alike and not any(len(A) for A in self.filters)
 
     def __call__(self, run: int, series: Series) -> Float[np.ndarray, "rows *columns"]:
@@ -64,10 +67,10 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
 
     **Arguments**: `residuals`, one `Series` per run, `values` (samples, outputs).
     """
-    of_kind = {}
+    by_kind = {}
     for kind in dict.fromkeys(series.kind for series in residuals):
-        of_kind[kind] = _autoregression([s for s in residuals if s.kind == kind])
-    filters = [of_kind[series.kind] for series in residuals]
+        by_kind[kind] = _autoregression([s for s in residuals if s.kind == kind])
+    filters = [by_kind[series.kind] for series in residuals]
     scales = _scales(residuals, filters)
     slow = [
         _slow_power(_filtered(series, A, S))
@@ -76,7 +79,7 @@ def whitener(residuals: Sequence[Series]) -> Whitener:
     return Whitener(filters, [S / np.sqrt(s) for S, s in zip(scales, slow, strict=True)])
 
 
-def plain(residuals: Sequence[Series]) -> Whitener:
+def scaling_whitener(residuals: Sequence[Series]) -> Whitener:
     """A whitener without filters, only with the scale of each run."""
     filters = [np.zeros((0, *2 * s.values.shape[1:2])) for s in residuals]
     return Whitener(filters, _scales(residuals, filters))
@@ -88,7 +91,7 @@ def _slow_power(white: Rows) -> float:
     A short filter cannot remove errors that last, such as those of a coarse encoder while the motor hardly turns. A
     run with such noise is given less weight.
     """
-    count = min(SLOWEST, len(white) // 4)
+    count = min(SLOW_FREQUENCIES, len(white) // 4)
     if not count:
         return 1.0
     power = np.abs(np.fft.rfft(white, axis=0)[1 : count + 1]) ** 2 / len(white)
@@ -110,17 +113,18 @@ def _scales(
 
 
 def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order outputs outputs"]:
-    """Coefficients A_k of r(t) = sum_k A_k r(t - k) + white noise, of the order with the lowest criterion.
+    """Coefficients A_k of r(t) = sum_k A_k r(t - k) + white noise, of the order with the lowest Bayesian
+    information criterion.
 
     Each run is weighted by the inverse of its variance, because noise may differ between runs.
     """
     outputs, longest = residuals[0].values.shape[1], max(ORDERS)
     lagged = [_lagged(series, longest) for series in residuals]
-    units = np.sqrt(np.mean(np.square(np.concatenate(lagged)), axis=0))[:outputs] + 1e-300
+    rms = np.sqrt(np.mean(np.square(np.concatenate(lagged)), axis=0))[:outputs] + 1e-300
     size, rows = outputs * (longest + 1), sum(len(x) for x in lagged)
     gram = np.zeros((size, size))
     for x in lagged:
-        scaled = x / np.tile(units, longest + 1)
+        scaled = x / np.tile(rms, longest + 1)
         gram += scaled.T @ scaled / (np.mean(np.square(scaled)) + 1e-300)
     best = rows * np.linalg.slogdet(gram[:outputs, :outputs] / max(rows, 1))[1]
     chosen = np.zeros((0, outputs, outputs))
@@ -130,18 +134,18 @@ def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order out
         now, past = slice(0, outputs), slice(outputs, outputs * (order + 1))
         ridge = 1e-9 * np.trace(gram[past, past]) * np.eye(order * outputs) / (order * outputs)
         coefficients = np.linalg.solve(gram[past, past] + ridge, gram[past, now])
-        left = gram[now, now] - gram[now, past] @ coefficients
-        criterion = rows * np.linalg.slogdet(left / rows)[1] + order * outputs**2 * np.log(rows)
-        if criterion < best:
-            best = criterion
+        innovations = (gram[now, now] - gram[now, past] @ coefficients) / rows
+        bic = rows * np.linalg.slogdet(innovations)[1] + order * outputs**2 * np.log(rows)
+        if bic < best:
+            best = bic
             chosen = coefficients.reshape(order, outputs, outputs).transpose(0, 2, 1)
-    return chosen * units[:, None] / units
+    return chosen * rms[:, None] / rms
 
 
 def _lagged(series: Series, order: int) -> Float[np.ndarray, "rows lags"]:
     values = series.values
     whole = np.concatenate([values[order - k : len(values) - k] for k in range(order + 1)], axis=1)
-    return whole[remembered(series.known, order)[order:]]
+    return whole[with_history(series.known, order)[order:]]
 
 
 def _filtered(
@@ -151,12 +155,12 @@ def _filtered(
 ) -> Rows:
     values, order, outputs = series.values, len(filters), series.values.shape[1]
     flat = np.ascontiguousarray(values).reshape(len(values) * outputs, -1)
-    by_chunk = band(filters, np.eye(outputs) if scale is None else scale)
+    by_chunk = band_matrix(filters, np.eye(outputs) if scale is None else scale)
     rest = np.empty(((len(values) - order) * outputs, flat.shape[1]))
     for first in range(0, len(rest), len(by_chunk)):
         window = flat[first : first + by_chunk.shape[1]]
         part = rest[first : first + len(by_chunk)]
         np.matmul(by_chunk[: len(part), : len(window)], window, out=part)
     rest = rest.reshape(len(values) - order, *values.shape[1:])
-    whole = remembered(series.known, order)[order:]
+    whole = with_history(series.known, order)[order:]
     return rest if whole.all() else rest[whole]

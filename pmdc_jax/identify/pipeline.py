@@ -11,7 +11,7 @@ from ..compiled import free_memory_maps
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..recording_file import Runs
-from .friction_test import missing_friction, of_friction
+from .friction_test import friction_messages, missing_friction
 from .generalised_least_squares import last_fit, residuals_of
 from .identification import Identification
 from .noise_model import whitener
@@ -55,17 +55,17 @@ def identify(
     )
     given, solved = solve(given, search, seed, progress)
     report("estimating the uncertainty", solved.fit.fitness)
-    plainly = solved.fit
-    friction = missing_friction(given, plainly)
-    white = whitener(residuals_of(given, plainly))
-    given, polished = last_fit(given, plainly, plainly, white)
+    plain_fit = solved.fit
+    friction = missing_friction(given, plain_fit)
+    white = whitener(residuals_of(given, plain_fit))
+    given, polished = last_fit(given, plain_fit, plain_fit, white)
     found = results_of(given, solved._replace(fit=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
-    left = (
+    residual_messages = (
         f"the residual of the {name} is {times:.2g} times its white noise: run `pmdc diagnose` to find out whether the "
         "model lacks an effect, or the motor or a sensor was disturbed"
         for name, times in found.missed.items()
     )
-    doubts = (*of_friction(friction, found), *left)
+    doubts = (*friction_messages(friction, found), *residual_messages)
     messages = (*found.messages, *doubts)
     return attrs.evolve(found, seconds=seconds, messages=messages, doubts=doubts)

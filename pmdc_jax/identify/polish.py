@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..simulate import RunUnknowns
 from ..threads import map_in_threads
-from .noise import FLOOR
+from .noise import MIN_RELATIVE_NOISE
 from .parameters import Parameters
 from .problem import (
     Evaluation,
@@ -23,24 +23,24 @@ from .problem import (
     flatten,
     normal_matrix,
     unflatten,
-    weighed,
+    whitened,
 )
 from .refine import Optimum
 
-# The polish stops if the cost fell by less than IDLE over the last PATIENCE steps: dry elements leave kinks, at which
-# the linearised model predicts a larger reduction than there is
-PATIENCE, IDLE = 5, 1e-5
+# The polish stops if the cost fell by less than MIN_COST_DECREASE over the last PATIENCE steps: dry elements leave
+# kinks, at which the linearised model predicts a larger reduction than there is
+PATIENCE, MIN_COST_DECREASE = 5, 1e-5
 # Gauss-Newton steps at most, and the predicted reduction of the sum of squares, in noise variances, below which no
 # step is taken: the square of 0.03 standard errors
-POLISH = 20
-WORTH = 1e-3
+MAX_STEPS = 20
+TOLERANCE = 1e-3
 # Predicted reduction that still counts as converged where no step lowers the sum of squares, at the kinks of dry
 # elements: the square of 0.3 standard errors
-AT_KINK = 0.1
+KINK_TOLERANCE = 0.1
 # Initial twists tried for a run, as shares of the gear's backlash, from where the load presses the teeth
 BACKLASH_STARTS = np.linspace(-1.0, 1.0, 9)
 # Initial rotor angles tried per period of an angle-dependent torque (the shortest one), and at most
-ANGLES, MOST_ANGLES = 8, 32
+ANGLES_PER_PERIOD, MAX_ANGLES = 8, 32
 # Curvature added to every coordinate in a step, as a prior that knows each to within a factor of e: negligible for a
 # coordinate that the data determine, while one that they do not determine stays where it is
 RIDGE = 1.0
@@ -76,36 +76,37 @@ class Fit(NamedTuple):
 
 def polish(
     problem: Problem,
-    end: Optimum,
-    steps: int = POLISH,
-    worth: float = WORTH,
+    start: Optimum,
+    steps: int = MAX_STEPS,
+    tolerance: float = TOLERANCE,
     known: Evaluation | None = None,
 ) -> Fit:
     """Gauss-Newton iterations in which each output is weighted by the standard deviation of its own residuals.
 
     Convergence is judged by the gradient: no step within the bounds is predicted to lower the sum of squares by more
-    than `worth`, in noise variances (`AT_KINK` where no step that lowers it is found). A coordinate held at a bound is
-    released where the gradient points back inside. `known` is the evaluation at the start, if there is one already.
+    than `tolerance`, in noise variances (`KINK_TOLERANCE` where no step that lowers it is found). A coordinate held at
+    a bound is released where the gradient points back inside. `known` is the evaluation at the start, if there is one
+    already.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
-    trial, held, share = end.unknowns, set(end.at_bound), 1.0
-    best, converged = _weighed(problem, trial, known), False
-    reached, step, gain = best, np.zeros(len(flatten(trial))), np.inf
+    held, converged = set(start.at_bound), False
+    best = trial = _evaluate_weighted(problem, start.unknowns, known)
+    step, share, gain = np.zeros(len(flatten(start.unknowns))), 1.0, np.inf
     costs = [best.cost]
     for _ in range(steps):
-        if len(costs) > PATIENCE and costs[-1 - PATIENCE] - costs[-1] < IDLE:
+        if len(costs) > PATIENCE and costs[-1 - PATIENCE] - costs[-1] < MIN_COST_DECREASE:
             break
         if not np.isfinite(best.cost):
             break  # a failed simulation has no gradient
-        if reached.cost > best.cost + 1e-9 and share > 1e-3:
-            share /= 4  # the last step was too long
-        elif reached.cost <= best.cost + 1e-9:
-            best, share = reached, 1.0
-            start = np.asarray(best.unknowns.coordinates)
-            held = {k for k in held if (best.matrix[k, -1] > 0) == (start[k] <= low[k])}
+        if trial.cost <= best.cost + 1e-9:
+            best, share = trial, 1.0
+            coordinates = np.asarray(best.unknowns.coordinates)
+            held = {k for k in held if (best.matrix[k, -1] > 0) == (coordinates[k] <= low[k])}
             step, gain = gauss_newton_step(best.matrix, held, len(low))
-            if converged := gain <= worth * _variance(problem, best):
+            if converged := gain <= tolerance * _residual_variance(problem, best):
                 break
+        elif share > 1e-3:
+            share /= 4  # the last step was too long
         else:
             break
         moved = np.asarray(flatten(best.unknowns)) + _damped_log_step(
@@ -114,9 +115,9 @@ def polish(
         inside = np.clip(moved[: len(low)], low, high)
         held |= set(np.flatnonzero(inside != moved[: len(low)]).tolist())
         moved[: len(low)] = inside
-        reached = _weighed(problem, unflatten(problem, jnp.asarray(moved)))
-        costs.append(min(reached.cost, best.cost))
-    converged = converged or gain <= AT_KINK * _variance(problem, best)
+        trial = _evaluate_weighted(problem, unflatten(problem, jnp.asarray(moved)))
+        costs.append(min(trial.cost, best.cost))
+    converged = converged or gain <= KINK_TOLERANCE * _residual_variance(problem, best)
     optimum = Optimum(best.unknowns, best.fitness, tuple(sorted(held)), bool(converged))
     return Fit(optimum, best.evaluation, best.noise)
 
@@ -129,7 +130,7 @@ def _damped_log_step(parameters: Parameters, step: np.ndarray) -> np.ndarray:
     return np.where(rises & (step > 0), np.log1p(np.maximum(step, 0.0)), step)
 
 
-class _Weighed(NamedTuple):
+class _WeightedPoint(NamedTuple):
     """An evaluated point, each output weighted by its own residuals."""
 
     unknowns: Unknowns
@@ -142,7 +143,7 @@ class _Weighed(NamedTuple):
     fitness: float
 
 
-def _variance(problem: Problem, best: _Weighed) -> float:
+def _residual_variance(problem: Problem, best: _WeightedPoint) -> float:
     """Mean square of the weighted residuals. Unless they are whitened it is at least 1, the noise they are weighted by:
     fitted to a simulation without noise they are next to nothing."""
     mean = best.matrix[-1, -1] / problem.most_samples
@@ -151,14 +152,16 @@ def _variance(problem: Problem, best: _Weighed) -> float:
 
 def reweighted(problem: Problem, fit: Fit) -> Evaluation:
     """The evaluation at a fit to plain residuals, weighted as in a problem with another noise."""
-    return weighed(problem, _scaled(fit.evaluation, fit.noise / np.asarray(problem.noise)))
+    return whitened(problem, _scaled(fit.evaluation, fit.noise / np.asarray(problem.noise)))
 
 
-def _weighed(problem: Problem, unknowns: Unknowns, known: Evaluation | None = None) -> _Weighed:
+def _evaluate_weighted(
+    problem: Problem, unknowns: Unknowns, known: Evaluation | None = None
+) -> _WeightedPoint:
     evaluation = evaluate(problem, unknowns) if known is None else known
     with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
         squares = np.square(np.asarray(evaluation.residuals)[problem.fitted_blocks]).sum((0, 2))
-        noise, stretch = _own_noise(problem, squares)
+        noise, stretch = _residual_noise(problem, squares)
         scaled = _scaled(evaluation, stretch)
         matrix = np.array(normal_matrix(scaled, problem.tape, problem.fitted_runs))
         if problem.whitening is not None:
@@ -169,11 +172,11 @@ def _weighed(problem: Problem, unknowns: Unknowns, known: Evaluation | None = No
     fitness = float(squares.sum()) / problem.most_samples
     # a failed simulation is infinitely bad
     cost, fitness = (x if np.isfinite(x) else np.inf for x in (cost, fitness))
-    return _Weighed(unknowns, scaled, noise, matrix, cost, fitness)
+    return _WeightedPoint(unknowns, scaled, noise, matrix, cost, fitness)
 
 
-def best_backlash_start(problem: Problem, unknowns: Unknowns, begun: RunUnknowns) -> Unknowns:
-    """Each run's own unknowns as they are, or `begun` with the teeth of its gear elsewhere within the backlash,
+def best_backlash_start(problem: Problem, unknowns: Unknowns, start: RunUnknowns) -> Unknowns:
+    """Each run's own unknowns as they are, or `start` with the teeth of its gear elsewhere within the backlash,
     whichever fits the run best.
 
     No gradient leads there: the moment at which the teeth first meet changes all that follows, and a run that begins
@@ -181,9 +184,9 @@ def best_backlash_start(problem: Problem, unknowns: Unknowns, begun: RunUnknowns
     """
     motor = problem.parameters(unknowns.coordinates)
     play = sum(float(effect.play()) for effect in motor.effects)
-    middle = jnp.zeros_like(begun.twist)
-    trials = [begun._replace(twist=middle + share * play) for share in BACKLASH_STARTS if play]
-    return _whichever_fits(problem, unknowns, trials)
+    middle = jnp.zeros_like(start.twist)
+    trials = [start._replace(twist=middle + share * play) for share in BACKLASH_STARTS if play]
+    return _best_run_unknowns(problem, unknowns, trials)
 
 
 def best_initial_angle(problem: Problem, unknowns: Unknowns) -> Unknowns:
@@ -194,21 +197,21 @@ def best_initial_angle(problem: Problem, unknowns: Unknowns) -> Unknowns:
     """
     waves = [e.repeats_after() for e in problem.parameters(unknowns.coordinates).effects]
     periods = [float(wave["angle"]) for wave in waves if "angle" in wave]
-    turnable = np.asarray(problem.turnable & ~jnp.asarray(problem.fitted_runs))
+    turnable = np.asarray(problem.angle_unknown & ~jnp.asarray(problem.fitted_runs))
     if not periods or not turnable.any():
         return unknowns
-    count = min(round(ANGLES * max(periods) / min(periods)), MOST_ANGLES)
+    count = min(round(ANGLES_PER_PERIOD * max(periods) / min(periods)), MAX_ANGLES)
     turns = [np.arange(1, count) / count * max(periods)]
     if len(periods) > 1:
         turns += [np.arange(1, round(2 * np.pi / period)) * period for period in periods]
     for some in turns:
-        begun = unknowns.runs
-        trials = [begun._replace(angle=begun.angle + turn * turnable) for turn in some]
-        unknowns = _whichever_fits(problem, unknowns, trials)
+        own = unknowns.runs
+        trials = [own._replace(angle=own.angle + turn * turnable) for turn in some]
+        unknowns = _best_run_unknowns(problem, unknowns, trials)
     return unknowns
 
 
-def _whichever_fits(
+def _best_run_unknowns(
     problem: Problem, unknowns: Unknowns, trials: Sequence[RunUnknowns]
 ) -> Unknowns:
     """Each run's own unknowns as they are, or those of the trial that fits it best."""
@@ -240,21 +243,21 @@ def fit_run_unknowns(
     A step that makes a run worse, because the teeth of a gear meet at another time for example, is shortened for that
     run.
     """
-    still = eqx.tree_at(lambda p: p.free, problem, jnp.zeros_like(problem.free))
+    fixed = eqx.tree_at(lambda p: p.free, problem, jnp.zeros_like(problem.free))
     run = np.asarray(problem.tape.run)
     everyone, share = jnp.ones(problem.tape.runs, bool), np.ones(problem.tape.runs)
 
-    unknowns = best_initial_angle(still, best_backlash_start(still, unknowns, unknowns.runs))
-    best = evaluate(still, unknowns)
+    unknowns = best_initial_angle(fixed, best_backlash_start(fixed, unknowns, unknowns.runs))
+    best = evaluate(fixed, unknowns)
     for _ in range(passes):
-        matrix = np.asarray(normal_matrix(best, still.tape, everyone))
+        matrix = np.asarray(normal_matrix(best, fixed.tape, everyone))
         flat, gain = gauss_newton_step(matrix, set(), 0)
-        if gain < WORTH * matrix[-1, -1] / problem.most_samples:
+        if gain < TOLERANCE * matrix[-1, -1] / problem.most_samples:
             break
         step = unflatten(problem, jnp.asarray(flat)).runs
         changes = zip(unknowns.runs, step, strict=True)
         trial = RunUnknowns(*(x + share * change for x, change in changes))
-        reached = evaluate(still, unknowns._replace(runs=trial))
+        reached = evaluate(fixed, unknowns._replace(runs=trial))
         # false where the trial cannot be simulated
         better = _squares_of_runs(problem, reached) <= _squares_of_runs(problem, best)
         share = np.where(better, 1.0, share / 4)
@@ -321,18 +324,18 @@ def gauss_newton_step(matrix: np.ndarray, held: set[int], count: int) -> tuple[n
     return -(vectors @ shrunk) / lengths * moves, float(along @ shrunk)
 
 
-def _own_noise(
+def _residual_noise(
     problem: Problem, squares: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Standard deviation of the residuals of each output, and the old scale over the new; whitened ones keep theirs.
 
-    It is at least `FLOOR` times the root mean square of the measurement: without noise, the likelihood is greatest
-    where one output is met exactly, whatever becomes of the other.
+    It is at least `MIN_RELATIVE_NOISE` times the root mean square of the measurement: without noise, the likelihood is
+    greatest where one output is met exactly, whatever becomes of the other.
     """
     if problem.whitening is not None:
         return np.asarray(problem.noise), np.ones(2)
     noise = np.asarray(problem.noise)
     ratio = np.sqrt(squares / np.maximum(problem.samples, 1.0))
-    ratio = np.maximum(ratio, FLOOR * problem.sizes / noise)
+    ratio = np.maximum(ratio, MIN_RELATIVE_NOISE * problem.measured_rms / noise)
     ratio = np.where(ratio == 0, 1.0, ratio)
     return noise * ratio, 1 / ratio

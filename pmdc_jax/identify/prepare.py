@@ -17,7 +17,7 @@ from ..clock import evenly_stamped
 from ..effects import AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS
-from ..recording import OUTPUTS_TOO, Averaging, Finding, Recording
+from ..recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
 from ..recording_file import Runs, recordings_of
 from ..simulate import Tape, uniform
 from ..unmeasured import without_unmeasured
@@ -37,7 +37,7 @@ class Prepared(NamedTuple):
     runs: list[Recording]  # evenly sampled
     roles: list[Role]
     findings: tuple[Finding, ...]
-    untouched: Mapping[str, float]
+    irrelevant: Mapping[str, float]  # parameters that affect no run, with a harmless value
     known: Mapping[str, float]
     ties: tuple[tuple[str, str], ...]
     problem: Problem
@@ -75,7 +75,7 @@ class Prepared(NamedTuple):
     ) -> Parameters:
         """The parameters of a motor with these effects; `bounds` overrides those of the search and of the effects."""
         bounds = {**search_bounds(self.training), **(bounds or {})}
-        return Parameters.of(bounds, effects, {**self.untouched, **self.known}, self.ties)
+        return Parameters.of(bounds, effects, {**self.irrelevant, **self.known}, self.ties)
 
     def with_effects(self, effects: Sequence[type[AbstractEffect]]) -> Prepared:
         """The same runs for a motor with other effects."""
@@ -104,14 +104,16 @@ def prepare(
     recordings, holdout = (
         [without_unmeasured(run) for run in recordings_of(runs)] for runs in (recordings, holdout)
     )
-    _refuse(recordings, holdout, tie, known)
+    _check_arguments(recordings, holdout, tie, known)
     findings = check([*recordings, *holdout])
-    _refuse_errors(findings)
+    _raise_errors(findings)
     runs = [uniform(evenly_stamped(r)) for r in (*recordings, *holdout)]
     training = runs[: len(recordings)]
     noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in ("current", "speed")])
-    untouched = _untouched(training, tie)
-    parameters = Parameters.of(search_bounds(training), effects, untouched | dict(known or {}), tie)
+    irrelevant = _irrelevant(training, tie)
+    parameters = Parameters.of(
+        search_bounds(training), effects, irrelevant | dict(known or {}), tie
+    )
     if not parameters.names:
         raise InputError(
             "--known",
@@ -132,7 +134,7 @@ def prepare(
         runs,
         roles,
         findings,
-        untouched,
+        irrelevant,
         dict(known or {}),
         tuple(tie),
         problem,
@@ -142,7 +144,7 @@ def prepare(
     )
 
 
-def _refuse(
+def _check_arguments(
     recordings: Sequence[Recording],
     holdout: Sequence[Recording],
     tie: Sequence[tuple[str, str]],
@@ -151,9 +153,11 @@ def _refuse(
     if not recordings:
         raise InputError("RUN", "there is no recording to fit", "Give at least one")
     for run in (*recordings, *holdout):
-        if not run.tells:
+        if not run.is_identifiable:
             what = f"too few columns to identify a motor, only {', '.join(run.columns())}"
-            raise InputError(run.source or run.name, what, f"Needed besides time: {OUTPUTS_TOO}")
+            raise InputError(
+                run.source or run.name, what, f"Needed besides time: {NEEDED_TO_IDENTIFY}"
+            )
     names = [r.name for r in (*recordings, *holdout)]
     for name in names:
         if names.count(name) > 1:
@@ -173,7 +177,7 @@ def _refuse(
             raise InputError("--known", f"{name}={value} is not positive", "Give a value in SI")
 
 
-def _refuse_errors(findings: Sequence[Finding]) -> None:
+def _raise_errors(findings: Sequence[Finding]) -> None:
     for finding in findings:
         if finding.severity == "error":
             where = ", ".join(filter(None, (finding.run, finding.column, finding.where)))
@@ -184,10 +188,12 @@ def _signals(recordings: Sequence[Recording], name: str) -> list[np.ndarray]:
     return [signal for r in recordings if (signal := getattr(r, name)) is not None]
 
 
-def _untouched(recordings: Sequence[Recording], tie: Sequence[tuple[str, str]]) -> dict[str, float]:
+def _irrelevant(
+    recordings: Sequence[Recording], tie: Sequence[tuple[str, str]]
+) -> dict[str, float]:
     """Parameters that affect no run, not even through a tie, with a harmless value."""
-    touched = {"held": "R L", "torque": "J f", "current": "Kt J f", "voltage": "R L Kb Kt J f"}
+    affecting = {"held": "R L", "torque": "J f", "current": "Kt J f", "voltage": "R L Kb Kt J f"}
     kinds = {"held" if r.held else r.drive for r in recordings}
-    known = {name for kind in kinds for name in touched[kind].split()}
-    known |= {source for target, source in tie if target in known}
-    return {name: 1.0 for name in PARAMETERS if name not in known}
+    relevant = {name for kind in kinds for name in affecting[kind].split()}
+    relevant |= {source for target, source in tie if target in relevant}
+    return {name: 1.0 for name in PARAMETERS if name not in relevant}

@@ -18,7 +18,7 @@ from .whitening import Whitening
 
 # Derivative of an output by an unknown, in noise standard deviations, from which a simulation counts as failed: it is
 # so sensitive that rounding errors make its derivatives meaningless
-WILD = 1e12
+MAX_SENSITIVITY = 1e12
 
 
 class Unknowns(NamedTuple):
@@ -64,13 +64,13 @@ class Problem(eqx.Module):
         return max(float(self.samples.max()), 1.0)
 
     @property
-    def sizes(self) -> Float[np.ndarray, "2"]:
+    def measured_rms(self) -> Float[np.ndarray, "2"]:
         """Root mean square of each output as measured in the training runs; zero where it was not measured."""
         squares = np.square(np.asarray(self.tape.measured)[self.fitted_blocks]).sum((0, 2))
         return np.sqrt(squares / np.maximum(self.samples, 1.0))
 
     @property
-    def angular(self) -> bool:
+    def depends_on_angle(self) -> bool:
         """Whether a torque depends on the rotor's angle."""
         return any("angle" in effect.states for effect in self.parameters.effects)
 
@@ -80,7 +80,7 @@ class Problem(eqx.Module):
         return any(effect.spring_state for effect in self.parameters.effects)
 
     @property
-    def turnable(self) -> Bool[Array, " runs"]:
+    def angle_unknown(self) -> Bool[Array, " runs"]:
         """Which runs have an unknown initial rotor angle."""
         tape, known = self.tape, jnp.asarray(self.tape.angle_known)
         # if no angle is known, that of the first run is the reference for the phases
@@ -88,12 +88,12 @@ class Problem(eqx.Module):
         measured = jax.ops.segment_sum(jnp.sum(tape.weight, (1, 2)), tape.run, tape.runs) > 0
         return measured & ~known & ~zero
 
-    def moves(self) -> Bool[Array, "runs columns"]:
+    def determinable(self) -> Bool[Array, "runs columns"]:
         """Which coordinates and which of its own unknowns each run can determine."""
         tape = self.tape
         first = jnp.argmax(jnp.asarray(tape.run)[None, :] == jnp.arange(tape.runs)[:, None], axis=1)
         drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid][first] > 0, tape.drive)
-        angle = self.turnable & self.angular
+        angle = self.angle_unknown & self.depends_on_angle
         load = jnp.asarray(tape.load_unknown)
         twist = self.has_spring & drive.free
         own = jnp.stack([drive.voltage, drive.free, load, angle, twist], 1)
@@ -118,21 +118,21 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
         # without whitening and nuisance, so that the simulation, slow to compile, is compiled only once
         bare = replace(problem, whitening=None, nuisance=None)
         simulated = (_evaluate if bare.parameters.effects else _evaluate_linear)(bare, unknowns)
-        return weighed(problem, _less_nuisance(problem, simulated))
+        return whitened(problem, _without_nuisance(problem, simulated))
 
 
-def weighed(problem: Problem, plain: Evaluation) -> Evaluation:
+def whitened(problem: Problem, plain: Evaluation) -> Evaluation:
     """The evaluation with whitened residuals and derivatives, if the problem has a whitening filter."""
-    return plain if problem.whitening is None else _whitened(problem, plain)
+    return plain if problem.whitening is None else _apply_whitening(problem, plain)
 
 
 def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
     tape = problem.tape
     seen, jacobian = sensitivities(problem.parameters, unknowns.coordinates, tape, unknowns.runs)
     scale = tape.weight / problem.noise[:, None]
-    jacobian = jacobian * scale[..., None] * problem.moves()[tape.run][:, None, None, :]
+    jacobian = jacobian * scale[..., None] * problem.determinable()[tape.run][:, None, None, :]
     residuals = (seen - tape.measured) * scale
-    wild = ~jnp.all(jnp.abs(jacobian) < WILD, (1, 2, 3)) & problem.fitted_runs[tape.run]
+    wild = ~jnp.all(jnp.abs(jacobian) < MAX_SENSITIVITY, (1, 2, 3)) & problem.fitted_runs[tape.run]
     return Evaluation(seen, jnp.where(wild[:, None, None], jnp.inf, residuals), jacobian)
 
 
@@ -140,7 +140,7 @@ def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
 _evaluate, _evaluate_linear = compiled(_evaluated), quickly_compiled(_evaluated)
 
 
-def _less_nuisance(problem: Problem, plain: Evaluation) -> Evaluation:
+def _without_nuisance(problem: Problem, plain: Evaluation) -> Evaluation:
     """The evaluation with residuals and derivatives orthogonal to the responses to the nuisance parameters, if any."""
     return plain if problem.nuisance is None else _orthogonal(problem, plain)
 
@@ -166,7 +166,7 @@ def _orthogonal(problem: Problem, plain: Evaluation) -> Evaluation:
 
 
 @compiled
-def _whitened(problem: Problem, plain: Evaluation) -> Evaluation:
+def _apply_whitening(problem: Problem, plain: Evaluation) -> Evaluation:
     both = jnp.concatenate([plain.jacobian, plain.residuals[..., None]], -1)
     assert problem.whitening is not None
     both = problem.whitening(both * problem.noise[:, None, None], problem.tape.run)
@@ -182,12 +182,12 @@ def normal_matrix(
     both = jnp.concatenate([jacobian, r[..., None]], -1)
     of_block = jnp.einsum("bcsi,bcsj->bij", both, both)
     of_run = jax.ops.segment_sum(of_block, tape.run, tape.runs) * fitted_runs[:, None, None]
-    index = _columns(jacobian.shape[-1] - UNKNOWNS_PER_RUN, tape.runs)
+    index = _column_indices(jacobian.shape[-1] - UNKNOWNS_PER_RUN, tape.runs)
     size = index.max() + 1
     return jnp.zeros((size, size)).at[index[:, :, None], index[:, None, :]].add(of_run)
 
 
-def _columns(count: int, runs: int) -> np.ndarray:
+def _column_indices(count: int, runs: int) -> np.ndarray:
     """Indices of each run's columns among all unknowns and the residual."""
     own = count + UNKNOWNS_PER_RUN * np.arange(runs)[:, None] + np.arange(UNKNOWNS_PER_RUN)
     shared = np.broadcast_to(np.arange(count), (runs, count))

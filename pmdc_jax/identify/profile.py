@@ -11,11 +11,11 @@ from .polish import gauss_newton_step
 from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
 # For a coordinate (natural logarithm) with a smaller standard error the sum of squares is close enough to quadratic.
-QUADRATIC = 0.05
-ROUNDS = 5  # of the search for each end of the interval
-REFITS = 3  # Gauss-Newton steps of the other unknowns for each trial, at most
+QUADRATIC_STDERR = 0.05
+MAX_ROUNDS = 5  # of the search for each end of the interval
+MAX_REFITS = 3  # Gauss-Newton steps of the other unknowns for each trial, at most
 # Refits end when one more step would lower the sum of squares by less than this share of the rise that is sought
-CLOSE = 0.05
+REFIT_TOLERANCE = 0.05
 
 
 class _Point(NamedTuple):
@@ -42,12 +42,12 @@ def profile_interval(
     residuals as a quasi-likelihood, McCullagh (1983).
     """
     lowest = _point(problem, best, index)
-    centre, close = float(best.coordinates[index]), CLOSE * reach**2 * inflation
+    centre, close = float(best.coordinates[index]), REFIT_TOLERANCE * reach**2 * inflation
     limits = (float(problem.parameters.lower[index]), float(problem.parameters.upper[index]))
     ends = []
     for sign, limit in zip((-1.0, 1.0), limits, strict=True):
         distance, point = reach * spread, lowest
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ROUNDS):
             trial = centre + sign * min(distance, abs(limit - centre))
             point = _refitted(problem, point, index, trial, close)
             rise = np.sqrt(max(point.squares - lowest.squares, 1e-12) / inflation)
@@ -61,7 +61,7 @@ def profile_interval(
 
 def _refitted(problem: Problem, point: _Point, index: int, value: float, close: float) -> _Point:
     """The point of the profile at a value of the coordinate, found from another point."""
-    for _ in range(REFITS):
+    for _ in range(MAX_REFITS):
         point = _point(problem, _moved(problem, point, index, value), index)
         if not close < point.gain < np.inf:
             break

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from ..compiled import quickly_compiled
 from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
-STEPS = 60
+MAX_STEPS = 60
 
 
 class Optimum(NamedTuple):
@@ -52,10 +52,10 @@ def _compressed_jvp(
 
 
 def _factor(flat: Columns, args: Task) -> Float[Array, "columns+1 columns+1"]:
-    problem, begun, scale, size = args
+    problem, flat_start, scale, size = args
     # optimistix promotes dtypes strictly; under standard promotion earlier traces are reused
     with jax.numpy_dtype_promotion("standard"):
-        evaluation = evaluate(problem, _unscaled(problem, flat, begun, scale))
+        evaluation = evaluate(problem, _unscaled(problem, flat, flat_start, scale))
         matrix = normal_matrix(evaluation, problem.tape, problem.fitted_runs)
     stretch = jnp.append(scale, 1.0)
     matrix = matrix * stretch[:, None] * stretch / size
@@ -66,9 +66,9 @@ def _factor(flat: Columns, args: Task) -> Float[Array, "columns+1 columns+1"]:
     return jnp.sqrt(jnp.maximum(values, 0.0))[:, None] * vectors.T
 
 
-def _unscaled(problem: Problem, flat: Columns, begun: Columns, scale: Columns) -> Unknowns:
+def _unscaled(problem: Problem, flat: Columns, flat_start: Columns, scale: Columns) -> Unknowns:
     """The unknowns in their units; those without a scale stay at their start, from which rounding would move them."""
-    return unflatten(problem, jnp.where(scale > 0, flat * scale, begun))
+    return unflatten(problem, jnp.where(scale > 0, flat * scale, flat_start))
 
 
 @quickly_compiled
@@ -79,16 +79,16 @@ def _levenberg_marquardt(
     size: Float[Array, ""],
     tolerance: Float[Array, ""],
 ) -> tuple[Unknowns, Float[Array, ""]]:
-    begun = flatten(start)
+    flat_start = flatten(start)
     solution = optx.least_squares(
         compressed,
         optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),  # pyright: ignore[reportArgumentType]
-        jnp.where(scale > 0, begun / jnp.where(scale > 0, scale, 1.0), 0.0),
-        args=(problem, begun, scale, size),
-        max_steps=STEPS,
+        jnp.where(scale > 0, flat_start / jnp.where(scale > 0, scale, 1.0), 0.0),
+        args=(problem, flat_start, scale, size),
+        max_steps=MAX_STEPS,
         throw=False,
     )
-    ended = _unscaled(problem, solution.value, begun, scale)
+    ended = _unscaled(problem, solution.value, flat_start, scale)
     return ended, 2 * solution.state.f_info.as_min() * size
 
 

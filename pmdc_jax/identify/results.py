@@ -12,56 +12,59 @@ from ..motor import PARAMETERS, Motor
 from ..recording import OVER_BOTH, OVER_LAST, Recording
 from ..simulate import RunUnknowns, Tape
 from ..threads import map_in_threads
-from .identifiability import SHARE, explain
+from .identifiability import MIN_SHARE, explain_directions
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import noise_of_sensor, white_noise
 from .parameters import Parameters, unit_of
 from .polish import Fit, fit_run_unknowns, polish
 from .prepare import Prepared
 from .problem import Problem
-from .profile import QUADRATIC, profile_interval
+from .profile import QUADRATIC_STDERR, profile_interval
 from .refine import Optimum
-from .solve import SAME, Solved
-from .uncertainty import FLAT, Information, information_of
+from .solve import FITNESS_TOLERANCE, Solved
+from .uncertainty import MIN_UNSEEN_STDERR, Information, information_of
 
 TIE_ITERATIONS = 3
 # Residuals this many times their white noise are reported
-MISSED = 2.0
+MAX_RESIDUAL_RATIO = 2.0
 # Units of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
 # Spans over which a speed may be averaged
-MEANS = {OVER_LAST: "the last sample interval", OVER_BOTH: "the last and the next sample interval"}
+AVERAGING_SPANS = {
+    OVER_LAST: "the last sample interval",
+    OVER_BOTH: "the last and the next sample interval",
+}
 # A parameter is unseen by itself if at least this share of it lies in unseen directions
-ALONE = 0.99
-# A parameter is visible if it changes the outputs by this share of what the most sensitive one does
-TO_SHOW = 0.3
+MIN_UNSEEN_SHARE = 0.99
+# A refit makes a parameter visible: it then changes the outputs by this share of what the most sensitive one does
+VISIBLE_SHARE = 0.3
 
 
 def results_of(given: Prepared, solved: Solved) -> Identification:
     """The result of a fit: estimates with uncertainty and status, and the fit of every run."""
     problem, training = given.problem, given.training
-    polished = _released_from_bounds(problem, solved.fit)
+    released = _released_from_bounds(problem, solved.fit)
     parameters = problem.parameters
-    info = information_of(problem, polished)
-    chosen = _with_Kt_equal_Kb(problem, polished, info)
-    lifted = [_refit_with_visible(problem, chosen, k) for k in _invisible_alone(parameters, info)]
-    alike = [information_of(problem, fit) for fit in lifted if fit is not None]
-    info = max(info, *alike, key=lambda i: i.unseen_share.sum()) if alike else info
+    info = information_of(problem, released)
+    chosen = _with_Kt_equal_Kb(problem, released, info)
+    visible = [_refit_with_visible(problem, chosen, k) for k in _invisible_alone(parameters, info)]
+    others = [information_of(problem, fit) for fit in visible if fit is not None]
+    info = max([info, *others], key=lambda i: i.unseen_share.sum())
     best = chosen.optimum
-    motor = _plain(parameters(best.unknowns.coordinates))
+    motor = _with_numpy_arrays(parameters(best.unknowns.coordinates))
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
     unknowns, ended = fit_run_unknowns(problem, best.unknowns)
-    fit = _fits(given.runs, given.roles, problem.tape, np.asarray(ended.seen), unknowns.runs)
+    fit = _run_fits(given.runs, given.roles, problem.tape, np.asarray(ended.seen), unknowns.runs)
     names, covariance = parameters.with_tied(info.covariance)
     noise = {
-        name: white_noise([left for _, left in _measured_and_left(fit, name)])
+        name: white_noise([left for _, left in _measured_and_residuals(fit, name)])
         for name in ("current", "speed")
     }
     return Identification(
         motor=motor,
         parameters=_estimates(parameters, best, info, given, _intervals(problem, best, info)),
-        unidentified_directions=explain(info.unseen, parameters, training),
+        unidentified_directions=explain_directions(info.unseen, parameters, training),
         fit=fit,
         noise={"current_A": noise["current"], "speed_rad_s": noise["speed"]},
         converged=best.converged,
@@ -71,8 +74,8 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
         findings=given.findings,
         covariance=covariance,
         covariance_names=names,
-        messages=_messages(given, solved, chosen is not polished),
-        missed=_missed(fit),
+        messages=_messages(given, solved, Kt_set_to_Kb=chosen is not released),
+        missed=_large_residuals(fit),
     )
 
 
@@ -82,14 +85,14 @@ def _intervals(
     """The 95 % intervals of the identified coordinates, in parallel on all cores."""
     coordinates = np.asarray(best.unknowns.coordinates)
     # teeth that meet at another moment change all that follows: the sum of squares jumps, and no profile is smooth
-    leaps = problem.parameters(best.unknowns.coordinates).toothed is not None
+    jumps = problem.parameters(best.unknowns.coordinates).toothed is not None
 
     def interval(k: int) -> tuple[float, float]:
         spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.interval_factor[k])
         # the refits of a profile would not reach as far along an unseen direction as the truth may lie
         hidden = info.unseen_variance[k] > info.covariance[k, k] / 2
-        sure = not problem.parameters.logarithmic[k] or spread < QUADRATIC
-        if sure or hidden or leaps:
+        quadratic = not problem.parameters.logarithmic[k] or spread < QUADRATIC_STDERR
+        if quadratic or hidden or jumps:
             return coordinates[k] - reach * spread, coordinates[k] + reach * spread
         return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
 
@@ -106,13 +109,17 @@ def _released_from_bounds(problem: Problem, polished: Fit) -> Fit:
 
     bound = polished.at_bound
     unseen = information_of(problem, released(())).unseen if bound else ()
-    several = [d for d in unseen if np.max(np.abs(d)) <= ALONE]
-    return released([k for k in bound if all(abs(d[k]) <= SHARE for d in several)])
+    several = [d for d in unseen if np.max(np.abs(d)) <= MIN_UNSEEN_SHARE]
+    return released([k for k in bound if all(abs(d[k]) <= MIN_SHARE for d in several)])
 
 
 def _invisible_alone(parameters: Parameters, info: Information) -> list[int]:
     """Positive parameters that change nothing by themselves, because they are nearly zero for example."""
-    return [int(k) for k in np.flatnonzero(info.unseen_share > ALONE) if parameters.logarithmic[k]]
+    return [
+        int(k)
+        for k in np.flatnonzero(info.unseen_share > MIN_UNSEEN_SHARE)
+        if parameters.logarithmic[k]
+    ]
 
 
 def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
@@ -125,16 +132,16 @@ def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
     jacobian = np.asarray(polished.evaluation.jacobian)[problem.fitted_blocks]
     lengths = np.sqrt(np.square(jacobian[..., : len(problem.free)]).sum((0, 1, 2)))
     coordinates = np.array(polished.coordinates)
-    coordinates[k] += np.log(TO_SHOW * lengths.max() / max(lengths[k], 1e-300))
+    coordinates[k] += np.log(VISIBLE_SHARE * lengths.max() / max(lengths[k], 1e-300))
     coordinates[k] = np.clip(
         coordinates[k], problem.parameters.lower[k], problem.parameters.upper[k]
     )
     unknowns = polished.unknowns._replace(coordinates=jnp.asarray(coordinates))
     held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
-    lifted = polish(held, polished.optimum._replace(unknowns=unknowns))
+    refitted = polish(held, polished.optimum._replace(unknowns=unknowns))
     # false where the simulation failed: its fitness is infinite
-    as_good = lifted.fitness <= polished.fitness * (1 + SAME)
-    return polish(problem, lifted.optimum._replace(at_bound=()), steps=0) if as_good else None
+    as_good = refitted.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE)
+    return polish(problem, refitted.optimum._replace(at_bound=()), steps=0) if as_good else None
 
 
 def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit:
@@ -143,7 +150,7 @@ def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit
     The direction is straight only locally, so all other free parameters are refined again; a fit that is worse then is
     rejected.
     """
-    names, best = problem.parameters.names, polished.optimum
+    names = problem.parameters.names
     if "Kt" not in names or "Kb" not in names:
         return polished
     k, b = names.index("Kt"), names.index("Kb")
@@ -151,17 +158,17 @@ def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit
     if not along:
         return polished
     held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
-    tidied = polished
+    moved = polished
     for _ in range(TIE_ITERATIONS):  # Kb moves a little as well
-        coordinates = np.array(tidied.coordinates)
+        coordinates = np.array(moved.coordinates)
         coordinates += along[0] * (coordinates[b] - coordinates[k]) / along[0][k]
         coordinates[k] = coordinates[b]
-        unknowns = tidied.unknowns._replace(coordinates=jnp.asarray(coordinates))
-        tidied = polish(held, tidied.optimum._replace(unknowns=unknowns))
-    return tidied if tidied.fitness <= best.fitness * (1 + SAME) else polished
+        unknowns = moved.unknowns._replace(coordinates=jnp.asarray(coordinates))
+        moved = polish(held, moved.optimum._replace(unknowns=unknowns))
+    return moved if moved.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE) else polished
 
 
-def _plain(motor: Motor) -> Motor:
+def _with_numpy_arrays(motor: Motor) -> Motor:
     return eqx.tree_at(
         lambda m: [getattr(m, name) for name in PARAMETERS],
         motor,
@@ -183,7 +190,7 @@ def _estimates(
     estimates = {}
     for name in names:
         unit, source = unit_of(name), ties.get(name, name)
-        if source in given.untouched and source not in given.known:
+        if source in given.irrelevant and source not in given.known:
             estimates[name] = Estimate(None, None, None, unit, "not_identifiable")
             continue
         value = parameters.value(name, coordinates)
@@ -209,25 +216,25 @@ def _estimates(
 def _status(k: int, best: Optimum, info: Information) -> Status:
     if k in best.at_bound:
         return "at_bound"
-    if info.unseen_share[k] > SHARE or np.sqrt(info.covariance[k, k]) > FLAT:
+    if info.unseen_share[k] > MIN_SHARE or np.sqrt(info.covariance[k, k]) > MIN_UNSEEN_STDERR:
         return "not_identifiable"
     return "identified"
 
 
-def _fits(
-    even: Sequence[Recording],
+def _run_fits(
+    runs: Sequence[Recording],
     roles: Sequence[Role],
     tape: Tape,
-    seen: np.ndarray,
+    simulated: np.ndarray,
     own: RunUnknowns,
 ) -> dict[str, RunFit]:
     # the speed as it was fitted: corrected for what the sensor added, without samples that do not count
     fitted = np.where(np.asarray(tape.weight) > 0, tape.measured, np.nan)[:, 1]
     fits = {}
-    for index, (run, role) in enumerate(zip(even, roles, strict=True)):
-        current, speed = (tape.samples_of(index, seen[:, c], len(run.time)) for c in range(2))
+    for index, (run, role) in enumerate(zip(runs, roles, strict=True)):
+        current, speed = (tape.samples_of(index, simulated[:, c], len(run)) for c in range(2))
         driven = run.drive == "voltage"
-        measured = None if run.speed is None else tape.samples_of(index, fitted, len(run.time))
+        measured = None if run.speed is None else tape.samples_of(index, fitted, len(run))
         fits[run.name] = RunFit(
             role=role,
             current_rmse=_rmse(run.current, current) if driven else None,
@@ -262,27 +269,30 @@ def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | 
     return float(100 * (1 - error / spread)) if spread > 0 else None
 
 
-def _measured_and_left(fit: Mapping[str, RunFit], name: str) -> list[tuple[np.ndarray, np.ndarray]]:
+def _measured_and_residuals(
+    fit: Mapping[str, RunFit], name: str
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """An output as measured and its residuals, in every training run that has it."""
     runs = [f for f in fit.values() if f.role == "train"]
     pairs = [(getattr(f, name), getattr(f, f"{name}_simulated")) for f in runs]
     return [(m, m - s) for m, s in pairs if m is not None and s is not None]
 
 
-def _missed(fit: Mapping[str, RunFit]) -> dict[str, float]:
-    """RMS of the residuals over the white noise of the runs, for the outputs for which it is above `MISSED`."""
-    times = {}
+def _large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:
+    """RMS of the residuals over the white noise of the runs, for the outputs for which that exceeds
+    `MAX_RESIDUAL_RATIO`."""
+    ratios = {}
     for name in ("current", "speed"):
         scaled = [
             left / noise
-            for measured, left in _measured_and_left(fit, name)
+            for measured, left in _measured_and_residuals(fit, name)
             if (noise := noise_of_sensor(measured, left))
         ]
-        times[name] = _rms(np.concatenate(scaled)) if scaled else 0.0
-    return {name: much for name, much in times.items() if much > MISSED}
+        ratios[name] = _rms(np.concatenate(scaled)) if scaled else 0.0
+    return {name: ratio for name, ratio in ratios.items() if ratio > MAX_RESIDUAL_RATIO}
 
 
-def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:
+def _messages(given: Prepared, solved: Solved, Kt_set_to_Kb: bool) -> tuple[str, ...]:
     messages = [
         f"{run.name}: the recorded {run.drive} has {given.input_noise[run.name]:.3g} {UNITS[run.drive]} of sensor "
         "noise that did not reach the motor: it was removed"
@@ -294,10 +304,11 @@ def _messages(given: Prepared, solved: Solved, tied: bool) -> tuple[str, ...]:
         messages.append(f"the voltage {acts}: this is modelled")
     if given.averaging:
         messages.append(
-            f"the speed is a mean over {MEANS[given.averaging]}, as differences of an angle are: this is modelled"
+            f"the speed is a mean over {AVERAGING_SPANS[given.averaging]}, as differences of an angle are:"
+            " this is modelled"
         )
     if solved.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
-    if tied:
+    if Kt_set_to_Kb:
         messages.append("Kt was set equal to Kb, as holds in SI units, and J and f scale with it")
     return tuple(messages)

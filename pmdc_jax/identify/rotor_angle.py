@@ -15,12 +15,12 @@ from .polish import Fit
 from .problem import Problem
 
 # Neighbouring frequencies over which the power of the residuals is averaged
-NEIGHBOURS = 33
+SMOOTHING_WIDTH = 33
 # Median of the square of a normal variable, over its variance
-MEDIAN = 0.4549
+CHI2_MEDIAN = 0.4549
 
 
-def of_rotor(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
+def rotor_outputs(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
     """Simulated current and speed of the rotor itself, A and rad/s, without sensor effects and averaging."""
     effects, tape = problem.parameters.effects, problem.tape
     if tape.averaging is None and all(effect.equation != "sensor" for effect in effects):
@@ -40,9 +40,9 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
     """
     motor = problem.parameters(fit.coordinates)
     tape, seen = problem.tape, np.asarray(fit.evaluation.seen)
-    rotor = np.asarray(of_rotor(problem, fit))
+    rotor = np.asarray(rotor_outputs(problem, fit))
     turn, run = np.array(tape.turn), np.asarray(tape.run)
-    length = np.asarray(tape.sample_time)[np.asarray(tape.grid)]
+    sample_time = np.asarray(tape.sample_time)[np.asarray(tape.grid)]
     for index in range(tape.runs):
         mine = (run == index) & ~np.isnan(turn).all(1)
         measured, weight = (
@@ -55,17 +55,18 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
         end = known[-1] + 1
         error = np.where(weight[:end] > 0, measured[:end] - simulated[:end], 0.0)
         speed = rotor[mine, 1].reshape(-1).copy()
-        time = np.cumsum(np.repeat(length[mine], turn.shape[1]))[:end]
-        missed = motion(error)
+        time = np.cumsum(np.repeat(sample_time[mine], turn.shape[1]))[:end]
+        unmodelled = motion_in(error)
         for effect in motor.effects:
-            missed = effect.speed_before_sensor(missed, time)
-        speed[:end] += missed
-        ahead = np.append(speed[1:], speed[-1])
-        turn[mine] = ((speed + ahead) / 2).reshape(turn[mine].shape) * length[mine, None]
+            unmodelled = effect.speed_before_sensor(unmodelled, time)
+        speed[:end] += unmodelled
+        following = np.append(speed[1:], speed[-1])
+        mean = ((speed + following) / 2).reshape(turn[mine].shape)
+        turn[mine] = mean * sample_time[mine, None]
     return eqx.tree_at(lambda p: p.tape.turn, problem, jnp.asarray(turn))
 
 
-def motion(error: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+def motion_in(error: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
     """The part of measured minus simulated speed that is motion instead of sensor noise.
 
     A Wiener smoother: every frequency is weighted by the share of its power that exceeds the white noise, whose level
@@ -75,9 +76,9 @@ def motion(error: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"
     """
     spectrum = np.asarray(fft.dct(error, norm="ortho"))
     power = spectrum**2
-    noise = np.median(power[len(power) // 2 :]) / MEDIAN
+    noise = np.median(power[len(power) // 2 :]) / CHI2_MEDIAN
     # two standard deviations of the average of so few powers: fluctuations of the noise are no motion
-    noise *= 1 + 2 * np.sqrt(2 / NEIGHBOURS)
-    around = ndimage.uniform_filter1d(power, NEIGHBOURS, mode="reflect")
+    noise *= 1 + 2 * np.sqrt(2 / SMOOTHING_WIDTH)
+    around = ndimage.uniform_filter1d(power, SMOOTHING_WIDTH, mode="reflect")
     share = np.clip(1 - noise / np.maximum(around, 1e-300), 0.0, 1.0)
     return np.asarray(fft.idct(share * spectrum, norm="ortho"))

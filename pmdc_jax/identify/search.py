@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -54,15 +54,18 @@ METHODS: Mapping[str, Method] = {
 }
 
 # A distribution starts from the best of this many candidates scattered over the bounds.
-SCATTERED = 256
+INITIAL_CANDIDATES = 256
 # ... with this standard deviation in the unit cube: the best of that many is not far from the optimum.
-SPREAD = 0.15
+INITIAL_SPREAD = 0.15
 
-# The search may stop once the best tenth of the population agree this well, in natural logarithms.
-AGREED = 0.1
+# The search may stop after some generations, once the best tenth of the population agree this well, in natural
+# logarithms.
+MIN_GENERATIONS, AGREEMENT = 10, 0.1
+# Most candidates that are kept
+MAX_CANDIDATES = 2000
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """The result of a search."""
 
     candidates: np.ndarray  # (kept, parameters) coordinates, best first
@@ -71,6 +74,13 @@ class Found(NamedTuple):
     median: np.ndarray  # (generations,)
     evaluations: int
     interrupted: bool
+
+
+class _Generation(NamedTuple):
+    """Evaluated points of the unit cube, and their fitness."""
+
+    cube: np.ndarray
+    fitness: np.ndarray
 
 
 def search(
@@ -82,7 +92,7 @@ def search(
     population: int | None = None,
     generations: int | None = None,
     progress: ReportProgress | None = None,
-) -> Found:
+) -> SearchResult:
     """Search the bounds of `parameters` for motors that reproduce the tape.
 
     The fitness is the paper's equation (10), F1 + a F2 (mean square speed error plus a times mean square current
@@ -105,29 +115,30 @@ def search(
     fitness_of = _Fitness(parameters, tape, noise)
 
     kind, seeds = Kind(method, size, len(low)), np.asarray(seed)
-    start = _scattered(seed, SCATTERED if chosen.distribution else size, len(low))
-    seen = [(start, fitness_of.scattered(low + (high - low) * start, size))]
-    if chosen.distribution:
-        asked, state = _begin(kind, seeds, start[np.argmin(seen[0][1])])
-    else:
-        asked, state = _begin(kind, seeds, start, seen[0][1])
+    start = _scattered(seed, INITIAL_CANDIDATES if chosen.distribution else size, len(low))
+    first = _Generation(start, fitness_of.scattered(low + (high - low) * start, size))
+    begins_with = (start[np.argmin(first.fitness)],) if chosen.distribution else first
+    asked, state = _first_points(kind, seeds, *begins_with)
+    evaluated = [first]
 
     interrupted = False
     try:
         for generation in range(1, rounds):
             cube = np.asarray(asked)
             fitness = fitness_of(low + (high - low) * cube)
-            asked, state = _go_on(kind, seeds, np.asarray(generation), cube, fitness, state)
-            seen.append((cube, fitness))
+            asked, state = _next_points(kind, seeds, np.asarray(generation), cube, fitness, state)
+            evaluated.append(_Generation(cube, fitness))
             if progress:
-                best = min(f.min() for _, f in seen)
+                best = min(each.fitness.min() for each in evaluated)
                 progress(f"searching, generation {generation}", float(best), generation / rounds)
             elite = cube[np.argsort(fitness)[: size // 10 + 1]]
-            if generation > 10 and np.all(np.ptp((high - low) * elite, axis=0) < AGREED):
+            if generation > MIN_GENERATIONS and np.all(
+                np.ptp((high - low) * elite, axis=0) < AGREEMENT
+            ):
                 break
     except KeyboardInterrupt:
         interrupted = True
-    return _collect(seen, low, high, interrupted)
+    return _collect(evaluated, low, high, interrupted)
 
 
 Value = Array | np.ndarray
@@ -149,14 +160,14 @@ Asked = tuple[Float[Array, "population dimensions"], Leaves]
 
 
 @quickly_compiled
-def _begin(kind: Kind, seed: Value, *start: Value) -> Asked:
+def _first_points(kind: Kind, seed: Value, *start: Value) -> Asked:
     """The first points of the unit cube to evaluate, (population, dimensions), and the state of the algorithm."""
     algorithm, settings = _algorithm(kind)
-    return _asked(kind, seed, 1, algorithm.init(jax.random.key(seed), *start, settings))
+    return _ask(kind, seed, 1, algorithm.init(jax.random.key(seed), *start, settings))
 
 
 @quickly_compiled
-def _go_on(
+def _next_points(
     kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Value, state: Leaves
 ) -> Asked:
     """The next points to evaluate, given the fitness of those of the `cube`, and the state of the algorithm."""
@@ -165,10 +176,10 @@ def _go_on(
     like = algorithm.init(jax.random.key(0), *start, settings)
     whole = jax.tree.unflatten(jax.tree.structure(like), state)
     whole, _ = algorithm.tell(_keys(seed, generation)[1], cube, fitness, whole, settings)
-    return _asked(kind, seed, generation + 1, whole)
+    return _ask(kind, seed, generation + 1, whole)
 
 
-def _asked(kind: Kind, seed: Value, generation: Value | int, state: State) -> Asked:
+def _ask(kind: Kind, seed: Value, generation: Value | int, state: State) -> Asked:
     algorithm, settings = _algorithm(kind)
     asked, state = algorithm.ask(_keys(seed, generation)[0], state, settings)
     return jnp.clip(asked, 0.0, 1.0), tuple(map(_strongly_typed, jax.tree.leaves(state)))
@@ -185,7 +196,7 @@ def _algorithm(kind: Kind) -> tuple[EvolutionaryAlgorithm, Params]:
     with jax.ensure_compile_time_eval():  # called within a trace, it must not cache tracers
         algorithm = method.algorithm()(kind.population, jnp.zeros(kind.dimensions))
         default = algorithm.default_params
-    return algorithm, default.replace(std_init=SPREAD) if method.distribution else default
+    return algorithm, default.replace(std_init=INITIAL_SPREAD) if method.distribution else default
 
 
 def _strongly_typed(leaf: Array) -> Array:
@@ -224,15 +235,17 @@ def _scattered(seed: int, size: int, dimensions: int) -> np.ndarray:
     return (strata + rng.random(strata.shape)) / size
 
 
-def _collect(seen: list, low: np.ndarray, high: np.ndarray, interrupted: bool) -> Found:
-    cubes = np.concatenate([cube for cube, _ in seen])
-    fitness = np.concatenate([f for _, f in seen])
-    order = np.argsort(fitness, kind="stable")[:2000]
-    return Found(
+def _collect(
+    evaluated: Sequence[_Generation], low: np.ndarray, high: np.ndarray, interrupted: bool
+) -> SearchResult:
+    cubes = np.concatenate([each.cube for each in evaluated])
+    fitness = np.concatenate([each.fitness for each in evaluated])
+    order = np.argsort(fitness, kind="stable")[:MAX_CANDIDATES]
+    return SearchResult(
         candidates=low + (high - low) * cubes[order],
         fitness=fitness[order],
-        best=np.minimum.accumulate([f.min() for _, f in seen]),
-        median=np.array([np.median(f) for _, f in seen]),
+        best=np.minimum.accumulate([each.fitness.min() for each in evaluated]),
+        median=np.array([np.median(each.fitness) for each in evaluated]),
         evaluations=len(fitness),
         interrupted=interrupted,
     )

@@ -20,28 +20,29 @@ from .corrections.input_timing import (
     negative_log_likelihood_within,
     with_timing,
 )
-from .corrections.speed_averaging import clearly_averaged, with_averaging
+from .corrections.speed_averaging import with_averaging, with_evident_averaging
 from .corrections.step_times import with_step_times
-from .corrections.uneven_sampling import on_clock
+from .corrections.uneven_sampling import with_even_clock
 from .identification import Search
 from .parameters import Parameters
-from .polish import IDLE, Fit, polish, with_holdout_unknowns
+from .polish import Fit, polish, with_holdout_unknowns
 from .prepare import Prepared
 from .problem import Evaluation, Problem, Unknowns
 from .refine import Optimum, refine
 from .rotor_angle import with_rotor_angle
-from .search import Found
+from .search import SearchResult
 from .search import search as global_search
 
 STARTS = 4
 # Two refinements found the same optimum if their fitness agrees to this share.
-SAME = 1e-4
+FITNESS_TOLERANCE = 1e-4
 # A mean square of the residuals above this many noise variances asks for another search, up to this many in all.
-POOR = 1.5
-SEARCHES = 5
-ANGLE_ITERATIONS = 3
+POOR_FIT = 1.5
+MAX_SEARCHES = 5
+# Updates of the rotor angle at most, and the share of the fitness that each must gain
+ANGLE_ITERATIONS, MIN_ANGLE_GAIN = 3, 1e-5
 # Starts that differ by less than this in all natural logarithms count as one.
-DISTINCT = 0.3
+MIN_DISTANCE = 0.3
 
 
 class Solved(NamedTuple):
@@ -59,25 +60,25 @@ def solve(
 ) -> tuple[Prepared, Solved]:
     """The best fit of a search, to runs corrected for artefacts of their sensors and for the timing of their inputs.
 
-    **Returns**: the problem as `searched` returns it, corrected, and the fit to it.
+    **Returns**: the problem as `search_and_refine` returns it, corrected, and the fit to it.
     """
-    recorded = given = clearly_averaged(given)
-    given, solved = _corrected(*searched(given, search, seed, progress))
+    recorded = given = with_evident_averaging(given)
+    given, solved = _corrected(*search_and_refine(given, search, seed, progress))
     timings = likelier_timings(given, solved.fit)
-    acting = [with_timing(recorded, timing) for timing in timings]
-    otherwise = [_corrected(*searched(taken, search, seed, progress)) for taken in acting]
+    retimed = [with_timing(recorded, timing) for timing in timings]
+    others = [_corrected(*search_and_refine(runs, search, seed, progress)) for runs in retimed]
     found = []
-    for runs, ended in [(given, solved), *otherwise]:
-        runs, fit = with_step_times(runs, ended.fit)
-        found.append((runs, ended._replace(fit=fit)))
-    if not otherwise:
+    for runs, result in [(given, solved), *others]:
+        runs, fit = with_step_times(runs, result.fit)
+        found.append((runs, result._replace(fit=fit)))
+    if not others:
         return found[0]
-    return min(found, key=lambda ended: negative_log_likelihood_within(ended[0], ended[1].fit))
+    return min(found, key=lambda pair: negative_log_likelihood_within(pair[0], pair[1].fit))
 
 
 # Applied in this order: uneven sampling hides everything else, and a mean is recognised by the sensor's own noise
 CORRECTIONS: tuple[Callable[[Prepared, Fit], tuple[Prepared, Fit]], ...] = (
-    on_clock,
+    with_even_clock,
     without_input_noise,
     with_averaging,
 )
@@ -91,12 +92,12 @@ def _corrected(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
     return given, solved._replace(fit=fit)
 
 
-def searched(
+def search_and_refine(
     given: Prepared,
     search: str,
     seed: int,
     progress: ReportProgress | None = None,
-    searches: int = SEARCHES,
+    searches: int = MAX_SEARCHES,
 ) -> tuple[Prepared, Solved]:
     """Search the bounds and refine the best candidates; repeat with other seeds while the fit is poor or no two
     refinements agree, up to `searches` searches in all.
@@ -107,32 +108,32 @@ def searched(
     report = progress or silent
     problem = given.problem
     searching = Tape.from_recordings(given.training, straight=given.straight)
-    noise, sought = np.asarray(problem.noise), _where_effects_show(given)
+    noise, parameters = np.asarray(problem.noise), _searched_parameters(given)
 
-    def look(seed: int) -> Found:
-        return global_search(sought, searching, noise, search, seed, progress=progress)
+    def run_search(seed: int) -> SearchResult:
+        return global_search(parameters, searching, noise, search, seed, progress=progress)
 
     middle = (problem.parameters.lower + problem.parameters.upper) / 2
     # a refinement that stops at once, so that it is compiled on another core while the search runs
     compiled = submit(refine, problem, _start(problem.tape, middle), tolerance=1e3)
-    found = look(seed)
-    searched = time.perf_counter()
+    found = run_search(seed)
+    search_ended = time.perf_counter()
     report("refining the best candidates", float(found.best[-1]))
     compiled.result()
     ends = _refine_all(problem, found)
     for attempt in range(1, searches):
         if found.interrupted or _agreed(ends, problem.outputs):
             break
-        before, found = found, look(seed + attempt)
+        before, found = found, run_search(seed + attempt)
         found = found._replace(evaluations=before.evaluations + found.evaluations)
         ends = sorted([*ends, *_refine_all(problem, found)], key=_fitness)
     given, polished = polish_with_angle(given, ends[0])
-    seconds = {"search": searched - began, "refine": time.perf_counter() - searched}
+    seconds = {"search": search_ended - began, "refine": time.perf_counter() - search_ended}
     record = _search_record(search, found, ends)
     return given, Solved(polished, record, seed, found.interrupted, seconds)
 
 
-def _where_effects_show(given: Prepared) -> Parameters:
+def _searched_parameters(given: Prepared) -> Parameters:
     """The parameters within narrower bounds: the search can skip values at which an effect does not show."""
     effects = given.problem.parameters.effects
     return given.parameters(effects, effect_bounds(effects, given.training))
@@ -143,10 +144,10 @@ def polish_with_angle(
 ) -> tuple[Prepared, Fit]:
     """Polish; where a torque depends on the rotor angle, update the angle from the fit and repeat while that helps."""
     polished = polish(given.problem, end, known=known)
-    for _ in range(ANGLE_ITERATIONS if given.problem.angular else 0):
+    for _ in range(ANGLE_ITERATIONS if given.problem.depends_on_angle else 0):
         again = given._replace(problem=with_rotor_angle(given.problem, polished))
         better = polish(again.problem, polished.optimum)
-        if not better.fitness < (1 - IDLE) * polished.fitness:
+        if not better.fitness < (1 - MIN_ANGLE_GAIN) * polished.fitness:
             break
         given, polished = again, better
     return given, polished
@@ -156,7 +157,7 @@ def _start(tape: Tape, coordinates: jax.Array | np.ndarray) -> Unknowns:
     return Unknowns(jnp.asarray(coordinates), RunUnknowns.as_recorded(tape))
 
 
-def _distinct(found: Found, parameters: Parameters) -> list[np.ndarray]:
+def _distinct(found: SearchResult, parameters: Parameters) -> list[np.ndarray]:
     """The best few clearly different candidates, preceded by the best one with L in the middle of its range.
 
     Where L is too small to matter the sum of squares is flat in it, and no gradient leads back.
@@ -167,14 +168,14 @@ def _distinct(found: Found, parameters: Parameters) -> list[np.ndarray]:
         kept.append(np.array(found.candidates[0]))
         kept[0][L] = (parameters.lower[L] + parameters.upper[L]) / 2
     for candidate in found.candidates:
-        if all(np.max(np.abs(candidate - other)) > DISTINCT for other in kept):
+        if all(np.max(np.abs(candidate - other)) > MIN_DISTANCE for other in kept):
             kept.append(candidate)
         if len(kept) == STARTS:
             break
     return kept
 
 
-def _refine_all(problem: Problem, found: Found) -> list[Optimum]:
+def _refine_all(problem: Problem, found: SearchResult) -> list[Optimum]:
     """Refine the best distinct candidates of a search, one on each core at a time, until they agree; the best first."""
     starts = [_start(problem.tape, candidate) for candidate in _distinct(found, problem.parameters)]
 
@@ -193,16 +194,16 @@ def _agreed(ends: Sequence[Optimum], outputs: int) -> bool:
     more starts than one search has. Larger residuals may be due to the model or to a local optimum: only another search
     can tell.
     """
-    needed = 2 if ends[0].fitness < POOR * outputs else STARTS + 1
+    needed = 2 if ends[0].fitness < POOR_FIT * outputs else STARTS + 1
     return _times_found(ends) >= needed
 
 
 def _times_found(ends: Sequence[Optimum]) -> int:
     fitness = np.array([end.fitness for end in ends])
-    return int(np.sum(fitness <= fitness[0] * (1 + SAME) + 1e-12))
+    return int(np.sum(fitness <= fitness[0] * (1 + FITNESS_TOLERANCE) + 1e-12))
 
 
-def _search_record(method: str, found: Found, ends: Sequence[Optimum]) -> Search:
+def _search_record(method: str, found: SearchResult, ends: Sequence[Optimum]) -> Search:
     return Search(
         method=method,
         evaluations=found.evaluations,

@@ -14,20 +14,20 @@ from ..simulate import UNKNOWNS_PER_RUN
 from .polish import Fit
 from .problem import Problem
 
-REACH = NormalDist().inv_cdf(0.975)  # of a 95 % interval, in standard errors
-# A direction with at least this standard error, of a logarithm, counts as unseen.
-FLAT = 0.5
+Z_95 = NormalDist().inv_cdf(0.975)  # of a 95 % interval, in standard errors
+# A direction with at least this standard error, of a logarithm, counts as unseen
+MIN_UNSEEN_STDERR = 0.5
 # Stretches into which a run is summed for its long-run variance. Measured on white and on three kinds of slow noise,
 # 60 x 6 runs of 5,000 samples each: 2,000 and 500 miss slow noise (standard errors down to a fifth), 50 scatters.
 STRETCHES = 100
 # Parts of a run that are left out one at a time: longer than any correlation that a noise filter leaves
-PARTS = 10
+JACKKNIFE_PARTS = 10
 # Largest share of the information on a direction that one part is taken to hold: without it little would be left
-MOST_OF_ALL = 0.9
+MAX_PART_SHARE = 0.9
 # Probability that white noise alone makes the parts disagree so much that the intervals follow them
-BY_CHANCE = 0.05
-# Standard deviation of a logarithm along an unseen direction: a factor of twenty
-ANYWHERE = 3.0
+SIGNIFICANCE = 0.05
+# Largest standard error of a logarithm along an unseen direction: a factor of twenty
+MAX_UNSEEN_STDERR = 3.0
 
 
 class Information(NamedTuple):
@@ -91,38 +91,48 @@ def information(
     scores: list[np.ndarray] = []
     parts: list[Part] = []
     for index in range(runs):
-        J = jacobian[run == index]
-        r = residuals[run == index]
-        own = J[..., count:].reshape(-1, UNKNOWNS_PER_RUN)
-        across = J[..., :count].reshape(-1, count)
-        # project the run's own unknowns out
-        taken = np.linalg.pinv(own.T @ own, hermitian=True) @ (own.T @ across)
-        across = (across - own @ taken).reshape(*J.shape[:-1], count)
+        J = _without_own_unknowns(jacobian[run == index])
         # samples in order, both outputs of an instant together
-        across = np.moveaxis(across, 1, 2).reshape(-1, 2, count)
-        scores.append(np.einsum("sci,sc->si", across, np.moveaxis(r, 1, 2).reshape(-1, 2)))
-        for J, score in zip(*(np.array_split(x, PARTS) for x in (across, scores[-1])), strict=True):
+        J, r = (np.moveaxis(x, 1, 2) for x in (J, residuals[run == index]))
+        J = J.reshape(-1, 2, count)
+        scores.append(np.einsum("sci,sc->si", J, r.reshape(-1, 2)))
+        split = (np.array_split(x, JACKKNIFE_PARTS) for x in (J, scores[-1]))
+        for J, score in zip(*split, strict=True):
             J = J.reshape(-1, count)
             parts.append(Part(J.T @ J, score.sum(0)))
     hessian = np.sum([part.hessian for part in parts], 0)
-    unseen, root, left_open = _split(hessian, free)
+    unseen, root, unseen_covariance = _split_by_visibility(hessian, free)
     inverse = root @ root.T
-    spread = np.asarray(sum(long_run_variance(score @ inverse) for score in scores))
+    long_run = np.asarray(sum(long_run_variance(score @ inverse) for score in scores))
     white = np.diag(inverse)
-    by_parts, reach = _by_parts(parts, root)
-    variance = np.maximum(np.maximum(np.diag(spread), white), by_parts)
-    stretch = np.sqrt(_ratio_or_one(variance, np.diag(spread)))
-    covariance = spread * stretch[:, None] * stretch
+    jackknife, interval_factor = _jackknife(parts, root)
+    variance = np.maximum(np.maximum(np.diag(long_run), white), jackknife)
+    stretch = np.sqrt(_ratio_or_one(variance, np.diag(long_run)))
     return Information(
-        covariance + left_open, _ratio_or_one(variance, white), reach, np.diag(left_open), unseen
+        covariance=long_run * stretch[:, None] * stretch + unseen_covariance,
+        inflation=_ratio_or_one(variance, white),
+        interval_factor=interval_factor,
+        unseen_variance=np.diag(unseen_covariance),
+        unseen=unseen,
     )
+
+
+def _without_own_unknowns(
+    jacobian: Float[np.ndarray, "blocks 2 samples columns"],
+) -> Float[np.ndarray, "blocks 2 samples parameters"]:
+    """Derivatives by the coordinates in a run, with those by the run's own unknowns projected out."""
+    count = jacobian.shape[-1] - UNKNOWNS_PER_RUN
+    own = jacobian[..., count:].reshape(-1, UNKNOWNS_PER_RUN)
+    shared = jacobian[..., :count].reshape(-1, count)
+    projection = np.linalg.pinv(own.T @ own, hermitian=True) @ (own.T @ shared)
+    return (shared - own @ projection).reshape(*jacobian.shape[:-1], count)
 
 
 def _ratio_or_one(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(b > 0, a / np.where(b > 0, b, 1.0), 1.0)
 
 
-def _by_parts(
+def _jackknife(
     parts: Sequence[Part], root: Float[np.ndarray, "parameters seen"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Jackknife variances, zero where white noise may explain their size; and the reach of a 95 % interval in standard
@@ -130,36 +140,36 @@ def _by_parts(
     moved, shares = [], []
     for part in parts:
         known, axes = np.linalg.eigh(root.T @ part.hessian @ root)
-        known = np.clip(known, 0.0, MOST_OF_ALL)
+        known = np.clip(known, 0.0, MAX_PART_SHARE)
         along = root @ axes
         moved.append(along @ (along.T @ part.score / (1 - known)))
         shares.append(np.square(along) @ known)
     n, moved, shares = len(parts), np.square(moved), np.array(shares)
     variance, white = moved.sum(0) * (n - 1) / n, np.square(root).sum(1)
     deciding = _ratio_or_one(shares.sum(0) ** 2, np.square(shares).sum(0))
-    clear = variance > white * chdtri(deciding, BY_CHANCE) / deciding
+    clear = variance > white * chdtri(deciding, SIGNIFICANCE) / deciding
     freedom = np.maximum(_ratio_or_one(moved.sum(0) ** 2, np.square(moved).sum(0)), 2.0)
-    return np.where(clear, variance, 0.0), np.where(clear, stdtrit(freedom, 0.975), REACH)
+    return np.where(clear, variance, 0.0), np.where(clear, stdtrit(freedom, 0.975), Z_95)
 
 
-def _split(
+def _split_by_visibility(
     hessian: Float[np.ndarray, "parameters parameters"], free: Bool[np.ndarray, " parameters"]
 ) -> tuple[
     tuple[Float[np.ndarray, " parameters"], ...],
     Float[np.ndarray, "parameters seen"],
     Float[np.ndarray, "parameters parameters"],
 ]:
-    """The unseen directions; a root R of the inverse on the others, R R'; and the variance due to the unseen ones."""
+    """The unseen directions; a root R of the inverse on the others, R R'; and the covariance due to the unseen ones."""
     index = np.flatnonzero(free)
     values, vectors = np.linalg.eigh(hessian[np.ix_(index, index)])
-    seen = values > max(1 / FLAT**2, 1e-13 * values.max(initial=0.0))
+    seen = values > max(1 / MIN_UNSEEN_STDERR**2, 1e-13 * values.max(initial=0.0))
     full = np.zeros((len(hessian), len(index)))
     full[index] = vectors
     root = full[:, seen] / np.sqrt(values[seen])
     # even a small component along an unseen direction adds to the variance of a parameter
-    open_ended = np.minimum(1 / np.maximum(values[~seen], 1e-300), ANYWHERE**2)
-    blind = (full[:, ~seen] * open_ended) @ full[:, ~seen].T
-    return tuple(full[:, k] for k in np.flatnonzero(~seen)), root, blind
+    variances = np.minimum(1 / np.maximum(values[~seen], 1e-300), MAX_UNSEEN_STDERR**2)
+    covariance = (full[:, ~seen] * variances) @ full[:, ~seen].T
+    return tuple(full[:, k] for k in np.flatnonzero(~seen)), root, covariance
 
 
 def long_run_variance(terms: Float[np.ndarray, "samples n"]) -> Float[np.ndarray, "n n"]:
@@ -172,9 +182,9 @@ def long_run_variance(terms: Float[np.ndarray, "samples n"]) -> Float[np.ndarray
     stretch = max(1, len(terms) // STRETCHES)
     whole = len(terms) // stretch * stretch
     sums = terms[:whole].reshape(-1, stretch, terms.shape[1]).sum(1)
-    memory = np.clip(_autoregression(sums), -0.97, 0.97)
-    whitened = sums[1:] - memory * sums[:-1]
-    rest = np.clip(_autoregression(whitened), -0.97, 0.97)
+    ar1 = np.clip(_ar1_coefficients(sums), -0.97, 0.97)
+    whitened = sums[1:] - ar1 * sums[:-1]
+    rest = np.clip(_ar1_coefficients(whitened), -0.97, 0.97)
     slow = np.sum(4 * rest**2 / (1 - rest) ** 8) / np.sum((1 - rest) ** -4.0)
     bandwidth = 1.3221 * max(slow * len(whitened), 1e-12) ** 0.2
     lags = np.arange(1, min(len(whitened) - 1, int(8 * bandwidth) + 2))
@@ -187,11 +197,11 @@ def long_run_variance(terms: Float[np.ndarray, "samples n"]) -> Float[np.ndarray
         one_sided = kernel @ cross[lags]
         variance[i] += one_sided
         variance[:, i] += one_sided
-    recolour = 1 / (1 - memory)
-    return variance * recolour[:, None] * recolour * (len(sums) / len(whitened))
+    recolouring = 1 / (1 - ar1)
+    return variance * recolouring[:, None] * recolouring * (len(sums) / len(whitened))
 
 
-def _autoregression(series: np.ndarray) -> np.ndarray:
+def _ar1_coefficients(series: np.ndarray) -> np.ndarray:
     return np.sum(series[1:] * series[:-1], 0) / (np.sum(series[:-1] ** 2, 0) + 1e-300)
 
 

@@ -42,7 +42,7 @@ class Whitening(eqx.Module):
         """From the coefficients A and the scale S of each run; `weight` is zero where nothing was measured, `run` is
         the run of each block."""
         longest = [np.append(A, np.zeros((CHUNK - len(A), 2, 2)), axis=0) for A in filters]
-        bands = np.stack([band(A, S) for A, S in zip(longest, scales, strict=True)])
+        bands = np.stack([band_matrix(A, S) for A, S in zip(longest, scales, strict=True)])
         known = np.moveaxis(np.asarray(weight) > 0, 1, 2)
         usable = np.zeros(known.shape)
         for index, A in enumerate(filters):
@@ -50,7 +50,7 @@ class Whitening(eqx.Module):
             measured = known[mine].reshape(-1, 2)[:, counts]
             begun = np.logical_or.accumulate(measured.all(1))
             before = np.append(np.ones(len(A), bool), measured.all(1) | ~begun)
-            whole = remembered(before, len(A))[len(A) :] & measured.any(1)
+            whole = with_history(before, len(A))[len(A) :] & measured.any(1)
             usable[mine] = (whole[:, None] * counts).reshape(-1, *known.shape[1:])
         return cls(jnp.asarray(bands), jnp.asarray(np.moveaxis(usable, 2, 1)))
 
@@ -72,7 +72,7 @@ class Whitening(eqx.Module):
         return white * self.usable[..., None]
 
 
-def band(
+def band_matrix(
     A: Float[np.ndarray, "order outputs outputs"], S: Float[np.ndarray, "outputs outputs"]
 ) -> Float[np.ndarray, "white seen"]:
     """The matrix that filters a chunk: from its samples and the `order` before them to the whitened ones."""
@@ -84,7 +84,7 @@ def band(
     return matrix.reshape(CHUNK * outputs, -1)
 
 
-def remembered(known: Bool[np.ndarray, " samples"], order: int) -> Bool[np.ndarray, " samples"]:
+def with_history(known: Bool[np.ndarray, " samples"], order: int) -> Bool[np.ndarray, " samples"]:
     """Which samples were measured, together with the `order` samples before them."""
     lost = np.cumsum(np.append(0, ~known))
     return np.append(np.zeros(order, bool), lost[order + 1 :] == lost[: len(known) - order])

@@ -49,7 +49,7 @@ def simulate(motor: Motor, recording: Run) -> Recording:
     tape = Tape.from_recordings([even], unloaded=True)
     outputs = free_run(motor, tape)
     seen = np.stack([tape.samples_of(0, outputs[:, c], len(even)) for c in range(2)], 1)
-    if even.uneven is not None:
+    if even.resampled_from is not None:
         seen = seen_at_record(motor, tape.drive_of(0), even, seen)
     current = seen[:, 0] if recording.drive == "voltage" else recording.current
     return attrs.evolve(recording, current=current, speed=seen[:, 1], angle=None)

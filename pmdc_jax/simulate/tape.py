@@ -77,7 +77,7 @@ class Tape(eqx.Module):
         vary linearly from sample to sample instead of being held.
         """
         runs = [_Run(recording, straight) for recording in recordings]
-        rises = straight or any(recording.uneven is not None for recording in recordings)
+        rises = straight or any(recording.resampled_from is not None for recording in recordings)
         averaged = any(recording.averaging is not None for recording in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
         empty_runs = _power_of_two(len(runs)) - len(runs)
@@ -185,13 +185,13 @@ class _Run:
         if recording.speed is not None:
             self.speed = recording.speed
         if self.averaging is not None:
-            self.speed = self.averaging.known_of(self.speed)
+            self.speed = self.averaging.with_ends_missing(self.speed)
         drive = recording.drive
         if drive == "voltage" and recording.current is not None:
             self.current = recording.current
         value = getattr(recording, drive)
         linear = straight or varies_linearly(recording)
-        if recording.uneven is not None:
+        if recording.resampled_from is not None:
             self.value, self.rise = mean_and_rise(recording, pieces_of(recording, straight))
         else:
             self.rise = np.diff(value, append=value[-1]) if linear else np.zeros(self.length)

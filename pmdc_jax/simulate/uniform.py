@@ -22,8 +22,8 @@ def uniform(recording: Recording) -> Recording:
     Evenly sampled recordings keep their samples; if only the angle was measured, their speed is its mean over every
     sample. Otherwise voltage, torque and load, which hold between samples, are averaged over each interval of the grid,
     so that no volt-second is lost. Current and speed are interpolated linearly; inside gaps, and past the end, they are
-    missing (NaN). The record is kept as `uneven`. A rotor that stands still throughout is taken as held, because its
-    speed tells nothing.
+    missing (NaN). The record is kept as `resampled_from`. A rotor that stands still throughout is taken as held,
+    because its speed tells nothing.
 
     **Raises**: `InputError` if gaps are so long that the grid has more than `MAX_TICKS_PER_SAMPLE` ticks per sample.
     """
@@ -55,7 +55,7 @@ def uniform(recording: Recording) -> Recording:
         time=grid,
         angle=None,
         temperature=None,
-        uneven=recording,
+        resampled_from=recording,
         **{k: _interval_means(time, x, grid) for k, x in held.items() if x is not None},
         **{k: _interpolate(time, x, grid) for k, x in seen.items() if x is not None},
     )

@@ -26,19 +26,19 @@ from ..prepare import Prepared
 from ..problem import Problem
 
 # Noise below this share of the largest value is rounding
-ROUNDING = 1e-7
+MIN_RELATIVE_NOISE = 1e-7
 # Half widths of the smoothing windows, samples
-WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40)
+HALF_WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40)
 # Windows behind (-1), around (0) and ahead of (1) a sample, each with the order of the polynomial fitted in it
 WINDOWS = ((-1, 0), (0, 0), (1, 0), (-1, 1), (0, 2), (1, 1))
 # Half width, in standard errors, of the confidence intervals of the estimates by wider and wider windows, which must
 # intersect. For voltages of motors a larger value leaves less noise, but rounds corners: like a missing effect.
-DEPARTURE = 1.25
+CONFIDENCE_HALF_WIDTH = 1.25
 # A rough part is noise if the motor felt less than this share of it, and so many standard errors less than all of it
-FELT, CLEAR = 0.5, 5.0
+MAX_FELT_SHARE, MIN_Z_SCORE = 0.5, 5.0
 # ... unless its removal raises the squared residuals of the run by this factor: the whitening filter then mistook its
 # effect for noise
-MISSED = 1.1
+MAX_SQUARES_RATIO = 1.1
 
 
 def without_input_noise(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
@@ -48,15 +48,15 @@ def without_input_noise(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     makes the runs less likely: where most of the residuals have another cause, their regression may mislead.
     """
     drives = [np.asarray(getattr(run.recorded, run.drive)) for run in given.runs]
-    rough = [drive - smoothed(drive) for drive in drives]
+    rough = [drive - denoised(drive) for drive in drives]
     if not any(map(np.any, rough)):
         return given, fit
-    smooth = _driven(given, [d - r for d, r in zip(drives, rough, strict=True)])
-    felt = _felt(given, fit, polish(smooth, fit.optimum, steps=0))
+    smooth = _with_drives(given, [d - r for d, r in zip(drives, rough, strict=True)])
+    felt = _felt_shares(given, fit, polish(smooth, fit.optimum, steps=0))
     if not any(share < 1 for share in felt):
         return given, fit
     lost = [(1 - share) * r for share, r in zip(felt, rough, strict=True)]
-    problem = _driven(given, [d - x for d, x in zip(drives, lost, strict=True)])
+    problem = _with_drives(given, [d - x for d, x in zip(drives, lost, strict=True)])
     better = polish(problem, fit.optimum)
     if negative_log_likelihood(given, better) > negative_log_likelihood(given, fit):
         return given, fit
@@ -66,7 +66,7 @@ def without_input_noise(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     return given._replace(problem=problem, input_noise=taken), better
 
 
-def _driven(given: Prepared, drives: list[np.ndarray]) -> Problem:
+def _with_drives(given: Prepared, drives: list[np.ndarray]) -> Problem:
     """The problem with these drives of the runs."""
     runs = [
         uniform(attrs.evolve(run.recorded, **{run.drive: drive}))
@@ -78,7 +78,7 @@ def _driven(given: Prepared, drives: list[np.ndarray]) -> Problem:
     return replace(given.problem, tape=replace(tape, value=value, rise=rise))
 
 
-def _felt(given: Prepared, rough: Fit, smooth: Fit) -> list[float]:
+def _felt_shares(given: Prepared, rough: Fit, smooth: Fit) -> list[float]:
     """The share of the rough part that the motor felt, for each run; 1 unless it is clearly less than half.
 
     By regression of the residuals with the whole drive on the response to its rough part, both filtered by the whitener
@@ -96,16 +96,20 @@ def _felt(given: Prepared, rough: Fit, smooth: Fit) -> list[float]:
         share = 1 + rest @ response / power if power > 0 else 1.0
         error = np.std(rest) / np.sqrt(power) if power > 0 else 1.0
         mine = tape.blocks_of(run)
-        squares, smoothly = (
+        squares, squares_smooth = (
             np.square(residual[mine] / rough.noise[:, None]).sum()
             for residual in (left, left_smooth)
         )
-        clear = share < FELT and share + CLEAR * error < 1 and smoothly < MISSED * squares
-        shares.append(float(np.clip(share, 0.0, 1.0)) if clear else 1.0)
+        is_noise = (
+            share < MAX_FELT_SHARE
+            and share + MIN_Z_SCORE * error < 1
+            and squares_smooth < MAX_SQUARES_RATIO * squares
+        )
+        shares.append(float(np.clip(share, 0.0, 1.0)) if is_noise else 1.0)
     return shares
 
 
-def smoothed(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+def denoised(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
     """A signal without its white noise, but with its steps and corners preserved.
 
     Each sample is estimated from the widest window behind, around and ahead of it in which the signal is smooth: the
@@ -116,20 +120,22 @@ def smoothed(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " sampl
     confidence intervals); Katkovnik, IEEE Transactions on Signal Processing 47 (1999) 2567.
     """
     noise = noise_by_differences(4, signal)  # by a median, since most of a signal is smooth
-    if not noise > ROUNDING * np.max(np.abs(signal)):
+    if not noise > MIN_RELATIVE_NOISE * np.max(np.abs(signal)):
         return signal
-    estimates, errors = zip(*(_widest(signal, noise, *window) for window in WINDOWS), strict=True)
+    estimates, errors = zip(
+        *(_estimate_by_widest(signal, noise, *window) for window in WINDOWS), strict=True
+    )
     return np.average(estimates, axis=0, weights=1 / np.square(errors))
 
 
-def _widest(
+def _estimate_by_widest(
     signal: np.ndarray, noise: float, side: int, order: int
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
     """The estimate of each sample from the widest smooth window on one side of it, and its standard error."""
     best, error = signal.copy(), np.full(len(signal), noise)
-    low, high = signal - DEPARTURE * noise, signal + DEPARTURE * noise
+    low, high = signal - CONFIDENCE_HALF_WIDTH * noise, signal + CONFIDENCE_HALF_WIDTH * noise
     smooth = np.ones(len(signal), bool)
-    for width in WIDTHS:
+    for width in HALF_WIDTHS:
         samples = width + 1 if side else 2 * width + 1
         if not order < samples - 1 < len(signal):
             continue
@@ -139,8 +145,8 @@ def _widest(
         inner = slice(before, len(signal) - samples + 1 + before)
         estimate = np.full(len(signal), np.nan)
         estimate[inner] = np.correlate(signal, weights, "valid")
-        low = np.fmax(low, estimate - DEPARTURE * spread)
-        high = np.fmin(high, estimate + DEPARTURE * spread)
+        low = np.fmax(low, estimate - CONFIDENCE_HALF_WIDTH * spread)
+        high = np.fmin(high, estimate + CONFIDENCE_HALF_WIDTH * spread)
         smooth &= ~np.isnan(estimate) & (low <= high)
         best, error = np.where(smooth, estimate, best), np.where(smooth, spread, error)
     return best, error

@@ -19,15 +19,15 @@ import numpy as np
 
 from ...recording import Recording
 from ...simulate import Tape, uniform
-from ..likelihood import LIKELIER, negative_log_likelihood
+from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import normal_matrix
-from .speed_averaging import as_sampled, seems_averaged, with_averaging, without_ends
-from .uneven_sampling import on_clock
+from .speed_averaging import seems_averaged, with_averaging, without_averaging, without_ends
+from .uneven_sampling import with_even_clock
 
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
-SHOWS = 0.3
+MIN_LEAD = 0.3
 
 
 class Timing(NamedTuple):
@@ -39,7 +39,7 @@ class Timing(NamedTuple):
     load: bool = False  # whether the recorded loads have the same timing
 
 
-OTHERWISE = (
+ALTERNATIVES = (
     Timing("is linear between samples instead of held", 0, True),
     Timing("was recorded one sample late, after it had been held instead of before", 1, False),
     Timing("acts one sample later than it was recorded", -1, False),
@@ -53,25 +53,25 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
     """
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
         return []  # without a current, or without a speed, only a delay would show
-    early = _early(given, fit)
+    lead = _apparent_lead(given, fit)
     # a speed that is a mean over the last sample is half a sample late, too, and may hide the shift
     hidden = given.averaging is None and seems_averaged(given)
-    if abs(early) < SHOWS and not hidden:
+    if abs(lead) < MIN_LEAD and not hidden:
         return []
 
     @cache
-    def unlikely_with(timing: Timing) -> float:
-        other = as_sampled(with_timing(given, timing))
+    def unlikelihood(timing: Timing) -> float:
+        other = without_averaging(with_timing(given, timing))
         nearer = polish(other.problem, fit.optimum)
         # only a fit with the right timing can tell a mean over the last sample from a delay
-        return negative_log_likelihood_within(*with_averaging(*on_clock(other, nearer)))
+        return negative_log_likelihood_within(*with_averaging(*with_even_clock(other, nearer)))
 
-    enough = negative_log_likelihood_within(given, fit) - LIKELIER
-    asked = [t for t in OTHERWISE if hidden or (t.ahead < 0) == (early < 0)]
-    clearly = [timing for timing in asked if unlikely_with(timing) < enough]
+    limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
+    plausible = [t for t in ALTERNATIVES if hidden or (t.ahead < 0) == (lead < 0)]
+    likelier = [timing for timing in plausible if unlikelihood(timing) < limit]
     if all(run.load is None for run in given.training):
-        return clearly
-    return [min(t, t._replace(load=True), key=unlikely_with) for t in clearly]
+        return likelier
+    return [min(t, t._replace(load=True), key=unlikelihood) for t in likelier]
 
 
 def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:
@@ -80,13 +80,13 @@ def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:
     return negative_log_likelihood(without_ends(given), fit)
 
 
-def _early(given: Prepared, fit: Fit) -> float:
+def _apparent_lead(given: Prepared, fit: Fit) -> float:
     """How much earlier than assumed the voltages seem to act, in half samples: regression of the residuals on the
     change that half a sample makes in the outputs, less the part that the parameters could explain.
 
     Half a sample earlier is a held mean of the voltages at a sample and the next, which reuses compiled programs.
     """
-    means = with_timing(given, OTHERWISE[0]).problem
+    means = with_timing(given, ALTERNATIVES[0]).problem
     means = replace(means, tape=replace(means.tape, rise=None))
     sooner, evaluation = polish(means, fit.optimum, steps=0).evaluation.seen, fit.evaluation
     scale = given.problem.tape.weight / fit.noise[:, None]
@@ -96,14 +96,14 @@ def _early(given: Prepared, fit: Fit) -> float:
     )
     hessian, slope = matrix[:-1, :-1], matrix[:-1, -1]
     own = matrix[-1, -1] - slope @ np.linalg.pinv(hessian, hermitian=True) @ slope
-    shared = -float(jnp.sum(evaluation.residuals * change))
-    return shared / own if own > 0 else 0.0
+    along = -float(jnp.sum(evaluation.residuals * change))
+    return along / own if own > 0 else 0.0
 
 
 def with_timing(given: Prepared, timing: Timing) -> Prepared:
     """The runs with voltages of this timing."""
     tape = given.problem.tape
-    runs = [uniform(_acting(run, k, tape, timing)) for k, run in enumerate(given.runs)]
+    runs = [uniform(_retimed(run, k, tape, timing)) for k, run in enumerate(given.runs)]
     driven = Tape.from_recordings(runs, straight=timing.straight)
     value, load, rise = jax.tree.map(jnp.asarray, (driven.value, driven.load, driven.rise))
     tape = replace(tape, value=value, load=load, rise=rise)
@@ -113,14 +113,14 @@ def with_timing(given: Prepared, timing: Timing) -> Prepared:
     return without_ends(acting) if timing.ahead < 0 else acting
 
 
-def _acting(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
+def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
     """The record of a run with its voltages, and its loads if the timing says so, moved to the samples where they act.
 
     Voltages of an even clock are taken from the tape, where their noise may have been removed.
     """
     if run.drive != "voltage":
         return run.recorded
-    even = run.uneven is None
+    even = run.resampled_from is None
     voltage = tape.samples_of(k, tape.value, len(run)) if even else run.recorded.voltage
     run, last = run.recorded, len(run.recorded) - 1
     rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)

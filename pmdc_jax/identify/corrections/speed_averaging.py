@@ -17,41 +17,41 @@ from jaxtyping import Float
 
 from ...recording import OVER_BOTH, OVER_LAST, Averaging
 from ...simulate import Tape
-from ..likelihood import LIKELIER, negative_log_likelihood
+from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..noise import quantum
 from ..polish import Fit, polish
 from ..prepare import Prepared
 
 # Most lines of an encoder, and by how much a computed number of lines may differ from a whole one
-LINES, WHOLE = 2e4, 0.02
+MAX_LINES, LINES_TOLERANCE = 2e4, 0.02
 # Noise power in counts squared next to the Nyquist frequency: 1/12 for a speed rounded to counts, 1/3 for a mean over
 # the last sample
-COUNTED = 1 / 6
+COUNTED_AT_NYQUIST = 1 / 6
 # The same averaged over all high frequencies: 1/12 and 1/4
 COUNTED_IN_ALL = 1 / 7
 # Shortest run, in samples, of which these powers are estimated
-ENOUGH = 200
+MIN_SAMPLES = 200
 # Frequency bands as shares of the Nyquist frequency: around half of it, near it, next to it, and all that are high
 BANDS = ((0.4, 0.6), (0.9, 0.95), (0.98, 1.0), (0.4, 1.0))
 # How much smaller an inductance is tried, in natural logarithms
-SMALLER = 3.0
+L_REDUCTION = 3.0
 # Which outputs: current and speed, or speed alone
 BOTH, SPEED = slice(None), slice(1, None)
 # Power next to the Nyquist frequency over that near it, at most, for a mean over two samples: in theory 1/40
-NONE = 1 / 8
+MAX_NYQUIST_RATIO = 1 / 8
 
 
 def seems_averaged(given: Prepared) -> bool:
     """Whether the speeds are encoder counts with the noise of a mean."""
-    mean, _, counted = _mean_by_noise(given)
+    mean, _, counted = _averaging_by_noise(given)
     return counted and mean is not None
 
 
-def clearly_averaged(given: Prepared) -> Prepared:
+def with_evident_averaging(given: Prepared) -> Prepared:
     """The runs with their speeds treated as means over the last sample where the noise leaves no doubt of it."""
-    mean, enough, _ = _mean_by_noise(given)
-    sure = mean is not None and np.isneginf(enough)
-    return _averaged(without_ends(given, SPEED), mean) if sure else given
+    mean, min_gain, _ = _averaging_by_noise(given)
+    sure = mean is not None and np.isneginf(min_gain)
+    return _with_speeds_averaged(without_ends(given, SPEED), mean) if sure else given
 
 
 def with_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
@@ -63,26 +63,26 @@ def with_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """
     if given.averaging:
         return given, fit
-    mean, enough, counted = _mean_by_noise(given)
+    mean, min_gain, counted = _averaging_by_noise(given)
     if mean is None:
         return given, fit
     inner = without_ends(given, SPEED)
-    averaged, better = _fitted(_averaged(inner, mean), fit)
+    averaged, better = _fit_to(_with_speeds_averaged(inner, mean), fit)
     left = negative_log_likelihood(averaged, better)
-    if not negative_log_likelihood(inner, fit) - left > enough:
+    if not negative_log_likelihood(inner, fit) - left > min_gain:
         return given, fit
     if not counted:
         # a mean over the last and the next sample has no lag: a speed that fits better a sample earlier, or as a mean
         # over the last sample, is merely late
-        last = negative_log_likelihood(*_fitted(_averaged(inner, OVER_LAST), fit))
-        if last < left or _fitted(_sooner(inner), fit)[1].fitness < fit.fitness:
+        last = negative_log_likelihood(*_fit_to(_with_speeds_averaged(inner, OVER_LAST), fit))
+        if last < left or _fit_to(_shifted_earlier(inner), fit)[1].fitness < fit.fitness:
             return given, fit
     return averaged, better
 
 
-def as_sampled(given: Prepared) -> Prepared:
+def without_averaging(given: Prepared) -> Prepared:
     """The runs with their recorded speeds treated as instantaneous again."""
-    return _averaged(given, None) if given.averaging else given
+    return _with_speeds_averaged(given, None) if given.averaging else given
 
 
 def without_ends(given: Prepared, outputs: slice = BOTH) -> Prepared:
@@ -98,7 +98,7 @@ def without_ends(given: Prepared, outputs: slice = BOTH) -> Prepared:
     return given.with_tape(weight=jnp.asarray(weight))
 
 
-def _averaged(given: Prepared, averaging: Averaging | None) -> Prepared:
+def _with_speeds_averaged(given: Prepared, averaging: Averaging | None) -> Prepared:
     """The runs with their recorded speeds treated as such means, or as instantaneous for None."""
     runs = [
         attrs.evolve(run, averaging=averaging) if run.speed is not None and not ours else run
@@ -109,7 +109,7 @@ def _averaged(given: Prepared, averaging: Averaging | None) -> Prepared:
     return averaged._replace(runs=runs, averaging=averaging)
 
 
-def _sooner(given: Prepared) -> Prepared:
+def _shifted_earlier(given: Prepared) -> Prepared:
     """The runs with their speeds shifted to one sample earlier."""
     runs = [
         run if run.speed is None else attrs.evolve(run, speed=np.append(run.speed[1:], np.nan))
@@ -120,36 +120,38 @@ def _sooner(given: Prepared) -> Prepared:
     return given.with_tape(measured=jnp.asarray(laid.measured), weight=weight)
 
 
-def _fitted(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def _fit_to(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs, and the fit to them that starts from `fit`, or from there with a smaller inductance: a large one may
     have compensated half a sample of delay."""
     parameters, unknowns = given.problem.parameters, fit.unknowns
     starts = [fit.optimum]
     if "L" in parameters.names and given.averaging == OVER_LAST:
         L = parameters.names.index("L")
-        less = jnp.maximum(unknowns.coordinates[L] - SMALLER, parameters.lower[L])
+        less = jnp.maximum(unknowns.coordinates[L] - L_REDUCTION, parameters.lower[L])
         coordinates = unknowns.coordinates.at[L].set(less)
         starts.append(fit.optimum._replace(unknowns=unknowns._replace(coordinates=coordinates)))
     ends = [polish(given.problem, start) for start in starts]
     return given, min(ends, key=lambda end: end.fitness)
 
 
-def _mean_by_noise(given: Prepared) -> tuple[Averaging | None, float, bool]:
+def _averaging_by_noise(given: Prepared) -> tuple[Averaging | None, float, bool]:
     """The mean that the noise of the speeds suggests, None if none; the gain in log-likelihood that it must bring, as
-    in `counted_over`; and whether the speeds are counts.
+    in `averaging_of_counts`; and whether the speeds are counts.
 
     A mean over the last sample can be told from a delay only if the speed is counted, and from an inductance only if
     the current was measured.
     """
     speeds = _speeds(given)
     counts = _in_counts(speeds)
-    mean, enough = counted_over(counts) if counts else differenced_over([s for s, _ in speeds])
+    mean, min_gain = (
+        averaging_of_counts(counts) if counts else averaging_of_differences([s for s, _ in speeds])
+    )
     if mean == OVER_LAST and not given.problem.samples[0] > 0:
         mean = None
-    return mean, enough, bool(counts)
+    return mean, min_gain, bool(counts)
 
 
-def counted_over(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
+def averaging_of_counts(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
     """The mean that speeds in counts per sample are, None if none, and the gain in log-likelihood that it must bring;
     if negative, the loss that is accepted.
 
@@ -158,23 +160,23 @@ def counted_over(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]
     zero and four times. While the rotor turns steadily the rounding error is not noise but a beat at some frequency:
     only its total power is known then, and the fit must decide.
     """
-    middle, high, highest, in_all = _powers(counts)
-    if highest > COUNTED:
-        clearly = highest > np.sqrt(2.0) * max(middle, COUNTED)
-        return OVER_LAST, -np.inf if clearly else -LIKELIER
-    if in_all > COUNTED_IN_ALL and not highest < NONE * high:
-        return OVER_LAST, LIKELIER
-    return OVER_BOTH if highest < NONE * high else None, -LIKELIER
+    middle, high, highest, in_all = _band_powers(counts)
+    if highest > COUNTED_AT_NYQUIST:
+        clearly = highest > np.sqrt(2.0) * max(middle, COUNTED_AT_NYQUIST)
+        return OVER_LAST, -np.inf if clearly else -MIN_LOG_LIKELIHOOD_GAIN
+    if in_all > COUNTED_IN_ALL and not highest < MAX_NYQUIST_RATIO * high:
+        return OVER_LAST, MIN_LOG_LIKELIHOOD_GAIN
+    return OVER_BOTH if highest < MAX_NYQUIST_RATIO * high else None, -MIN_LOG_LIKELIHOOD_GAIN
 
 
-def differenced_over(speeds: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
+def averaging_of_differences(speeds: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
     """The same for speeds that are no counts: differences over two samples have no power at the Nyquist frequency, any
     other signal with noise or steps has as much there as near it."""
-    _, high, highest, _ = _powers(speeds) if speeds else (0.0, 0.0, 0.0, 0.0)
-    return OVER_BOTH if highest < NONE * high else None, LIKELIER
+    _, high, highest, _ = _band_powers(speeds) if speeds else (0.0, 0.0, 0.0, 0.0)
+    return OVER_BOTH if highest < MAX_NYQUIST_RATIO * high else None, MIN_LOG_LIKELIHOOD_GAIN
 
 
-def _powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
+def _band_powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
     """Mean power of the signals in each of the `BANDS`, scaled as the variance of white noise with that power.
 
     Computed from second differences, since the much stronger low frequencies would leak into the high ones.
@@ -191,14 +193,14 @@ def _powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
 
 
 def _speeds(given: Prepared) -> list[tuple[np.ndarray, float]]:
-    """The recorded speeds, rad/s, of all training runs long enough to show their noise, and their sample times, s."""
+    """The recorded speeds, rad/s, of all training runs long min_gain to show their noise, and their sample times, s."""
     recorded = [
         (run.speed, np.diff(run.time))
         for run, ours in zip(given.training, given.differentiated, strict=False)
         if run.speed is not None and not ours
     ]
     known = [(speed[~np.isnan(speed)], float(np.median(steps))) for speed, steps in recorded]
-    return [(speed, step) for speed, step in known if len(speed) >= ENOUGH]
+    return [(speed, step) for speed, step in known if len(speed) >= MIN_SAMPLES]
 
 
 def _in_counts(speeds: Sequence[tuple[np.ndarray, float]]) -> list[np.ndarray]:
@@ -208,12 +210,12 @@ def _in_counts(speeds: Sequence[tuple[np.ndarray, float]]) -> list[np.ndarray]:
         # a speed may jump by many counts from sample to sample, but its sorted values lie closer together
         step = quantum(np.diff(speed)) or quantum(np.diff(np.unique(speed)))
         lines = 2 * np.pi / step / sample_time if step else np.inf
-        if lines > LINES:
+        if lines > MAX_LINES:
             return []
         in_counts = speed / step
         # the tolerance grows with the error of a count where speeds were written with few digits
         rounded = np.quantile(np.abs(in_counts - np.round(in_counts)), 0.95)
-        whole = WHOLE + lines * rounded / np.max(np.abs(in_counts))
+        whole = LINES_TOLERANCE + lines * rounded / np.max(np.abs(in_counts))
         if abs(lines - round(lines)) > whole:
             return []
         counts.append(in_counts)

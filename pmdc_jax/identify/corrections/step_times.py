@@ -18,26 +18,26 @@ from scipy.linalg import expm
 
 from ...recording import Averaging, Recording
 from ...simulate.tape import BLOCK
-from ..likelihood import LIKELIER, negative_log_likelihood
+from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem
 
 # A step is this many times the change of the voltage in the samples beside it, and this share of the voltage's range
-STANDS_OUT, LARGE = 10.0, 0.05
+MIN_STEP_RATIO, MIN_STEP_SHARE = 10.0, 0.05
 # With fewer steps in all it cannot be told whether they share one delay; a run with more than one step in this many
 # samples is not switched
-FEWEST, SAMPLES = 4, 20
+MIN_STEPS, MIN_SAMPLES_PER_STEP = 4, 20
 # Most numbers in the array of step responses
-NUMBERS = 2e7
-# Steps without a clock come anywhere within a sample: SPREAD is the least standard deviation of their places in it;
-# OUTSIDE is how far outside it an estimate may lie, in samples, and also the share of estimates that may lie farther
-SPREAD, OUTSIDE = 0.15, 0.2
+MAX_ELEMENTS = 2e7
+# Steps without a clock come anywhere within a sample: least standard deviation of their places in it, how far outside
+# it an estimate may lie, both in samples, and the share of the estimates that may lie farther outside
+MIN_SPREAD, MARGIN, MAX_OUTLIERS = 0.15, 0.2, 0.2
 # Gain in log-likelihood that each step must bring
-EACH = 5.0
-PASSES = 5
+MIN_GAIN_PER_STEP = 5.0
+REFITS = 5
 # A combination of steps with less than this share of the largest eigenvalue of the normal matrix is not felt
-HARDLY = 1e-8
+RANK_TOLERANCE = 1e-8
 
 
 class Steps(NamedTuple):
@@ -57,64 +57,70 @@ def with_step_times(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     if given.straight:  # a straight rise between two samples is a step in their middle
         steps = [s._replace(share=s.share + 0.5) for s in steps]
     count, most = sum(len(s.at) for s in steps), max(len(s.at) for s in steps)
-    too_many = 2 * problem.tape.value.size * most > NUMBERS
-    if not all(problem.samples > 0) or count < FEWEST or too_many:
+    too_many = 2 * problem.tape.value.size * most > MAX_ELEMENTS
+    if not all(problem.samples > 0) or count < MIN_STEPS or too_many:
         return given, fit
-    enough = LIKELIER + EACH * count
-    steps, promised = _moved(problem, fit, steps)
-    if promised < enough or not _come_anywhere(steps):
+    min_gain = MIN_LOG_LIKELIHOOD_GAIN + MIN_GAIN_PER_STEP * count
+    steps, predicted_gain = _fit_times(problem, fit, steps)
+    if predicted_gain < min_gain or not _are_unsynchronised(steps):
         return given, fit
     placed, better = given, fit
-    for again in range(PASSES):
-        if again:
-            steps, _ = _moved(placed.problem, better, steps)
-        placed = _placed(given, better, steps)
+    for refit in range(REFITS):
+        if refit:
+            steps, _ = _fit_times(placed.problem, better, steps)
+        placed = _with_steps(given, better, steps)
         better = polish(placed.problem, better.optimum)
-    gained = negative_log_likelihood(given, fit) - negative_log_likelihood(given, better)
-    return (placed, better) if gained > enough else (given, fit)
+    gain = negative_log_likelihood(given, fit) - negative_log_likelihood(given, better)
+    return (placed, better) if gain > min_gain else (given, fit)
 
 
 def steps_of(run: Recording) -> Steps:
     """The voltage steps of a run that stand out, placed at samples."""
     at, height = np.zeros(0, int), np.zeros(0)
-    if run.drive == "voltage" and run.voltage is not None and run.uneven is None and len(run) > 3:
+    if (
+        run.drive == "voltage"
+        and run.voltage is not None
+        and run.resampled_from is None
+        and len(run) > 3
+    ):
         rise = np.diff(run.voltage)
         size = np.abs(rise)
-        around = np.pad(size, 1)
-        around = np.maximum(around[:-2], around[2:])
-        enough = np.maximum(STANDS_OUT * around, LARGE * np.ptp(run.voltage))
-        found = np.flatnonzero(size > enough)
-        if len(found) <= len(run) / SAMPLES:
+        padded = np.pad(size, 1)
+        beside = np.maximum(padded[:-2], padded[2:])
+        least = np.maximum(MIN_STEP_RATIO * beside, MIN_STEP_SHARE * np.ptp(run.voltage))
+        found = np.flatnonzero(size > least)
+        if len(found) <= len(run) / MIN_SAMPLES_PER_STEP:
             at, height = found + 1, rise[found]
     return Steps(at, height, np.zeros(len(at)))
 
 
-def _come_anywhere(steps: Sequence[Steps]) -> bool:
+def _are_unsynchronised(steps: Sequence[Steps]) -> bool:
     """Whether the steps are spread over a sample interval, instead of all at the same place in it or outside."""
     share = np.concatenate([s.share for s in steps])
-    inside = (share > -OUTSIDE) & (share < 1 + OUTSIDE)
-    return bool(np.mean(inside) > 1 - OUTSIDE and np.std(np.clip(share, 0, 1)) > SPREAD)
+    inside = (share > -MARGIN) & (share < 1 + MARGIN)
+    spread = np.std(np.clip(share, 0, 1))
+    return bool(np.mean(inside) > 1 - MAX_OUTLIERS and spread > MIN_SPREAD)
 
 
-def _moved(problem: Problem, fit: Fit, steps: Sequence[Steps]) -> tuple[list[Steps], float]:
+def _fit_times(problem: Problem, fit: Fit, steps: Sequence[Steps]) -> tuple[list[Steps], float]:
     """The steps at the times that minimise the residuals of a fit, and the gain in log-likelihood for white noise."""
     tape = problem.tape
     scale = np.asarray(tape.weight) / fit.noise[:, None]
     left = (np.asarray(tape.measured) - np.asarray(fit.evaluation.seen)) * scale
-    moved, squares = [], 0.0
+    fitted, squares = [], 0.0
     for run, s in enumerate(steps):
         mine = tape.blocks_of(run)
         columns = _responses(problem, fit, run, s) * scale[mine][..., None]
         rows, rest = columns.reshape(left[mine].size, len(s.at)), left[mine].ravel()
         along = rows.T @ rest
         # a step that is hardly felt stays where it is
-        by = np.linalg.pinv(rows.T @ rows, hermitian=True, rcond=HARDLY) @ along
-        moved.append(s._replace(share=s.share + by))
+        by = np.linalg.pinv(rows.T @ rows, hermitian=True, rcond=RANK_TOLERANCE) @ along
+        fitted.append(s._replace(share=s.share + by))
         squares += float(along @ by)
-    return moved, squares / 2
+    return fitted, squares / 2
 
 
-def _placed(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
+def _with_steps(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
     """The runs with the steps at their times, which become nuisance parameters of the problem."""
     problem, tape = given.problem, given.problem.tape
     value = np.array(tape.value)
@@ -146,17 +152,17 @@ def _responses(
     motor = problem.parameters(fit.coordinates)
     A, B = map(np.asarray, motor.state_space(tape.drive_of(run)))
     length = int(tape.blocks_of(run).sum()) * BLOCK
-    after = _powers(expm(A * step), length)
+    after = _matrix_powers(expm(A * step), length)
     responses = np.zeros((length, 2, len(steps.at)))
     for k, (at, height, share) in enumerate(zip(*steps, strict=True)):
-        begun = expm(A * step * np.clip(share, 0.0, 1.0)) @ B[:, 0] * step * height
-        responses[at:, :, k] = after[: length - at] @ begun
+        at_sample = expm(A * step * np.clip(share, 0.0, 1.0)) @ B[:, 0] * step * height
+        responses[at:, :, k] = after[: length - at] @ at_sample
     if tape.averaging is not None:
-        responses[:, 1] = Averaging(*np.asarray(tape.averaging)[run]).of(responses[:, 1])
+        responses[:, 1] = Averaging(*np.asarray(tape.averaging)[run]).applied_to(responses[:, 1])
     return np.moveaxis(responses.reshape(length // BLOCK, BLOCK, 2, len(steps.at)), 1, 2)
 
 
-def _powers(A: Float[np.ndarray, "2 2"], count: int) -> Float[np.ndarray, "count 2 2"]:
+def _matrix_powers(A: Float[np.ndarray, "2 2"], count: int) -> Float[np.ndarray, "count 2 2"]:
     """The powers of a matrix, starting at the zeroth."""
     powers = np.eye(2)[None]
     while len(powers) < count:

@@ -19,35 +19,35 @@ from ..polish import Fit, polish
 from ..prepare import Prepared
 
 # Refits at most
-PASSES = 12
+MAX_REFITS = 12
 # Refits end when the shifts of the samples change by less than this, sum of squares in noise variances: that could move
 # no estimate by more than its root, 0.1 standard errors
-AT_REST = 0.01
+SHIFT_TOLERANCE = 0.01
 # Steps of the parameters that shrink by less than this ratio are extrapolated to their limit
-SHRINKING = 0.9
+MAX_STEP_RATIO = 0.9
 
 
-def on_clock(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def with_even_clock(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with every sample of an uneven clock shifted to the nearest even sample along the simulated motion, and
     the fit to them; both unchanged where all clocks are even."""
-    uneven = any(run.uneven is not None for run in given.runs)
+    uneven = any(run.resampled_from is not None for run in given.runs)
     last = None
-    for _ in range(PASSES if uneven else 0):
-        before, given = given, _moved(given, fit)
+    for _ in range(MAX_REFITS if uneven else 0):
+        before, given = given, _shifted(given, fit)
         fit, start = polish(given.problem, fit.optimum), fit
-        if _squares_between(before, given, fit) < AT_REST:
+        if _squares_between(before, given, fit) < SHIFT_TOLERANCE:
             break
         step = np.asarray(fit.coordinates - start.coordinates)
         rate = step @ last / (last @ last) if last is not None else 0.0
         last = step
-        if 0 < rate < SHRINKING:
+        if 0 < rate < MAX_STEP_RATIO:
             # where the current settles within a sample, samples shifted with a wrong inductance reproduce most of its
             # error, and plain iteration would converge slowly
-            fit, last = _ahead(given, fit, rate / (1 - rate) * step), None
+            fit, last = _extrapolated(given, fit, rate / (1 - rate) * step), None
     return given, fit
 
 
-def _ahead(given: Prepared, fit: Fit, step: Float[np.ndarray, " parameters"]) -> Fit:
+def _extrapolated(given: Prepared, fit: Fit, step: Float[np.ndarray, " parameters"]) -> Fit:
     """The fit evaluated a `step` further on, within the bounds (Irons and Tuck, doi:10.1002/nme.1620010306)."""
     parameters, unknowns = given.problem.parameters, fit.unknowns
     further = jnp.clip(unknowns.coordinates + step, parameters.lower, parameters.upper)
@@ -62,16 +62,16 @@ def _squares_between(before: Prepared, after: Prepared, fit: Fit) -> float:
     return float(np.square(moved / fit.noise[:, None])[after.problem.fitted_blocks].sum())
 
 
-def _moved(given: Prepared, fit: Fit) -> Prepared:
+def _shifted(given: Prepared, fit: Fit) -> Prepared:
     """The runs with their samples shifted along the simulated motion of this fit."""
     tape, seen = given.problem.tape, fit.evaluation.seen
     motor = given.problem.parameters(fit.coordinates)
     runs = []
     for k, run in enumerate(given.runs):
-        if run.uneven is not None:
+        if run.resampled_from is not None:
             now = np.stack([tape.samples_of(k, seen[:, c], len(run)) for c in range(2)], 1)
             then = seen_at_record(motor, tape.drive_of(k), run, now, given.straight)
-            run = _next_to(run, now, then)
+            run = _nearest_samples(run, now, then)
         runs.append(run)
     laid, begins = Tape.from_recordings(runs), np.asarray(tape.begins)
     # the first sample of a run is the first of the even clock: it counts if it did before
@@ -80,7 +80,7 @@ def _moved(given: Prepared, fit: Fit) -> Prepared:
     return moved.with_tape(measured=jnp.asarray(laid.measured), weight=jnp.asarray(laid.weight))
 
 
-def _next_to(run: Recording, now: np.ndarray, then: np.ndarray) -> Recording:
+def _nearest_samples(run: Recording, now: np.ndarray, then: np.ndarray) -> Recording:
     """A run on an even clock with the output recorded nearest to each of its samples, and NaN inside gaps.
 
     **Arguments**: `now` and `then`, the simulated outputs at the even samples and at the recorded ones.
