@@ -38,6 +38,8 @@ BETTER = 1e-3
 ROUGHLY = 8
 # ... two of which found the same optimum if their misfits differ by less than this factor
 AGREED = 1.05
+# A fuller form whose short refits leave no less than this share of the simple form's misfit is searched no further
+PROMISING = 0.9
 # Grid points in [-pi, pi) for the phase that all runs have in common
 PHASES = 120
 
@@ -106,9 +108,11 @@ class Refits:
         def refit() -> Model:
             its = self._by_what_it_replaces(current, old, new)
             starts = self._starts(current, effects) or [self._start(current, effects, its)]
+            to_beat = np.inf
             if old in FULLER and FULLER[old].effect == new:
                 starts = [self._in_full(current, old, effects), *starts]
-            return self._best_of(effects, starts, white)
+                to_beat = PROMISING * _fitness(current)
+            return self._best_of(effects, starts, white, to_beat)
 
         return self._once(effects, current, refit)
 
@@ -199,11 +203,18 @@ class Refits:
         others = starts(self.library.scales) if starts else []
         return [self._start(current, effects, {effects[-1]: values}) for values in others]
 
-    def _best_of(self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener) -> Model:
+    def _best_of(
+        self,
+        effects: tuple[str, ...],
+        starts: Sequence[Start],
+        white: Whitener,
+        to_beat: float = np.inf,
+    ) -> Model:
         """The best refit from several starts of the last effect.
 
         Short refits are made until the best reaches the noise (`POOR_FIT`) or two agree on it (`AGREED`); it is then
-        refitted in full. With `Trial.factors`, populations search around each start first, and around the end.
+        refitted in full. With `Trial.factors`, populations search around each start first; and around the end, if the
+        best short refit has a misfit below `to_beat`.
         """
         given, seed = starts[0][0], self.solved.seed
         runs = starts[0][1].unknowns.runs
@@ -219,7 +230,7 @@ class Refits:
         ends = map_in_threads_until(_roughly, starts, enough)
         best = min(ends, key=lambda end: end.fitness)
         begun = best._replace(unknowns=best_backlash_start(given.problem, best.unknowns, runs))
-        if factors:
+        if factors and best.fitness < to_beat:
             return _best_around(effects, given, begun, factors, seed)
         return refit_from(effects, given, begun, white)
 
