@@ -27,7 +27,7 @@ from ..motor import Motor
 from .response import Path, path_of
 
 # Largest number of effects in a set
-MOST_EFFECTS = 3
+MAX_EFFECTS = 3
 # A model is exact if its residuals are a smaller share of what was measured, as root mean squares
 CLOSE = 1e-4
 
@@ -169,7 +169,7 @@ class RunSeries(NamedTuple):
     simulated: Series
 
 
-def rows_of(model: Model) -> list[RunSeries]:
+def series_of_runs(model: Model) -> list[RunSeries]:
     """The fit of every training run, in the order of time."""
     evaluation, tape = model.fit.evaluation, model.given.problem.tape
     J = np.asarray(evaluation.jacobian) * model.fit.noise[:, None, None]

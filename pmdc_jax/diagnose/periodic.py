@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from .model import Model, rows_of
+from .model import Model, series_of_runs
 
 # Frequencies (bins) whose median power is the level around a line
 NEIGHBOURS = 41
@@ -53,7 +53,7 @@ class Spectrum(NamedTuple):
 def line_of(model: Model) -> Line | None:
     """The steady oscillation that a model leaves in most of the runs, if it leaves one."""
     spectra = []
-    for run, fit in zip(model.given.training, rows_of(model), strict=True):
+    for run, fit in zip(model.given.training, series_of_runs(model), strict=True):
         drives = (run.voltage, run.torque, run.load, run.current)
         # a current drives only where there is no voltage
         there = [x for x in drives[: 3 + (run.voltage is None)] if x is not None]

@@ -22,13 +22,14 @@ from ..identify.solve import POOR_FIT, Solved, search_and_refine
 from ..identify.uncertainty import information_of
 from ..progress import ReportProgress
 from ..threads import map_in_threads_until
-from .candidates import TRIALS, Values
+from .candidates import Values
 from .compare import Comparison
-from .effect_relations import CONTAINS, FULLER, spelt_out
+from .effect_relations import CONTAINS, FULLER, with_split_friction
 from .library import Library
 from .model import Model, model_of, refit_from
 from .shortlist import effect_of
 from .signals import Screen, Signal
+from .trials import TRIALS
 
 # Share of the gain promised by the evidence that a refit must realise; otherwise it is fitted in another way
 KEPT = 0.5
@@ -309,11 +310,11 @@ class Refits:
 
 
 def _with_another(here: tuple[str, ...], effect: str) -> tuple[str, ...]:
-    """A set of effects with one more in place of those that it contains: the others in order, those that `spelt_out`
-    puts in, and the new one last."""
+    """A set of effects with one more in place of those that it contains: the others in order, those that
+    `with_split_friction` adds, and the new one last."""
     contains, kept = CONTAINS.get(effect, set()), set(here)
-    if contains & spelt_out(kept):
-        kept = spelt_out(kept) - contains
+    if contains & with_split_friction(kept):
+        kept = with_split_friction(kept) - contains
     return (*(e for e in here if e in kept), *sorted(kept - set(here)), effect)
 
 
