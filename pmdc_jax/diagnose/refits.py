@@ -271,7 +271,7 @@ class Refits:
             return None
         values = {candidate.effect: its}
         if "constant_load" in set(effects) - set(current.effects) - {candidate.effect}:
-            values["constant_load"] = {"torque_Nm": current.slanted}
+            values["constant_load"] = {"torque_Nm": current.friction_asymmetry}
         return self._start(current, effects, values, fit.moved, angles)
 
     def _start(
@@ -295,10 +295,10 @@ class Refits:
         before = dict(zip(names, np.asarray(unknowns.coordinates) + near, strict=True))
         for effect, new in values.items():
             self.begun.setdefault(effect, new)
-        coordinates, lost = [], current.lost
+        coordinates, undetermined = [], current.undetermined
         for name, log in zip(parameters.names, parameters.logarithmic, strict=True):
             effect, _, field = name.partition(".")
-            if name in before and not (field and name in lost):
+            if name in before and not (field and name in undetermined):
                 coordinates.append(before[name])
             else:
                 value = values.get(effect, self.begun.get(effect, {}))[field]
