@@ -124,7 +124,7 @@ class Undecided(StepwiseSelection):
     _by_likeliest_effect = staticmethod(lambda *models: None)
     _best = staticmethod(lambda tried, white: tried[0])
     elimination = Mock(reduced=lambda model: model)
-    _exceeds_model_form_error = staticmethod(lambda *models: True)
+    _is_genuine_improvement = staticmethod(lambda *models: True)
     _equivalent_swaps = staticmethod(lambda *models: [])
     _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))
 
@@ -139,7 +139,7 @@ def test_what_only_mends_a_formula_does_not_hide_what_plain_squares_find():
     """A filter may swallow most of an effect: what it leaves then looks like the formula of another one."""
     selection = Undecided()
     selection._by_unfiltered_misfit = lambda current, found: selection.other
-    selection._exceeds_model_form_error = lambda current, found, better: better is selection.other
+    selection._is_genuine_improvement = lambda current, found, better: better is selection.other
     selection._in_other_forms = lambda *models: []
     assert selection._step(selection.base, selection.assess(selection.base)) is selection.other
 
@@ -236,13 +236,13 @@ def test_only_waves_that_records_show_are_tried():
     assert tried("", SCALES._replace(travel=0.0)) == []
 
 
-@pytest.mark.parametrize("simple", [s for s, form in FULLER.items() if form.reduced])
+@pytest.mark.parametrize("simple", [s for s, form in FULLER.items() if form.to_simple])
 def test_a_simple_form_begins_within_its_ranges(simple):
     """Even where the rich one was fitted with nothing but a peak."""
     rich = FULLER[simple].effect
     sizes = dict(zip(EFFECTS[rich].ranges, (1e-10, 0.3, 20.0), strict=False))
     effect = EFFECTS[rich](**{field: np.asarray(x) for field, x in sizes.items()})
-    values = FULLER[simple].reduced(effect)
+    values = FULLER[simple].to_simple(effect)
     assert values.keys() == EFFECTS[simple].ranges.keys()
     for field, r in EFFECTS[simple].ranges.items():
         assert r.lower < values[field] < r.upper
@@ -269,7 +269,7 @@ def test_a_fuller_form_begins_as_the_simple_one_with_more_to_it(simple):
     about = EFFECTS[simple].ranges
     effect = EFFECTS[simple](**{field: np.asarray(0.3) for field in about})
     fuller = FULLER[simple]
-    values = fuller.begun(effect, SCALES)
+    values = fuller.from_simple(effect, SCALES)
     full = EFFECTS[fuller.effect](**{field: np.asarray(x) for field, x in values.items()})
     assert full.is_possible()
     assert set(fuller.extra) < set(values) == set(full.ranges)

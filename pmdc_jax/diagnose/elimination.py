@@ -54,7 +54,7 @@ class BackwardElimination:
 
     def _simpler_forms(self, effect: str) -> list[str]:
         """The simpler effects that may replace one: contained ones that were begun, and that of which it is fuller."""
-        of_fuller = {s for s, form in FULLER.items() if form.effect == effect and form.reduced}
+        of_fuller = {s for s, form in FULLER.items() if form.effect == effect and form.to_simple}
         return sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys() | of_fuller)
 
     def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:

@@ -28,7 +28,7 @@ CURVE_VARIABLES = {
     "mechanical": ("speed", "current", "time"),
     "electrical": ("current", "speed", "voltage", "time"),
 }
-# Knots of a curve over speed, current or voltage, and over the time of each run.
+# Knots of a curve over speed, current or voltage, and over the time of each run
 KNOTS, KNOTS_IN_TIME = 9, 7
 # Periods per turn of the rotor of a torque that is periodic behind a gear; so dense that neighbours differ by half a
 # period over about 500 rad
@@ -61,7 +61,7 @@ class Curve(NamedTuple):
     variable: str
     knots: np.ndarray
     per_run: bool = False  # every run has a curve of its own
-    # (knots, columns): values of the columns at the knots; None where these are hat functions, one a knot
+    # (knots, columns): values of the columns at the knots; None where these are hat functions, one per knot
     shapes: np.ndarray | None = None
     # changes sign with the direction of motion, as a friction that changes over time does
     reverses: bool = False
@@ -125,6 +125,7 @@ class Library:
         return run_one_ahead(self._change_calls(tape, path))
 
     def _change_calls(self, tape: Tape, path: Path) -> Iterator[Callable[[], Change]]:
+        """Functions that compute the changes, each of as many columns as are simulated together."""
         for name in EFFECTS:
             shapes = [c for c in self.candidates if c.effect == name]
             if shapes and shapes[0].full_simulation:
@@ -210,6 +211,7 @@ def curves_along(library: Library, tape: Tape, path: Path) -> tuple[list[Curve],
     return [curve for curve, _ in terms], (change() for _, change in terms)
 
 
+# A curve, and a function that computes what it changes
 Term = tuple[Curve, Callable[[], Change]]
 
 
@@ -254,8 +256,9 @@ def _angle_waves(library: Library, tape: Tape, path: Path) -> Iterator[Term]:
 
 
 def _wave_curve(equation: str, periods: float) -> Curve:
-    turned = np.linspace(0, 2 * np.pi / periods, KNOTS_IN_PERIOD)
-    return Curve(equation, "angle", turned, True, _wave(periods * turned))
+    """A sinusoid of the angle with its own phase in every run, over one period."""
+    angle = np.linspace(0, 2 * np.pi / periods, KNOTS_IN_PERIOD)
+    return Curve(equation, "angle", angle, True, _wave(periods * angle))
 
 
 def _change_by_input(gain: np.ndarray, shape: Callable[[], np.ndarray]) -> Change:

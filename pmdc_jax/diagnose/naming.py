@@ -53,7 +53,7 @@ POOR_MISFIT = 10.0
 
 
 class Naming(NamedTuple):
-    """The set chosen, its rivals, and what is left that no candidate explains."""
+    """The model chosen, its rivals, and what is left that no candidate explains."""
 
     chosen: Model
     rivals: list[Model]
@@ -87,7 +87,7 @@ class StepwiseSelection:
         )
 
     def name(self) -> Naming:
-        """Add effects while the evidence asks for them; then try other effects in the place of those found."""
+        """Add effects while the evidence calls for them; then try other effects in place of those found."""
         current, found = self.base, self.assess(self.base)
         self.superseded.add(current)
         while better := self._step(current, found):
@@ -111,7 +111,7 @@ class StepwiseSelection:
     def _accepted(self, current: Model, found: Assessment, better: Model | None) -> Model | None:
         """A better model if it does more than compensate for model-form error; else another form of it that does."""
         return self._in_form_that_settles(
-            lambda model: self._exceeds_model_form_error(current, found, model), current, better
+            lambda model: self._is_genuine_improvement(current, found, model), current, better
         )
 
     def _in_form_that_settles(
@@ -127,7 +127,7 @@ class StepwiseSelection:
         return best if best and settles(best) else None
 
     def _by_evidence(self, current: Model, found: Assessment) -> Model | None:
-        """The best of the models that the evidence asks to be tried."""
+        """The best of the models that the evidence suggests."""
         return self._better(current, found, self._trials(current, found))
 
     def _better(
@@ -139,10 +139,8 @@ class StepwiseSelection:
             return None
         best = self._best(possible, found.screen.white)
         # by the filter fitted without the clearest signal: one fitted to the current residuals absorbs what is missing
-        if (
-            simplest_equivalent(self.comparison.ranked([current, best], found.screen.white))
-            is current
-        ):
+        ranked = self.comparison.ranked([current, best], found.screen.white)
+        if simplest_equivalent(ranked) is current:
             return None
         return self.elimination.reduced(best)
 
@@ -150,7 +148,7 @@ class StepwiseSelection:
         """Whether a model exists, is physically possible, and was not superseded by a better one."""
         return model is not None and model.is_possible and model not in self.superseded
 
-    def _exceeds_model_form_error(self, current: Model, found: Assessment, better: Model) -> bool:
+    def _is_genuine_improvement(self, current: Model, found: Assessment, better: Model) -> bool:
         """Whether a better model does more than compensate for model-form error of the current one's effects.
 
         It does if what was left is clearly something else, if the better one leaves little, or if it adds a refit-only
@@ -238,6 +236,7 @@ class StepwiseSelection:
         return self._naming(self.refits.without(named.chosen, effect, white))
 
     def _naming(self, current: Model) -> Naming:
+        """The naming with a model as the chosen one."""
         base, found = self.assess(self.base), self.assess(current)
         more_missing = found.p_value < FALSE_ALARM
         return Naming(

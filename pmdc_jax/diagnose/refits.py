@@ -117,7 +117,7 @@ class Refits:
         """Start values, from the fit of the old effect, of one that resembles it or of a simple form never begun."""
         begins = TRIALS[old].alike.get(new)
         if new not in self.begun and new in FULLER and FULLER[new].effect == old:
-            begins = FULLER[new].reduced
+            begins = FULLER[new].to_simple
         if begins is None:
             return {}
         return {new: begins(next(e for e in current.motor.effects if e.name == old))}
@@ -155,7 +155,7 @@ class Refits:
         """The start of a refit with the fuller form of an effect, from the fit of the simple one."""
         fuller = FULLER[effect]
         simple = next(e for e in current.motor.effects if e.name == effect)
-        values = fuller.begun(simple, self.library.scales)
+        values = fuller.from_simple(simple, self.library.scales)
         return self._start(current, effects, {fuller.effect: values})
 
     def without(self, model: Model, effect: str, white: Whitener) -> Model:

@@ -51,10 +51,10 @@ class Fuller(NamedTuple):
 
     effect: str
     # start values from the fit of the simple form, with what makes it fuller clearly present
-    begun: Callable[[Any, Scales], Values]
+    from_simple: Callable[[Any, Scales], Values]
     extra: tuple[str, ...]  # the fields that make it fuller
     # start values of the simple form from the fit of the fuller one, which may have been found without it
-    reduced: Callable[[Any], Values] | None = None
+    to_simple: Callable[[Any], Values] | None = None
 
 
 class Trial(NamedTuple):
