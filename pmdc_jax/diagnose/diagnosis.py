@@ -30,7 +30,7 @@ OUTLIER_RATIO = 5.0
 
 @frozen
 class EffectFound:
-    """An effect that the data ask for: its parameters, and how sure it is that it is there."""
+    """An effect for which there is evidence: its parameters, and how certain it is."""
 
     name: str  # a key of `pmdc_jax.effects.EFFECTS`
     equation: str  # "electrical", "mechanical", "input" or "sensor"
@@ -74,18 +74,18 @@ class Gap:
 
 @frozen
 class NextExperiment:
-    """A run that would tell the rivals apart, and how likely it is to."""
+    """A run that would distinguish the rivals, and the probability that it does."""
 
     why: str
     description: str
-    power: float  # probability of telling them apart, 0 to 1
+    power: float  # probability of distinguishing them, 0 to 1
     time: np.ndarray  # s, (samples,)
     voltage: np.ndarray  # V, (samples,)
 
 
 @frozen
 class Detectable:
-    """The smallest amplitude of an effect that these runs would have shown, nine times of ten."""
+    """The smallest amplitude of an effect that these runs would have shown with a probability of 90 %."""
 
     effect: str
     parameter: str
@@ -95,7 +95,7 @@ class Detectable:
 
 @frozen
 class Diagnosis:
-    """Which effects the motor without effects lacked, where that shows, and the completed motor."""
+    """Which effects are missing from the motor without effects, where that shows, and the completed motor."""
 
     verdict: Verdict
     effects: tuple[EffectFound, ...]
@@ -167,5 +167,6 @@ def unlike_held_out(gap: Mapping[Role, Gap]) -> bool:
 
 
 def worse_held_out(gap: Mapping[Role, Gap]) -> bool:
-    """Whether the effects added make hold-outs worse: then others are missing that look alike in the fitted runs."""
+    """Whether the effects added make hold-outs worse: the missing ones are then others that look alike in the fitted
+    runs."""
     return "holdout" in gap and gap["holdout"].after > MAX_HOLDOUT_GROWTH * gap["holdout"].before

@@ -33,7 +33,7 @@ class BackwardElimination:
 
     def reduced(self, model: Model) -> Model:
         """The model after backward elimination: without effects that it does not need, and with simpler forms of
-        effects, alone or with another effect added, where these do as well."""
+        effects, alone or with another effect added, where these are as good."""
         white = self.comparison.filter_of(model)
         for effect in model.effects[:-1]:
             smaller = self.refits.without(model, effect, white)

@@ -96,7 +96,7 @@ def difference_between(
 ) -> float:
     """Root of the summed squares of the difference between two motors' responses, over the noise of current and speed.
 
-    Zero if one cannot be simulated: fitted to other runs, it may be unstable in this one.
+    Zero if one cannot be simulated: a motor fitted to other runs may be unstable in this one.
     """
     zero = np.zeros_like(time)
     run = Recording("next", time, voltage, current=zero, speed=zero, load=zero)

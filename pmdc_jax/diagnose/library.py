@@ -63,7 +63,7 @@ class Curve(NamedTuple):
     per_run: bool = False  # every run has a curve of its own
     # (knots, columns): values of the columns at the knots; None where these are hat functions, one per knot
     shapes: np.ndarray | None = None
-    # changes sign with the direction of motion, as a friction that changes over time does
+    # changes sign with the direction of motion, such as a friction that varies over time
     reverses: bool = False
     # known to show noise, and so no evidence
     is_noise: bool = False
@@ -121,7 +121,7 @@ class Library:
         self._base = base
 
     def changes(self, tape: Tape, path: Path) -> Iterator[Change]:
-        """What the candidates change along a path, in their order; each `Change` is of some of one effect."""
+        """What the candidates change along a path, in their order; a `Change` has some candidates of one effect."""
         return run_one_ahead(self._change_calls(tape, path))
 
     def _change_calls(self, tape: Tape, path: Path) -> Iterator[Callable[[], Change]]:
@@ -295,7 +295,7 @@ def _share_of_run(tape: Tape) -> np.ndarray:
 
 
 def _knots(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Knots over the range of a variable, denser where it often is, and near zero."""
+    """Knots over the range of a variable, denser at frequent values and near zero."""
     values = x[weight]
     low, high = np.quantile(values, [0.001, 0.999])
     spread = max(high - low, 1e-9)

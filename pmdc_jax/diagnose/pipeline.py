@@ -255,7 +255,7 @@ def _learned_curves(naming: Naming) -> tuple[LearnedCurve, ...]:
 
 
 def _detectable_effects(found: Screen) -> tuple[Detectable, ...]:
-    """The smallest amplitude of each effect that would have been detected nine times of ten, where one is physical."""
+    """The smallest amplitude of each effect that would be detected with a probability of 90 %, if it is physical."""
     count = len(found.candidates) + len(found.curves)
     needed = stats.norm.isf(FALSE_ALARM / count / 2) + stats.norm.isf(0.1)
     smallest: dict[str, Detectable] = {}
