@@ -199,10 +199,12 @@ def _states(motor: Motor, tape: Tape, path: Path) -> State:
     def advance(extra: Extra, sample: OfSample) -> tuple[Extra, Extra]:
         begins, initial, current, speed, value, load, block = sample
         extra = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, extra)
-        of_block = jax.tree.map(lambda leaf: leaf[..., 0, block], propagator)
+        block_propagator = jax.tree.map(lambda leaf: leaf[..., 0, block], propagator)
         drive = jax.tree.map(lambda share: share[block], inputs.drive)
         state = State(current, speed, extra)
-        return held_step(motor, of_block, Input(drive, value, load), state, steps).extra, extra
+        return held_step(
+            motor, block_propagator, Input(drive, value, load), state, steps
+        ).extra, extra
 
     block = jnp.broadcast_to(jnp.arange(load.shape[1]), load.shape)
     samples = (begins, start.extra, path.current, path.speed, inputs.value, load, block)
