@@ -15,22 +15,23 @@ from benchmarks import virtual_bench as vb
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import naming
 from pmdc_jax.diagnose.assessment import Assessment
-from pmdc_jax.diagnose.candidates import TRIALS, Scales
+from pmdc_jax.diagnose.candidates import Scales
 from pmdc_jax.diagnose.compare import Fitted
-from pmdc_jax.diagnose.effect_relations import FULLER, are_rivals, is_within
-from pmdc_jax.diagnose.evidence import Block, products
+from pmdc_jax.diagnose.effect_relations import FULLER, are_rivals, is_simpler_form
+from pmdc_jax.diagnose.evidence import Block, gather_evidence
 from pmdc_jax.diagnose.experiment import difference_between
 from pmdc_jax.diagnose.library import Change, Library
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
 from pmdc_jax.diagnose.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.periodic import common_line, spectrum
-from pmdc_jax.diagnose.pipeline import may_be_none
-from pmdc_jax.diagnose.quantisation import READINGS, readings
+from pmdc_jax.diagnose.pipeline import may_be_absent
+from pmdc_jax.diagnose.quantisation import ROUNDING_DRAWS, rounding_errors
 from pmdc_jax.diagnose.refits import common_phase
-from pmdc_jax.diagnose.response import kicks, path_of, respond, sensed
-from pmdc_jax.diagnose.rows import _side_by_side
-from pmdc_jax.diagnose.shortlist import effect_of, promising, shortlist
-from pmdc_jax.diagnose.signals import Screen, Signal, common_to_waves, log_chance
+from pmdc_jax.diagnose.response import kicks, path_of, respond, sensor_changes
+from pmdc_jax.diagnose.rows import _batches
+from pmdc_jax.diagnose.shortlist import effect_of, most_promising, shortlist
+from pmdc_jax.diagnose.signals import Screen, Signal, gain_common_to_waves, log_p_value
+from pmdc_jax.diagnose.trials import TRIALS
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate, Identification
 from pmdc_jax.identify.noise_model import Series, whitener
@@ -47,13 +48,16 @@ SCALES = Scales(10.0, 300.0, 10.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0, 500.0)
 
 def promises_of(gains: dict[str, float], unexplained: float) -> Assessment:
     """Evidence of effects with such gains, the first of them the most significant."""
-    candidates = [TRIALS[name].columns(name, SCALES)[0] for name in gains]
+    candidates = [TRIALS[name].candidates(name, SCALES)[0] for name in gains]
     signals = [
         Signal(gain, -1e3 + k, candidate, Mock(spec=Block))
         for k, (gain, candidate) in enumerate(zip(gains.values(), candidates, strict=True))
     ]
     found = Mock(
-        spec=Assessment, of_candidates=signals, of_curves=signals[:1], unexplained=unexplained
+        spec=Assessment,
+        candidate_signals=signals,
+        curve_signals=signals[:1],
+        unexplained=unexplained,
     )
     found.screen = Mock(spec=Screen, candidates=candidates)
     found.clearest = max(signals, key=lambda s: s.gain)
@@ -82,7 +86,7 @@ def test_every_effect_has_a_row():
 @pytest.mark.parametrize("name", EFFECTS)
 def test_candidates_are_within_the_ranges(name):
     """Each shape is an effect that can be built, and of which a positive coefficient makes a legal one."""
-    candidates = TRIALS[name].columns(name, SCALES)
+    candidates = TRIALS[name].candidates(name, SCALES)
     begins = TRIALS[name].starts
     starts = begins(SCALES) if begins else []
     assert candidates or starts
@@ -120,7 +124,7 @@ class Undecided(StepwiseSelection):
     _by_likeliest_effect = staticmethod(lambda *models: None)
     _best = staticmethod(lambda tried, white: tried[0])
     elimination = Mock(reduced=lambda model: model)
-    _explains_more_than_a_formula = staticmethod(lambda *models: True)
+    _is_genuine_improvement = staticmethod(lambda *models: True)
     _equivalent_swaps = staticmethod(lambda *models: [])
     _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))
 
@@ -135,10 +139,8 @@ def test_what_only_mends_a_formula_does_not_hide_what_plain_squares_find():
     """A filter may swallow most of an effect: what it leaves then looks like the formula of another one."""
     selection = Undecided()
     selection._by_unfiltered_misfit = lambda current, found: selection.other
-    selection._explains_more_than_a_formula = lambda current, found, better: (
-        better is selection.other
-    )
-    selection._in_other_form = lambda *models: []
+    selection._is_genuine_improvement = lambda current, found, better: better is selection.other
+    selection._in_other_forms = lambda *models: []
     assert selection._step(selection.base, selection.assess(selection.base)) is selection.other
 
 
@@ -152,7 +154,7 @@ def test_what_only_mends_a_formula_does_not_hide_what_plain_squares_find():
     ],
 )
 def test_what_promises_little_by_plain_squares_is_not_tried(gains, least, listed):
-    found = promising(promises_of(gains, unexplained=0.0).of_candidates, set(), least)
+    found = most_promising(promises_of(gains, unexplained=0.0).candidate_signals, set(), least)
     assert [effect_of(signal) for signal in found] == list(gains)[:listed]
 
 
@@ -166,13 +168,17 @@ def test_of_what_promises_little_beside_a_curve_that_is_kept_which_settles_it(se
         "brush_voltage_drop": 5.0,
     }
     found = promises_of(gains, unexplained=np.inf)
-    found.p_value, found.is_formula, found.is_misread = 0.0, lambda model: False, lambda: False
+    found.p_value, found.may_be_model_form_error, found.is_sensor_ripple = (
+        0.0,
+        lambda model: False,
+        lambda: False,
+    )
     selection = StepwiseSelection.__new__(StepwiseSelection)
     tried = Mock(spec=Model, effects=("stribeck_friction",))
     selection.refits = Mock(with_signal=Mock(return_value=tried))
     selection.assess = lambda model: found
     selection._better = lambda current, found, models: models[-1] if models else None
-    selection._in_other_form = lambda *models: []
+    selection._in_other_forms = lambda *models: []
     selection._leaves_little = lambda current, better: settles
     better = selection._by_likeliest_effect(Mock(spec=Model, effects=()), found)
     assert better is (tried if settles else None)
@@ -185,19 +191,22 @@ def test_a_full_set_exchanges_what_acts_in_the_same_equation(monkeypatch, count,
     """Dry friction, a delay and an offset, where a peak of friction is what promises most."""
     effects = ("asymmetric_friction", "speed_sensor_delay", "current_sensor_offset")[:count]
     peak = Mock(spec=Signal, candidate=Mock(effect="stribeck_friction"), gain=1.0)
-    monkeypatch.setattr(naming, "clear", lambda found: [peak])
+    monkeypatch.setattr(naming, "clear_signals", lambda found: [peak])
     selection = Undecided()
     selection.refits = Mock(without=Mock(return_value=Mock(spec=Model)))
     selection.refits.with_signal.return_value = Mock(spec=Model)
     selection.assess = lambda model: Mock(
-        spec=Assessment, of_candidates=[peak], screen=Mock(spec=Screen)
+        spec=Assessment, candidate_signals=[peak], screen=Mock(spec=Screen)
     )
     selection._better = lambda current, found, tried: tried[0] if tried else None
     found = Mock(
-        spec=Assessment, p_value=p_value, is_trace=lambda model: False, screen=Mock(white="white")
+        spec=Assessment,
+        p_value=p_value,
+        is_negligible=lambda model: False,
+        screen=Mock(white="white"),
     )
     current = Mock(spec=Model, effects=effects)
-    better = selection._in_exchange(current, found)
+    better = selection._by_exchange(current, found)
     assert selection.refits.without.call_count == asked
     if asked:
         selection.refits.without.assert_called_with(current, "asymmetric_friction", "white")
@@ -218,8 +227,8 @@ def test_a_motor_that_cannot_be_simulated_suggests_no_run(x64):
 def test_only_waves_that_records_show_are_tried():
     """At 40 rad/s, of samples of 20 ms, one of seven periods comes round in one and an eighth; and over a tenth of a
     turn one of ten comes round once."""
-    seldom = SCALES._replace(slow=40.0, sample_time=0.02)
-    tried = TRIALS["cogging_torque"].columns
+    seldom = SCALES._replace(slow_speed=40.0, sample_time=0.02)
+    tried = TRIALS["cogging_torque"].candidates
     assert [c.columns[0]["periods"] for c in tried("", seldom)] == list(range(1, 8))
     assert max(c.columns[0]["periods"] for c in tried("", SCALES)) == 48
     short = SCALES._replace(travel=0.1 * 2 * np.pi)
@@ -227,13 +236,13 @@ def test_only_waves_that_records_show_are_tried():
     assert tried("", SCALES._replace(travel=0.0)) == []
 
 
-@pytest.mark.parametrize("simple", [s for s, form in FULLER.items() if form.reduced])
+@pytest.mark.parametrize("simple", [s for s, form in FULLER.items() if form.to_simple])
 def test_a_simple_form_begins_within_its_ranges(simple):
     """Even where the rich one was fitted with nothing but a peak."""
     rich = FULLER[simple].effect
     sizes = dict(zip(EFFECTS[rich].ranges, (1e-10, 0.3, 20.0), strict=False))
     effect = EFFECTS[rich](**{field: np.asarray(x) for field, x in sizes.items()})
-    values = FULLER[simple].reduced(effect)
+    values = FULLER[simple].to_simple(effect)
     assert values.keys() == EFFECTS[simple].ranges.keys()
     for field, r in EFFECTS[simple].ranges.items():
         assert r.lower < values[field] < r.upper
@@ -260,7 +269,7 @@ def test_a_fuller_form_begins_as_the_simple_one_with_more_to_it(simple):
     about = EFFECTS[simple].ranges
     effect = EFFECTS[simple](**{field: np.asarray(0.3) for field in about})
     fuller = FULLER[simple]
-    values = fuller.begun(effect, SCALES)
+    values = fuller.from_simple(effect, SCALES)
     full = EFFECTS[fuller.effect](**{field: np.asarray(x) for field, x in values.items()})
     assert full.is_possible()
     assert set(fuller.extra) < set(values) == set(full.ranges)
@@ -275,7 +284,9 @@ def test_a_fuller_form_begins_as_the_simple_one_with_more_to_it(simple):
 def evidence_of(J, own, X, r):
     """By rows given in two parts."""
     runs = (np.hstack([j, x, y[:, None], o]) for j, o, x, y in zip(J, own, X, r, strict=True))
-    return products(((rows[:150], rows[150:]) for rows in runs), J[0].shape[1], own[0].shape[1])
+    return gather_evidence(
+        ((rows[:150], rows[150:]) for rows in runs), J[0].shape[1], own[0].shape[1]
+    )
 
 
 def random_evidence(seed: int, runs: int = 3, rows: int = 400):
@@ -334,7 +345,7 @@ def test_chance_far_out_meets_the_exact_one(freedom):
     """The leading term of the tail, where the exact one can still be computed."""
     for gain in (520.0, 700.0):
         exact = stats.chi2.logsf(gain, freedom)
-        assert log_chance(gain, freedom) == pytest.approx(exact, abs=0.1 * freedom)
+        assert log_p_value(gain, freedom) == pytest.approx(exact, abs=0.1 * freedom)
 
 
 @pytest.mark.parametrize(
@@ -350,20 +361,20 @@ def test_chance_far_out_meets_the_exact_one(freedom):
 def test_an_amplitude_that_may_be_next_to_nothing(effect, field, interval, nothing):
     estimate = Estimate(0.35, 0.1, interval, "", "identified")
     found = Mock(spec=Identification, parameters={f"{effect}.{field}": estimate})
-    assert may_be_none(found, effect, field) is nothing
+    assert may_be_absent(found, effect, field) is nothing
 
 
 def test_what_waves_of_any_period_gain_is_evidence_for_none():
     """As where the residuals are slow: one period of cogging is asked for by what it gains beyond the others."""
     evidence = evidence_of(*random_evidence(0))
-    cogging = TRIALS["cogging_torque"].columns("cogging_torque", SCALES)
-    others = TRIALS["constant_load"].columns("constant_load", SCALES)
+    cogging = TRIALS["cogging_torque"].candidates("cogging_torque", SCALES)
+    others = TRIALS["constant_load"].candidates("constant_load", SCALES)
     freedom = 2 * 3  # cosine and sine in each of three runs
-    blocks = [Block((0, 1), own=True)] * len(cogging)
+    blocks = [Block((0, 1), per_run=True)] * len(cogging)
 
     def common(gains):
         loads = [(load, Block((2,)), 1000.0) for load in others]
-        return common_to_waves(evidence, [*zip(cogging, blocks, gains, strict=True), *loads])
+        return gain_common_to_waves(evidence, [*zip(cogging, blocks, gains, strict=True), *loads])
 
     rng = np.random.default_rng(1)
     by_chance = stats.chi2.rvs(freedom, size=len(cogging), random_state=rng)
@@ -383,7 +394,7 @@ def test_what_a_coarse_reading_leaves_is_evidence_for_nothing():
             Series(x, known, kind)
             for x in (speed[..., None], np.ones((len(speed), 1, 1)), np.round(speed) - speed, speed)
         )
-        errors = readings(RunSeries(shared, own, residual, simulated), seed)
+        errors = rounding_errors(RunSeries(shared, own, residual, simulated), seed)
         parts = (
             shared.values,
             (speed * np.abs(speed))[..., None],
@@ -391,9 +402,9 @@ def test_what_a_coarse_reading_leaves_is_evidence_for_nothing():
             residual.values[..., None],
         )
         rows = np.concatenate([*parts, own.values], -1)[:, 0] * np.sqrt(12)
-        evidence, drag = products([[rows]], 1, 1, READINGS), Block((1,))
+        evidence, drag = gather_evidence([[rows]], 1, 1, ROUNDING_DRAWS), Block((1,))
         gain = evidence.regress().squares - evidence.regress([drag]).squares
-        noise = evidence.gained_by_rounding(drag)
+        noise = evidence.rounding_dispersion(drag)
         alarms["as if white"] += stats.chi2.sf(gain, 1) < 0.01
         alarms["by rounding"] += stats.chi2.sf(gain / noise, 1) < 0.01
     assert alarms["as if white"] > 25
@@ -416,10 +427,12 @@ def test_only_steps_that_nothing_blurs_are_coarse(read, coarse):
         Series(0.5 * x, known, (1e-3, (0,)))
         for x in (read(exact, np.random.default_rng(0)) - exact, exact)
     )
-    errors = readings(RunSeries(simulated, simulated, left, simulated), 0)
+    errors = rounding_errors(RunSeries(simulated, simulated, left, simulated), 0)
     assert bool(errors.any()) is coarse
     assert np.abs(errors).max() <= 0.25 + 1e-12
-    assert np.array_equal(errors, readings(RunSeries(simulated, simulated, left, simulated), 0))
+    assert np.array_equal(
+        errors, rounding_errors(RunSeries(simulated, simulated, left, simulated), 0)
+    )
 
 
 # ---------------------------------------------------------------------------------- the noise
@@ -566,7 +579,7 @@ def test_response_is_the_change_of_the_simulation(x64, name):
     without, with_it = (free_run(m, tape, own) for m in (bare, motor))
     path = path_of(without, tape, BEGUN, False)
     if EFFECTS[name].equation == "sensor":
-        found = sensed(motor, bare, tape, path)
+        found = sensor_changes(motor, bare, tape, path)
     else:
         found = respond(bare, tape, path, kicks(motor, bare, tape, path)[..., None])[..., 0]
     expected = (with_it - without).transpose(2, 1, 0)
@@ -582,7 +595,7 @@ def test_columns_are_the_same_however_many_stand_side_by_side(most):
     rng = np.random.default_rng(3)
     kicks, seen = rng.standard_normal((2, 10, 2, 3, 13))
     changes = [Change(kicks[..., a:b], seen[..., a:b]) for a, b in ((0, 5), (5, 6), (6, 13))]
-    parts = list(_side_by_side(changes, most))
+    parts = list(_batches(changes, most))
     assert all(part.kicks.shape[-1] == most for part, _ in parts)
     for field, whole in (("kicks", kicks), ("seen", seen)):
         together = [getattr(part, field)[..., :width] for part, width in parts]
@@ -612,9 +625,9 @@ def test_rivals_differ_in_more_than_form(one, other, rivals):
 
 def test_a_simpler_form_is_within_a_richer_one():
     drag = {"quadratic_drag"}
-    assert is_within({"coulomb_friction"} | drag, {"stribeck_friction"} | drag)
-    assert not is_within({"stribeck_friction"} | drag, {"coulomb_friction"} | drag)
-    assert not is_within({"coulomb_friction"}, {"stribeck_friction"} | drag)
+    assert is_simpler_form({"coulomb_friction"} | drag, {"stribeck_friction"} | drag)
+    assert not is_simpler_form({"stribeck_friction"} | drag, {"coulomb_friction"} | drag)
+    assert not is_simpler_form({"coulomb_friction"}, {"stribeck_friction"} | drag)
 
 
 @pytest.mark.parametrize("periods", [4.0, 9.0, 14.0])

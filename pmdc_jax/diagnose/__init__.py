@@ -1,4 +1,4 @@
-"""Find where simulation and measurement disagree, name the missing effect, add it, show the gap shrink."""
+"""Find where simulation and measurement disagree, name the missing effects, and add them to the model."""
 
 from .diagnosis import Diagnosis
 from .pipeline import diagnose

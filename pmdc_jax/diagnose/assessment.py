@@ -1,4 +1,4 @@
-"""How the evidence against a model is read: is something missing, or may model-form error explain what is left?
+"""Interpret the evidence against a model: is something missing, or may model-form error explain what is left?
 
 *Model-form error* is what effects leave because their formulas are only approximately those of the real motor.
 """
@@ -12,50 +12,50 @@ import numpy as np
 
 from ..effects import EFFECTS
 from ..effects.base import AbstractEffect
-from .effect_relations import CONTAINS, FULLER, unbalances
+from .effect_relations import CONTAINS, FULLER, unbalanced_equation
 from .library import Curve
 from .model import Model
 from .signals import Screen, Signal
 
 # False-alarm probability: that anything is called missing from a motor that lacks nothing, or, once effects were
 # added, that anything more is in all later looks together
-ALARM = 0.01
+FALSE_ALARM = 0.01
 # Model-form error: the share of the squares explained by effects that imperfect formulas of them may leave; the larger
 # one if the rest is a curve over an effect's own variable
-FORMULA, OWN_FORMULA = 0.1, 0.5
+MODEL_FORM_SHARE, OWN_MODEL_FORM_SHARE = 0.1, 0.5
 # Gain of a candidate or curve over that of the clearest signal: from the first share on a candidate is worth a trial,
 # from the second on a curve describes what is left, from the third on what is left is clearly a candidate's effect
-MUCH_OF_IT, HALF_OF_IT, MOST_OF_IT = 0.3, 0.5, 0.7
-# Harder forms (fuller ones without a regression column) by the simple form, in whose place they are tried
-HARDER = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}
-# The clearest gain left, over what the effects explain, below which nothing more is worth a trial; the larger one with
-# harder forms, whose fit is never exact because when teeth meet is down to chance
-TRACE, TRACE_OF_HARDER = 2e-3, 1e-2
+TRIAL_SHARE, CURVE_SHARE, EFFECT_SHARE = 0.3, 0.5, 0.7
+# By simple effect, its fuller form if that has no regression column: only a refit can test it, such as backlash
+REFIT_ONLY = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}
+# The clearest gain left, over what the effects explain, below which nothing more is worth a trial; the larger one for
+# models with a refit-only form, whose fit is never exact because when teeth meet is unpredictable
+NEGLIGIBLE, NEGLIGIBLE_REFIT_ONLY = 2e-3, 1e-2
 
 
-def chance_of_nothing(
-    of_candidates: Sequence[Signal], of_curves: Sequence[Signal], count: int
+def familywise_p_value(
+    candidate_signals: Sequence[Signal], curve_signals: Sequence[Signal], count: int
 ) -> float:
-    """P-value of the strongest evidence if nothing were missing: Bonferroni-corrected for `count` blocks."""
-    smallest = min(s.log_p for s in (*of_candidates, *of_curves))
+    """P-value of the strongest evidence if nothing were missing, Bonferroni-corrected for `count` blocks."""
+    smallest = min(s.log_p for s in (*candidate_signals, *curve_signals))
     return float(min(1.0, np.exp(smallest + np.log(count))))
 
 
 class Assessment(NamedTuple):
-    """The evidence against a model, with the questions that are asked of it."""
+    """The evidence against a model, and the decisions that depend on it."""
 
     screen: Screen
-    of_candidates: list[Signal]  # the most significant first
-    of_curves: list[Signal]  # the most significant first
-    p_value: float  # of it if nothing more were missing
+    candidate_signals: list[Signal]  # the most significant first
+    curve_signals: list[Signal]  # the most significant first
+    p_value: float  # of the evidence if nothing more were missing
     # squared white residuals of the motor without effects, less those of the model
     explained: float
-    removed: float  # the same of the unfiltered misfit, `Fit.fitness`
+    explained_unfiltered: float  # the same for the unfiltered misfit, `Fit.fitness`
 
     @property
     def clearest(self) -> Signal:
         """The signal with the largest gain."""
-        return max((*self.of_candidates, *self.of_curves), key=_gain)
+        return max((*self.candidate_signals, *self.curve_signals), key=_gain)
 
     @property
     def unexplained(self) -> float:
@@ -63,102 +63,118 @@ class Assessment(NamedTuple):
         return float(self.clearest.gain / self.explained) if self.explained > 0 else np.inf
 
     @property
-    def by_one_more(self) -> float:
+    def best_candidate_share(self) -> float:
         """The largest gain of a single candidate over that of the clearest signal."""
-        best = max((s.gain for s in self.of_candidates), default=0.0)
+        best = max((s.gain for s in self.candidate_signals), default=0.0)
         return float(best / self.clearest.gain)
 
-    def asks_for_more(self) -> bool:
-        """Whether more is missing, and a single candidate would explain much of it."""
-        return bool(self.p_value < ALARM and self.by_one_more > MUCH_OF_IT)
+    def calls_for_effect(self) -> bool:
+        """Whether something more is missing, and a single candidate would explain enough of it for a trial."""
+        return bool(self.p_value < FALSE_ALARM and self.best_candidate_share > TRIAL_SHARE)
 
-    def is_another(self) -> bool:
-        """Whether what is left is clearly one more effect, and no model-form error.
+    def is_clearly_effect(self) -> bool:
+        """Whether what is left is clearly one more effect rather than model-form error.
 
         Never a periodic effect: gear teeth that meet at unpredictable times may look like one.
         """
-        if not self.of_candidates or self.unexplained < FORMULA or self.by_one_more < MOST_OF_IT:
+        if (
+            not self.candidate_signals
+            or self.unexplained < MODEL_FORM_SHARE
+            or self.best_candidate_share < EFFECT_SHARE
+        ):
             return False
-        best = max(self.of_candidates, key=_gain).candidate
+        best = max(self.candidate_signals, key=_gain).candidate
         return best is not None and not best.own_phase
 
-    def is_clear(self, model: Model) -> bool:
-        """Whether what a model leaves is too much for model-form error, and not of an effect that it has already."""
-        return bool(self.unexplained > FORMULA and not self._is_more_of(model))
+    def exceeds_model_form_error(self, model: Model) -> bool:
+        """Whether a model leaves too much for model-form error, and that is not due to an effect it already has."""
+        return bool(self.unexplained > MODEL_FORM_SHARE and not self._belongs_to(model))
 
-    def is_formula(self, model: Model) -> bool:
+    def may_be_model_form_error(self, model: Model) -> bool:
         """Whether what is left may be model-form error of the model's effects.
 
-        Not where it is more of the unfiltered misfit than they explain: then the whitening filter took what is missing
-        for noise.
+        Not if it is a larger part of the unfiltered misfit than they explain: the whitening filter has then absorbed
+        what is missing as noise.
         """
-        if not model.effects or self._unexplained_plainly(model) > 1:
+        if not model.effects or self._unexplained_unfiltered(model) > 1:
             return False
-        if self.unexplained < FORMULA:
+        if self.unexplained < MODEL_FORM_SHARE:
             return True
-        clearest = self.clearest.of
-        own = isinstance(clearest, Curve) and _is_own(clearest, model)
-        return self._is_more_of(model) or bool(own and self.unexplained < OWN_FORMULA)
+        clearest = self.clearest.term
+        own_curve = isinstance(clearest, Curve) and _has_axes_of(model, clearest)
+        within = self.unexplained < OWN_MODEL_FORM_SHARE
+        return self._belongs_to(model) or bool(own_curve and within)
 
-    def is_misread(self) -> bool:
-        """Whether what is left is clearest as a reading of the speed that swings with the angle."""
-        clearest = self.clearest.of
-        return isinstance(clearest, Curve) and clearest.is_misread
+    def is_sensor_ripple(self) -> bool:
+        """Whether the clearest signal is a ripple of the speed sensor over the rotor angle."""
+        clearest = self.clearest.term
+        return isinstance(clearest, Curve) and clearest.is_sensor_ripple
 
-    def plainly(self) -> list[Signal]:
+    def unfiltered_signals(self) -> list[Signal]:
         """The candidates' signals with their gains on the unfiltered residuals."""
-        plain = self.screen.unfiltered
-        whole = plain.regress().squares
+        unfiltered = self.screen.unfiltered
+        before = unfiltered.regress().squares
         return [
-            s._replace(gain=whole - plain.regress([s.block]).squares) for s in self.of_candidates
+            s._replace(gain=before - unfiltered.regress([s.block]).squares)
+            for s in self.candidate_signals
         ]
 
-    def _unexplained_plainly(self, model: Model) -> float:
-        """`unexplained` on the unfiltered misfit: what the clearest signal would explain, over what the model does."""
-        if not self.removed > 0:
+    def _unexplained_unfiltered(self, model: Model) -> float:
+        """`unexplained` for the unfiltered misfit: what the clearest signal would explain, over what the model does."""
+        if not self.explained_unfiltered > 0:
             return np.inf
         unfiltered = self.screen.unfiltered
-        rest = unfiltered.regress([self.clearest.block]).squares
-        share = 1 - rest / unfiltered.regress().squares
-        return float(share * model.fit.fitness / self.removed)
+        after = unfiltered.regress([self.clearest.block]).squares
+        share = 1 - after / unfiltered.regress().squares
+        return float(share * model.fit.fitness / self.explained_unfiltered)
 
-    def _is_more_of(self, model: Model) -> bool:
+    def _belongs_to(self, model: Model) -> bool:
         """Whether the clearest signal belongs to an effect that the model has."""
         clearest = self.clearest.candidate
         return clearest is not None and clearest.effect in model.effects
 
-    def is_trace(self, model: Model) -> bool:
-        """Whether so little is left that nothing more is worth a trial (`TRACE`)."""
-        return self.unexplained < (TRACE_OF_HARDER if _is_hard(model) else TRACE)
+    def is_negligible(self, model: Model) -> bool:
+        """Whether too little is left for another trial (`NEGLIGIBLE`)."""
+        return self.unexplained < (NEGLIGIBLE_REFIT_ONLY if _has_refit_only(model) else NEGLIGIBLE)
 
-    def is_foreign(self, model: Model) -> bool:
+    def is_unrelated_to(self, model: Model) -> bool:
         """Whether what is left is clearly one more effect, in another equation or over another variable than any of the
         model's, so that these cannot have left it.
 
-        Never beside a harder form: what gear teeth leave, which meet at unpredictable times, can look like anything.
+        Never beside a refit-only form: what gear teeth leave, which meet at unpredictable times, can look like any
+        effect.
         """
-        if _is_hard(model) or self.p_value >= ALARM or self.by_one_more < MOST_OF_IT:
+        if (
+            _has_refit_only(model)
+            or self.p_value >= FALSE_ALARM
+            or self.best_candidate_share < EFFECT_SHARE
+        ):
             return False
-        best, effect = max(self.of_curves, key=_gain), max(self.of_candidates, key=_gain).candidate
-        assert isinstance(best.of, Curve) and effect is not None
+        best_curve = max(self.curve_signals, key=_gain)
+        best = max(self.candidate_signals, key=_gain).candidate
+        assert isinstance(best_curve.term, Curve) and best is not None
         # of model-form error a curve over the effect's own variable explains nearly all
-        curve_is_own = _is_own(best.of, model) and best.gain > HALF_OF_IT * self.clearest.gain
-        return not (curve_is_own or _is_own(EFFECTS[effect.effect], model))
+        own_curve = (
+            _has_axes_of(model, best_curve.term)
+            and best_curve.gain > CURVE_SHARE * self.clearest.gain
+        )
+        return not (own_curve or _has_axes_of(model, EFFECTS[best.effect]))
 
 
 def _gain(signal: Signal) -> float:
     return signal.gain
 
 
-def _is_hard(model: Model) -> bool:
-    """Whether one of the model's effects is a harder form (`HARDER`)."""
-    return bool(set(model.effects) & set(HARDER.values()))
+def _has_refit_only(model: Model) -> bool:
+    """Whether one of the model's effects is a refit-only form (`REFIT_ONLY`)."""
+    return bool(set(model.effects) & set(REFIT_ONLY.values()))
 
 
-def _is_own(one: Curve | type[AbstractEffect], model: Model) -> bool:
+def _has_axes_of(model: Model, term: Curve | type[AbstractEffect]) -> bool:
     """Whether a curve or an effect has the same equation and variable as one of the model's effects."""
-    return one.variable is not None and _axes(one) in {_axes(EFFECTS[e]) for e in model.effects}
+    return term.variable is not None and _axes(term) in {_axes(EFFECTS[e]) for e in model.effects}
 
 
-def _axes(one: Curve | type[AbstractEffect]) -> tuple[str, str | None]:
-    return unbalances(one.equation), one.variable
+def _axes(term: Curve | type[AbstractEffect]) -> tuple[str, str | None]:
+    """The equation in which a term shows, and the variable that it depends on."""
+    return unbalanced_equation(term.equation), term.variable

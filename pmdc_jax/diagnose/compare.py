@@ -9,15 +9,15 @@ import numpy as np
 
 from ..identify.generalised_least_squares import fit_whitened, residuals_of, sum_of_squares
 from ..identify.noise_model import Whitener, whitener
-from .effect_relations import is_within
+from .effect_relations import is_simpler_form
 from .model import Model
 
-# Models whose criteria (BIC, in noise variances) differ by less are not told apart
-MARGIN = 8.0
+# Models whose criteria (BIC, in noise variances) differ by less are equivalent
+BIC_MARGIN = 8.0
 # Fall of the squares, in noise variances, below which no further fitting step is made
-WORTH = 0.1
-# A model that leaves so many times the unfiltered squares of another one is worse, whatever a filter makes of both
-FAR = 3.0
+MIN_DECREASE = 0.1
+# A model that leaves so many times the unfiltered squares of another one is worse, whatever its filtered squares are
+DECISIVE_RATIO = 3.0
 
 
 class Fitted(NamedTuple):
@@ -44,7 +44,9 @@ class Comparison:
         """
         least = min(m.fit.fitness for m in models)
         fitted = [
-            self.fitted(m, white) if m.fit.fitness < FAR * least else Fitted(m, np.inf, np.inf)
+            self.fitted(m, white)
+            if m.fit.fitness < DECISIVE_RATIO * least
+            else Fitted(m, np.inf, np.inf)
             for m in models
         ]
         return sorted(fitted, key=lambda f: f.criterion)
@@ -53,25 +55,25 @@ class Comparison:
         """A model fitted to its residuals whitened by a filter."""
         key = model, white
         if key not in self._fitted:
-            given, polished = fit_whitened(model.given, model.fit, white, WORTH)
+            given, polished = fit_whitened(model.given, model.fit, white, MIN_DECREASE)
             squares = sum_of_squares(given, polished)
             samples = given.problem.samples.sum()
-            price = len(given.problem.parameters.names) * np.log(samples)
-            self._fitted[key] = Fitted(model, squares, squares + price)
+            penalty = len(given.problem.parameters.names) * np.log(samples)
+            self._fitted[key] = Fitted(model, squares, squares + penalty)
         return self._fitted[key]
 
-    def white(self, model: Model) -> Whitener:
+    def filter_of(self, model: Model) -> Whitener:
         """The filter that whitens the residuals of a model."""
         if model not in self._filters:
             self._filters[model] = whitener(residuals_of(model.given, model.fit))
         return self._filters[model]
 
 
-def plainest(ranked: Sequence[Fitted]) -> Model:
-    """The best model, or one with an effect in a simpler form whose criterion is within `MARGIN` of the best."""
+def simplest_equivalent(ranked: Sequence[Fitted]) -> Model:
+    """The best model, or one with an effect in a simpler form whose criterion is within `BIC_MARGIN` of the best."""
     best = ranked[0]
     for other in ranked[1:]:
-        within = is_within(set(other.model.effects), set(best.model.effects))
-        if within and other.criterion < best.criterion + MARGIN:
+        is_simpler = is_simpler_form(set(other.model.effects), set(best.model.effects))
+        if is_simpler and other.criterion < best.criterion + BIC_MARGIN:
             return other.model
     return best.model

@@ -17,20 +17,20 @@ Verdict = Literal["none_detected", "named", "ambiguous", "not_in_library"]
 # sensors and model-form error leave up to 1.4; what is not in the library, such as a current that is the mean of many
 # samples, leaves 3 and more.
 MAX_ELECTRICAL = 3.0
-# ... or a misfit above the first value whose excess over the noise, in squares, is more than the second share of that
-# of the motor without effects: the effects added are then not what is missing there
-TRACE_OF_ELECTRICAL, UNEXPLAINED_ELECTRICAL = 1.5, 0.5
+# The effects added are not what is missing if they leave an electrical misfit above the first value whose excess over
+# the noise, in squares, is more than the second share of that of the motor without effects
+MAX_EXPLAINED_ELECTRICAL, MAX_ELECTRICAL_SHARE = 1.5, 0.5
 # Misfit of hold-outs over that of the fitted runs above which the hold-outs show something that the fitted runs do not
-BEYOND = 2.5
-# ... and the misfit of hold-outs after effects were added, over that before, above which these made them worse
-WORSE = 1.1
+MAX_HOLDOUT_RATIO = 2.5
+# Misfit of hold-outs after effects were added, over that before, above which these made them worse
+MAX_HOLDOUT_GROWTH = 1.1
 # Misfit of one fitted run over the largest of all others above which something happened in that run alone
-APART = 5.0
+OUTLIER_RATIO = 5.0
 
 
 @frozen
 class EffectFound:
-    """An effect that the data ask for: its parameters, and how sure it is that it is there."""
+    """An effect for which there is evidence: its parameters, and how certain it is."""
 
     name: str  # a key of `pmdc_jax.effects.EFFECTS`
     equation: str  # "electrical", "mechanical", "input" or "sensor"
@@ -74,18 +74,18 @@ class Gap:
 
 @frozen
 class NextExperiment:
-    """A run that would tell the rivals apart, and how likely it is to."""
+    """A run that would distinguish the rivals, and the probability that it does."""
 
     why: str
     description: str
-    power: float  # probability of telling them apart, 0 to 1
+    power: float  # probability of distinguishing them, 0 to 1
     time: np.ndarray  # s, (samples,)
     voltage: np.ndarray  # V, (samples,)
 
 
 @frozen
 class Detectable:
-    """The smallest amplitude of an effect that these runs would have shown, nine times of ten."""
+    """The smallest amplitude of an effect that these runs would have shown with a probability of 90 %."""
 
     effect: str
     parameter: str
@@ -95,7 +95,7 @@ class Detectable:
 
 @frozen
 class Diagnosis:
-    """Which effects the motor without effects lacked, where that shows, and the completed motor."""
+    """Which effects are missing from the motor without effects, where that shows, and the completed motor."""
 
     verdict: Verdict
     effects: tuple[EffectFound, ...]
@@ -130,26 +130,26 @@ class Diagnosis:
 
     @property
     def beyond_fitted(self) -> float | None:
-        """The misfit of the hold-outs over that of the fitted runs, where that is too much for one motor; else None."""
+        """The misfit of the hold-outs over that of the fitted runs, if it is too large for one motor; else None."""
         return beyond_fitted(self.gap)
 
     @property
     def run_apart(self) -> tuple[str, float] | None:
-        """The fitted run that the final motor misses by far more than any other, and how many times; None without one,
-        or if all that is left is white noise, of which one run may have more."""
+        """The fitted run whose misfit is far larger than that of any other, and how many times; None without one, or if
+        all that is left is white noise, which may be larger in one run."""
         fitted = [name for name, fit in self.final.fit.items() if fit.role == "train"]
         leaves_more = self.final.missed or not self.leaves_noise or self.verdict == "not_in_library"
         if len(fitted) < 3 or not leaves_more:
             return None
         *_, second, worst = sorted(fitted, key=lambda name: self.gap_of_run[name].after)
         ratio = self.gap_of_run[worst].after / max(self.gap_of_run[second].after, 1e-300)
-        return (worst, ratio) if ratio > APART else None
+        return (worst, ratio) if ratio > OUTLIER_RATIO else None
 
 
 def breaks_electrical_equation(before: float, after: float) -> bool:
     """See `Diagnosis.breaks_electrical_equation`; the misfits before and after effects were added."""
-    unexplained = after**2 - 1 > UNEXPLAINED_ELECTRICAL * (before**2 - 1)
-    return after > MAX_ELECTRICAL or (after > TRACE_OF_ELECTRICAL and unexplained)
+    unexplained = after**2 - 1 > MAX_ELECTRICAL_SHARE * (before**2 - 1)
+    return after > MAX_ELECTRICAL or (after > MAX_EXPLAINED_ELECTRICAL and unexplained)
 
 
 def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:
@@ -158,7 +158,7 @@ def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:
         return None
     # a misfit of the fitted runs below the noise, as of a noiseless simulation, says nothing
     ratio = gap["holdout"].after / max(gap["train"].after, 1.0)
-    return ratio if ratio > BEYOND else None
+    return ratio if ratio > MAX_HOLDOUT_RATIO else None
 
 
 def unlike_held_out(gap: Mapping[Role, Gap]) -> bool:
@@ -167,5 +167,6 @@ def unlike_held_out(gap: Mapping[Role, Gap]) -> bool:
 
 
 def worse_held_out(gap: Mapping[Role, Gap]) -> bool:
-    """Whether the effects added make hold-outs worse: then others are missing that look alike in the fitted runs."""
-    return "holdout" in gap and gap["holdout"].after > WORSE * gap["holdout"].before
+    """Whether the effects added make hold-outs worse: the missing ones are then others that look alike in the fitted
+    runs."""
+    return "holdout" in gap and gap["holdout"].after > MAX_HOLDOUT_GROWTH * gap["holdout"].before

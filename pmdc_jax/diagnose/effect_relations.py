@@ -2,50 +2,51 @@
 
 from __future__ import annotations
 
-from .candidates import TRIALS
+from .trials import TRIALS
 
-# By rich effect, the effects that it contains and replaces
+# By richer effect, the effects that it contains and replaces
 CONTAINS = {effect: trial.contains for effect, trial in TRIALS.items() if trial.contains}
 # By simple effect, its fuller form
 FULLER = {effect: trial.fuller for effect, trial in TRIALS.items() if trial.fuller}
 
 
-def unbalances(equation: str) -> str:
-    """The equation in which a missing effect shows: the electrical one for a voltage lost before the terminals
-    ("input"), or else its own."""
+def unbalanced_equation(equation: str) -> str:
+    """The equation that a missing effect violates: the electrical one for a voltage lost before the terminals
+    ("input"), otherwise its own."""
     return "electrical" if equation == "input" else equation
 
 
 def are_rivals(a: set[str], b: set[str]) -> bool:
     """Whether two sets, `a` not empty, are alternatives: not the same torque, neither a part of the other, and neither
     the other with an effect in a simpler form."""
-    return bool(a) and not (a <= b or b <= a or _same_class(a, b) or _contains(a, b))
+    return bool(a) and not (a <= b or b <= a or _are_same_torque(a, b) or _is_part_of_other(a, b))
 
 
-def is_within(a: set[str], b: set[str]) -> bool:
+def is_simpler_form(a: set[str], b: set[str]) -> bool:
     """Whether `a` is `b` with one effect in a simpler form."""
     return any(a - b and a - b <= CONTAINS.get(e, set()) and b - a == {e} for e in b)
 
 
-def spelt_out(effects: set[str]) -> set[str]:
-    """The set with asymmetric friction as Coulomb friction and a constant load, the same torque while the motor turns,
-    so that an effect which is richer in another way, as Stribeck friction, can replace a part."""
+def with_split_friction(effects: set[str]) -> set[str]:
+    """The set with asymmetric friction split into Coulomb friction and a constant load, the same torque while the motor
+    turns, so that an effect that is richer in another way, such as Stribeck friction, can replace one of them."""
     if "asymmetric_friction" in effects:
         return (effects - {"asymmetric_friction"}) | CONTAINS["asymmetric_friction"]
     return effects
 
 
-def _same_class(a: set[str], b: set[str]) -> bool:
-    """Whether two sets are the same torque while the motor turns (see `spelt_out`)."""
-    return spelt_out(a) == spelt_out(b)
+def _are_same_torque(a: set[str], b: set[str]) -> bool:
+    """Whether two sets are the same torque while the motor turns (see `with_split_friction`)."""
+    return with_split_friction(a) == with_split_friction(b)
 
 
-def _contains(a: set[str], b: set[str]) -> bool:
+def _is_part_of_other(a: set[str], b: set[str]) -> bool:
     """Whether one set, with its effects in their simplest forms, is part of the other, or both are then the same."""
     return _simplified(a) <= b or _simplified(b) <= a or _simplified(a) == _simplified(b)
 
 
 def _simplified(effects: set[str]) -> set[str]:
+    """The set with each richer effect replaced by what it contains, without a constant load."""
     return {
         simple
         for e in effects

@@ -1,4 +1,4 @@
-"""Backward elimination: without effects that a model does not need, and with simpler forms of those that it does."""
+"""Backward elimination: remove effects that a model does not need, and simplify those that it does."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from collections.abc import Callable
 from typing import TypeGuard
 
 from ..identify.noise_model import Whitener
-from .assessment import ALARM, Assessment
-from .compare import MARGIN, Comparison
-from .effect_relations import CONTAINS, FULLER, spelt_out
-from .model import MOST_EFFECTS, Model
+from .assessment import FALSE_ALARM, Assessment
+from .compare import BIC_MARGIN, Comparison
+from .effect_relations import CONTAINS, FULLER, with_split_friction
+from .model import MAX_EFFECTS, Model
 from .refits import Refits
-from .shortlist import COMPARABLE, clear, effect_of
+from .shortlist import COMPARABLE_GAIN, clear_signals, effect_of
 
 # A simpler form may leave at most so many times the unfiltered squares of the richer one
-HARDLY_MORE = 1.5
+MAX_MISFIT_GROWTH = 1.5
 
 
 class BackwardElimination:
-    """Takes out of a model what it does not need."""
+    """Removes from a model what it does not need."""
 
     def __init__(
         self,
@@ -33,8 +33,8 @@ class BackwardElimination:
 
     def reduced(self, model: Model) -> Model:
         """The model after backward elimination: without effects that it does not need, and with simpler forms of
-        effects, alone or with another effect added, where these do as well."""
-        white = self.comparison.white(model)
+        effects, alone or with another effect added, where these are as good."""
+        white = self.comparison.filter_of(model)
         for effect in model.effects[:-1]:
             smaller = self.refits.without(model, effect, white)
             if (
@@ -45,60 +45,61 @@ class BackwardElimination:
         for effect in model.effects:
             for simple in self._simpler_forms(effect):
                 simpler = self.refits.in_place(model, white, effect, simple)
-                if self.is_new(simpler) and self._does_as_well(simpler, model):
+                if self.is_new(simpler) and self._is_as_good(simpler, model):
                     return self.reduced(simpler)
-                two = simpler and self._simple_form_with_another(simpler, model, effect)
-                if two and self._is_far_better(two, model, white):
-                    return self.reduced(two)
+                pair = simpler and self._simple_form_with_another(simpler, model, effect)
+                if pair and self._is_far_better(pair, model, white):
+                    return self.reduced(pair)
         return model
 
     def _simpler_forms(self, effect: str) -> list[str]:
         """The simpler effects that may replace one: contained ones that were begun, and that of which it is fuller."""
-        reduced = {s for s, form in FULLER.items() if form.effect == effect and form.reduced}
-        return sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys() | reduced)
+        of_fuller = {s for s, form in FULLER.items() if form.effect == effect and form.to_simple}
+        return sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys() | of_fuller)
 
     def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:
-        """A model with a simpler form of a rich effect, and one more effect that promises as much (`COMPARABLE`).
+        """A model with a simpler form of a rich effect, and one more effect of comparable gain (`COMPARABLE_GAIN`).
 
         Stribeck friction is curved like drag, for instance, if viscous friction compensates for the rest.
         """
-        if len(simpler.effects) == MOST_EFFECTS:
+        if len(simpler.effects) == MAX_EFFECTS:
             return None
         found = self.assess(simpler)
-        promised = {effect_of(s): s for s in clear(found)}
-        enough = COMPARABLE * promised[rich].gain if rich in promised else 0.0
-        here = set(simpler.effects)
+        by_effect = {effect_of(s): s for s in clear_signals(found)}
+        least = COMPARABLE_GAIN * by_effect[rich].gain if rich in by_effect else 0.0
+        present = set(simpler.effects)
         others = [
             s
-            for effect, s in promised.items()
+            for effect, s in by_effect.items()
             if effect not in {*model.effects, *CONTAINS}
-            and spelt_out({*here, effect}) != spelt_out(set(model.effects))
-            and s.gain > enough
+            and with_split_friction({*present, effect}) != with_split_friction(set(model.effects))
+            and s.gain > least
         ]
         best = max(others, key=lambda s: s.gain, default=None)
-        two = best and self.refits.with_signal(simpler, best, found.screen)
-        return two if two and two.is_possible else None
+        pair = best and self.refits.with_signal(simpler, best, found.screen)
+        return pair if pair and pair.is_possible else None
 
-    def _is_far_better(self, two: Model, model: Model, white: Whitener) -> bool:
-        """Whether two effects beat a rich one by `MARGIN` in the criterion, and leave no more unfiltered squares."""
-        if two.fit.fitness > model.fit.fitness:
+    def _is_far_better(self, pair: Model, model: Model, white: Whitener) -> bool:
+        """Whether two effects beat a rich one by `BIC_MARGIN`, and leave no more unfiltered squares."""
+        if pair.fit.fitness > model.fit.fitness:
             return False
-        criterion = {f.model: f.criterion for f in self.comparison.ranked([two, model], white)}
-        return bool(criterion[two] + MARGIN < criterion[model])
+        criterion = {f.model: f.criterion for f in self.comparison.ranked([pair, model], white)}
+        return bool(criterion[pair] + BIC_MARGIN < criterion[model])
 
-    def _does_as_well(self, simpler: Model, model: Model) -> bool:
-        """Whether a simpler form does as well as the richer one, chosen when another effect may have been missing.
+    def _is_as_good(self, simpler: Model, model: Model) -> bool:
+        """Whether a simpler form is as good as the richer one, chosen when another effect may have been missing.
 
-        Its criterion is worse by less than `MARGIN` and what neither explains; or, by its own filter, nothing
-        significant is left, and hardly more unfiltered squares.
+        Its criterion is worse by less than `BIC_MARGIN` and what neither explains; or, by its own filter, nothing
+        significant is left, and the unfiltered squares are hardly larger.
         """
-        rich, plain = (
-            self.comparison.fitted(m, self.comparison.white(model)).criterion
+        rich, simple = (
+            self.comparison.fitted(m, self.comparison.filter_of(model)).criterion
             for m in (model, simpler)
         )
-        rest = self.assess(model)
-        margin = MARGIN + (rest.clearest.gain if rest.p_value < ALARM else 0.0)
-        if plain < rich + margin:
+        found = self.assess(model)
+        unexplained = found.clearest.gain if found.p_value < FALSE_ALARM else 0.0
+        margin = BIC_MARGIN + unexplained
+        if simple < rich + margin:
             return True
-        hardly_more = simpler.fit.fitness < HARDLY_MORE * model.fit.fitness
-        return bool(hardly_more and self.assess(simpler).p_value >= ALARM)
+        hardly_more = simpler.fit.fitness < MAX_MISFIT_GROWTH * model.fit.fitness
+        return bool(hardly_more and self.assess(simpler).p_value >= FALSE_ALARM)

@@ -12,23 +12,23 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-# Directions with a smaller share of the squares are dropped. First-order responses are accurate to a thousandth (1e-6
-# in squares): a smaller difference between a column and what the motor's parameters can do is only that error.
-VISIBLE = 1e-6
+# Directions with a smaller eigenvalue, of unit columns, are dropped. First-order responses are accurate to a thousandth
+# (1e-6 in squares): a smaller difference between a column and what the motor's parameters can do is only that error.
+MIN_EIGENVALUE = 1e-6
 
 
 class Block(NamedTuple):
-    """Columns that are regressed on together; with `own`, every run has its own coefficients."""
+    """Columns that are regressed on together; with `per_run`, every run has its own coefficients."""
 
     columns: tuple[int, ...]
-    own: bool = False
+    per_run: bool = False
 
 
-def blocks_of(orders: Iterable[tuple[int, bool]], first: int) -> list[Block]:
-    """Blocks from pairs of a number of columns and `own`, one after another from the `first` column on."""
+def consecutive_blocks(orders: Iterable[tuple[int, bool]], first: int) -> list[Block]:
+    """Blocks from pairs of a number of columns and `per_run`, one after another from the `first` column on."""
     blocks = []
-    for order, own in orders:
-        blocks.append(Block(tuple(range(first, first + order)), own))
+    for order, per_run in orders:
+        blocks.append(Block(tuple(range(first, first + order)), per_run))
         first += order
     return blocks
 
@@ -42,6 +42,16 @@ class Regression(NamedTuple):
     errors: list[Float[np.ndarray, "*runs columns"]]  # their standard errors
 
 
+class _Solution(NamedTuple):
+    """Least squares of several targets: coefficients that all runs share, and those that each run has of its own."""
+
+    squares: Float[np.ndarray, " targets"]  # left of each target
+    shared: Float[np.ndarray, "shared targets"]
+    shared_errors: Float[np.ndarray, " shared"]
+    per_run: Float[np.ndarray, "runs columns targets"]
+    per_run_errors: Float[np.ndarray, "runs columns"]
+
+
 class Evidence(NamedTuple):
     """Inner products of the white rows of every run: the motor's parameters first, then the columns of what may be
     missing, those of rounding errors, and the residual last.
@@ -53,100 +63,115 @@ class Evidence(NamedTuple):
     products: Float[np.ndarray, "runs columns columns"]
     parameters: int  # number of columns that are the motor's
     rows: int  # number of white rows in all runs
-    readings: tuple[int, ...] = ()  # columns of the rounding errors of coarse converters
+    rounding_columns: tuple[int, ...] = ()  # of the rounding errors of coarse converters
 
-    def regress(self, blocks: Sequence[Block] = (), visible: float = VISIBLE) -> Regression:
+    def regress(
+        self, blocks: Sequence[Block] = (), min_eigenvalue: float = MIN_EIGENVALUE
+    ) -> Regression:
         """Least squares of the residual on the motor's parameters and some blocks.
 
-        Directions whose eigenvalue, with columns scaled to unit length, is below `visible` are not moved.
+        Directions whose eigenvalue, with columns scaled to unit length, is below `min_eigenvalue` are not moved.
         """
-        squares, shared, own = self._regressed(blocks, [-1], visible)
-        places, found, spread = [self.parameters, 0], [], []
+        found = self._solve(blocks, [-1], min_eigenvalue)
+        first_shared, first_per_run = self.parameters, 0
+        coefficients, errors = [], []
         for block in blocks:
-            n = len(block.columns)
-            part = slice(places[block.own], places[block.own] + n)
-            coefficients, errors = own if block.own else shared
-            found.append(coefficients[..., part, 0])
-            spread.append(errors[..., part])
-            places[block.own] += n
-        moved = shared[0][: self.parameters, 0]
-        return Regression(float(squares[0]), moved, found, spread)
+            width = len(block.columns)
+            if block.per_run:
+                part = slice(first_per_run, first_per_run + width)
+                first_per_run += width
+                coefficients.append(found.per_run[:, part, 0])
+                errors.append(found.per_run_errors[:, part])
+            else:
+                part = slice(first_shared, first_shared + width)
+                first_shared += width
+                coefficients.append(found.shared[part, 0])
+                errors.append(found.shared_errors[part])
+        moved = found.shared[: self.parameters, 0]
+        return Regression(float(found.squares[0]), moved, coefficients, errors)
 
-    def _regressed(
-        self, blocks: Sequence[Block], targets: Sequence[int], visible: float
-    ) -> tuple[
-        Float[np.ndarray, " targets"],
-        tuple[Float[np.ndarray, "shared targets"], Float[np.ndarray, " shared"]],
-        tuple[Float[np.ndarray, "runs own targets"], Float[np.ndarray, "runs own"]],
-    ]:
-        """Least squares of several targets: the squares left, and coefficients with standard errors, shared and own."""
-        own = np.array([c for b in blocks if b.own for c in b.columns], int)
-        shared = [*range(self.parameters), *(c for b in blocks if not b.own for c in b.columns)]
+    def _solve(
+        self, blocks: Sequence[Block], targets: Sequence[int], min_eigenvalue: float
+    ) -> _Solution:
+        """Least squares of the `targets`, which are columns, on the motor's parameters and some blocks."""
+        per_run = np.array([c for b in blocks if b.per_run for c in b.columns], int)
+        shared = [
+            *range(self.parameters),
+            *(c for b in blocks if not b.per_run for c in b.columns),
+        ]
         kept, n = np.array([*shared, *targets]), len(shared)
         total = self.products[:, kept[:, None], kept].sum(0)
-        across = self.products[:, own[:, None], kept]
-        of_own = _inverse(self.products[:, own[:, None], own], visible)
-        total -= (across.swapaxes(1, 2) @ of_own @ across).sum(0)
-        inverse = _inverse(total[:n, :n], visible)
+        cross = self.products[:, per_run[:, None], kept]
+        per_run_inverse = _inverse(self.products[:, per_run[:, None], per_run], min_eigenvalue)
+        total -= (cross.swapaxes(1, 2) @ per_run_inverse @ cross).sum(0)
+        inverse = _inverse(total[:n, :n], min_eigenvalue)
         coefficients = inverse @ total[:n, n:]
-        squares = np.diag(total[n:, n:]) - np.sum(total[:n, n:] * coefficients, 0)
-        own_coefficients = of_own @ (across[..., n:] - across[..., :n] @ coefficients)
-        return squares, (coefficients, _errors(inverse)), (own_coefficients, _errors(of_own))
+        return _Solution(
+            squares=np.diag(total[n:, n:]) - np.sum(total[:n, n:] * coefficients, 0),
+            shared=coefficients,
+            shared_errors=_errors(inverse),
+            per_run=per_run_inverse @ (cross[..., n:] - cross[..., :n] @ coefficients),
+            per_run_errors=_errors(per_run_inverse),
+        )
 
-    def gained_by_rounding(self, block: Block) -> float:
+    def rounding_dispersion(self, block: Block) -> float:
         """The mean gain per degree of freedom of a block on the rounding errors of coarse converters; at least one."""
-        if not self.readings:
+        if not self.rounding_columns:
             return 1.0
-        without, with_it = (self._regressed(b, self.readings, VISIBLE)[0] for b in ([], [block]))
-        return float(max(np.mean(without - with_it) / self.freedom(block), 1.0))
+        before, after = (
+            self._solve(blocks, self.rounding_columns, MIN_EIGENVALUE).squares
+            for blocks in ([], [block])
+        )
+        return float(max(np.mean(before - after) / self.degrees_of_freedom(block), 1.0))
 
-    def freedom(self, block: Block) -> int:
+    def degrees_of_freedom(self, block: Block) -> int:
         """The degrees of freedom of a block: its coefficients in all runs."""
-        return len(block.columns) * (len(self.products) if block.own else 1)
+        return len(block.columns) * (len(self.products) if block.per_run else 1)
 
 
 def _inverse(
-    matrix: Float[np.ndarray, "*runs n n"], visible: float = VISIBLE
+    matrix: Float[np.ndarray, "*runs n n"], min_eigenvalue: float = MIN_EIGENVALUE
 ) -> Float[np.ndarray, "*runs n n"]:
-    """Pseudo-inverse of a Gram matrix on the directions that are `visible`."""
+    """Pseudo-inverse of a Gram matrix without the directions whose eigenvalue is below `min_eigenvalue`."""
     if not matrix.size:
         return matrix
     lengths = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 0.0))
     lengths = np.where(lengths > 0, lengths, 1.0)
     units = lengths[..., :, None] * lengths[..., None, :]
     values, vectors = np.linalg.eigh(matrix / units)
-    seen = values > visible
-    inverse = np.where(seen, 1 / np.where(seen, values, 1.0), 0.0)
+    kept = values > min_eigenvalue
+    inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
     return (vectors * inverse[..., None, :]) @ vectors.swapaxes(-2, -1) / units
 
 
 def _errors(inverse: Float[np.ndarray, "*runs n n"]) -> Float[np.ndarray, "*runs n"]:
+    """Standard errors of the coefficients, from the inverse of their Gram matrix."""
     return np.sqrt(np.maximum(np.diagonal(inverse, axis1=-2, axis2=-1), 0.0))
 
 
-def products(
+def gather_evidence(
     runs: Iterable[Iterable[Float[np.ndarray, "rows _"]]],
     parameters: int,
-    own: int,
-    readings: int = 0,
+    run_unknowns: int,
+    rounding_errors: int = 0,
 ) -> Evidence:
     """Gather the evidence from white rows, those of each run in several pieces.
 
     **Arguments**: `runs`, the pieces of each run, with columns for the motor's `parameters`, what may be missing, the
-    rounding errors of coarse converters in some `readings`, the residual, and last the run's `own` unknowns; the
-    numbers are how many columns each has.
+    simulated `rounding_errors` of coarse converters, the residual, and last the `run_unknowns`; the numbers are how
+    many columns each has.
     """
-    gathered, rows = [], 0
+    products, rows = [], 0
     for pieces in runs:
         total = np.zeros(())
         for piece in pieces:
             total = total + piece.T @ piece
             rows += len(piece)
-        kept, alone = slice(0, -own), slice(-own, None)
-        across = total[alone, kept]
-        left = total[kept, kept] - across.T @ _inverse(total[alone, alone]) @ across
-        seen = np.diag(left) > VISIBLE * np.diag(total)[kept]
-        gathered.append(left * seen * seen[:, None])
-    found, last = np.array(gathered), gathered[0].shape[0] - 1
-    read = (k for k in range(last - readings, last) if found[:, k, k].any())
-    return Evidence(found, parameters, rows, tuple(read))
+        kept, nuisance = slice(0, -run_unknowns), slice(-run_unknowns, None)
+        cross = total[nuisance, kept]
+        projected = total[kept, kept] - cross.T @ _inverse(total[nuisance, nuisance]) @ cross
+        distinct = np.diag(projected) > MIN_EIGENVALUE * np.diag(total)[kept]
+        products.append(projected * distinct * distinct[:, None])
+    found, residual = np.array(products), products[0].shape[0] - 1
+    rounding = (k for k in range(residual - rounding_errors, residual) if found[:, k, k].any())
+    return Evidence(found, parameters, rows, tuple(rounding))

@@ -1,4 +1,4 @@
-"""The run that would best tell rivals apart: of a few waveforms, the one in which their simulations differ most."""
+"""The run that would best distinguish rivals: of a few waveforms, the one in which their simulations differ most."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from .diagnosis import NextExperiment
 from .naming import Naming
 
 # Length of the run in s, and its sample time
-DURATION, STEP = 6.0, 1e-3
+DURATION, SAMPLE_TIME = 6.0, 1e-3
 # Share of the difference between two simulations that remains once all parameters are fitted to the new run, too
-SHARED = 0.3
-# Probability of a false answer (one-sided) at which the power is stated
-LEVEL = 0.05
+REMAINING_SHARE = 0.3
+# Significance level (one-sided) at which the power is stated
+SIGNIFICANCE = 0.05
 
 Waveform = Callable[[np.ndarray], np.ndarray]  # time in s to voltage over its limit
 
 
-def _steps(seed: int, least: float, most: float) -> Waveform:
-    """Random levels, each held for a random time of `least` to `most` seconds."""
+def _random_steps(seed: int, shortest: float, longest: float) -> Waveform:
+    """Random levels, each held for a random time of `shortest` to `longest` seconds."""
 
     def levels(time: np.ndarray) -> np.ndarray:
         rng = np.random.default_rng(seed)
-        edges = np.cumsum(rng.uniform(least, most, int(time[-1] / least) + 1))
+        edges = np.cumsum(rng.uniform(shortest, longest, int(time[-1] / shortest) + 1))
         return rng.uniform(-1, 1, len(edges) + 1)[np.searchsorted(edges, time)]
 
     return levels
@@ -44,12 +44,12 @@ WAVEFORMS: dict[str, Waveform] = {
     "climb in steps to full speed forward, then backward": lambda t: (
         np.round(4 * np.abs((t * 4 / DURATION) % 4 - 2)) / 4 - 1
     ),
-    "jump between levels every few hundredths of a second": _steps(1, 0.01, 0.06),
-    "jump between levels every half second": _steps(2, 0.3, 0.7),
+    "jump between levels every few hundredths of a second": _random_steps(1, 0.01, 0.06),
+    "jump between levels every half second": _random_steps(2, 0.3, 0.7),
     "reverse at full voltage, then coast": lambda t: (
         np.sign(np.sin(4 * np.pi * t)) * ((t % 1.5) < 1)
     ),
-    "rest, then small steps": lambda t: 0.08 * _steps(3, 0.2, 0.4)(t) * (t > 2),
+    "rest, then small steps": lambda t: 0.08 * _random_steps(3, 0.2, 0.4)(t) * (t > 2),
 }
 
 
@@ -66,7 +66,7 @@ def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExpe
     rival = naming.rivals[0]
     motors = [jax.tree.map(np.asarray, m.motor) for m in (naming.chosen, rival)]
     noise = np.asarray(naming.chosen.fit.noise)
-    time = STEP * np.arange(int(DURATION / STEP))
+    time = SAMPLE_TIME * np.arange(int(DURATION / SAMPLE_TIME))
     ranked = sorted(
         (
             (difference_between(motors, time, limit * waveform(time), noise), name)
@@ -77,7 +77,7 @@ def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExpe
     difference, name = ranked[0]
     if not difference:
         return None
-    power = float(stats.norm.cdf(SHARED * difference - stats.norm.isf(LEVEL)))
+    power = float(stats.norm.cdf(REMAINING_SHARE * difference - stats.norm.isf(SIGNIFICANCE)))
     sets = (" + ".join(sorted(m.effects)) for m in (naming.chosen, rival))
     return NextExperiment(
         why=f"{' and '.join(sets)} explain these runs equally well",
@@ -96,16 +96,16 @@ def difference_between(
 ) -> float:
     """Root of the summed squares of the difference between two motors' responses, over the noise of current and speed.
 
-    Zero if one cannot be simulated: fitted to other runs, it may be unstable in this one.
+    Zero if one cannot be simulated: a motor fitted to other runs may be unstable in this one.
     """
-    start = np.zeros_like(time)
-    run = Recording("next", time, voltage, current=start, speed=start, load=start)
+    zero = np.zeros_like(time)
+    run = Recording("next", time, voltage, current=zero, speed=zero, load=zero)
     try:
         one, other = (simulate(motor, run) for motor in motors)
     except InputError:
         return 0.0
-    parts = [
+    differences = [
         (getattr(one, c) - getattr(other, c)) / s
         for c, s in zip(("current", "speed"), noise, strict=True)
     ]
-    return float(np.sqrt(np.sum(np.square(parts))))
+    return float(np.sqrt(np.sum(np.square(differences))))

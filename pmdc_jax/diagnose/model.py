@@ -27,9 +27,9 @@ from ..motor import Motor
 from .response import Path, path_of
 
 # Largest number of effects in a set
-MOST_EFFECTS = 3
+MAX_EFFECTS = 3
 # A model is exact if its residuals are a smaller share of what was measured, as root mean squares
-CLOSE = 1e-4
+EXACT_MISFIT = 1e-4
 
 
 @attrs.frozen(eq=False)
@@ -50,16 +50,16 @@ class Model:
         """Whether it can be simulated, its effects are physical, and each periodic torque completes a period."""
         simulated = np.isfinite(self.fit.fitness)
         physical = all(effect.is_possible() for effect in self.motor.effects)
-        return bool(simulated) and physical and self._comes_round
+        return bool(simulated) and physical and self._completes_periods
 
     @property
-    def _comes_round(self) -> bool:
+    def _completes_periods(self) -> bool:
         """Whether some run turns through a whole period of each torque that is periodic in the rotor angle.
 
         Over less than a period, any torque that depends on position may look like part of one.
         """
-        waves = [effect.repeats_after().get("angle", 0.0) for effect in self.motor.effects]
-        return not any(waves) or bool(max(waves) <= self.travel)
+        periods = [effect.repeats_after().get("angle", 0.0) for effect in self.motor.effects]
+        return not any(periods) or bool(max(periods) <= self.travel)
 
     @property
     def travel(self) -> float:
@@ -69,40 +69,41 @@ class Model:
 
     @property
     def effects_at_end(self) -> set[str]:
-        """The effects with a parameter that is held at its bound or `lost`."""
+        """The effects with a parameter that is held at its bound or `undetermined`."""
         names = self.given.problem.parameters.names
-        ended = {names[k] for k in self.fit.at_bound} | self.lost
-        return {name.partition(".")[0] for name in ended} & set(self.effects)
+        at_end = {names[k] for k in self.fit.at_bound} | self.undetermined
+        return {name.partition(".")[0] for name in at_end} & set(self.effects)
 
     @property
-    def lost(self) -> set[str]:
-        """The parameters to which no run is sensitive (standard error above `MIN_UNSEEN_STDERR`), so that no gradient
-        leads back."""
+    def undetermined(self) -> set[str]:
+        """The parameters to which no run is sensitive (standard error above `MIN_UNSEEN_STDERR`), so that a refit would
+        not move them."""
         problem = self.given.problem
         names = problem.parameters.names
         # columns of each run's own unknowns follow those of the parameters
         jacobian = np.asarray(self.fit.evaluation.jacobian)
         columns = jacobian[problem.fitted_blocks][..., : len(names)]
-        seen = np.square(columns).reshape(-1, len(names)).sum(axis=0)
+        information = np.square(columns).reshape(-1, len(names)).sum(axis=0)
         return {
             name
-            for name, square in zip(names, seen, strict=True)
+            for name, square in zip(names, information, strict=True)
             if square < 1 / MIN_UNSEEN_STDERR**2
         }
 
     @property
     def dry(self) -> float:
         """Coulomb friction, N m, the mean of both directions."""
-        return sum(self._dry) / 2
+        return sum(self._friction) / 2
 
     @property
-    def slanted(self) -> float:
-        """The constant load within asymmetric friction, N m: half of what it is larger forward than backward."""
-        backward, forward = self._dry
+    def friction_asymmetry(self) -> float:
+        """The constant load within asymmetric friction, N m: half the difference of forward and backward friction."""
+        backward, forward = self._friction
         return (forward - backward) / 2
 
     @property
-    def _dry(self) -> tuple[float, float]:
+    def _friction(self) -> tuple[float, float]:
+        """Coulomb friction backward and forward, N m."""
         for effect in self.motor.effects:
             if isinstance(effect, CoulombFriction):
                 return float(effect.torque_Nm), float(effect.torque_Nm)
@@ -113,22 +114,22 @@ class Model:
     @property
     def path(self) -> Path:
         """The free run of the fitted motor: the states of the rotor itself, before any sensor."""
-        held = "speed" in {EFFECTS[name].holds for name in self.effects}
+        can_stick = "speed" in {EFFECTS[name].holds for name in self.effects}
         problem = self.given.problem
-        begun = self.fit.unknowns.runs.angle
-        return path_of(rotor_outputs(problem, self.fit), problem.tape, begun, held)
+        start_angle = self.fit.unknowns.runs.angle
+        return path_of(rotor_outputs(problem, self.fit), problem.tape, start_angle, can_stick)
 
     @property
-    def misses(self) -> float:
+    def relative_misfit(self) -> float:
         """Its residuals over what was measured, as root mean squares, for the output where that is larger."""
         sizes = self.given.problem.measured_rms
-        there = sizes > 0
-        return float(np.max(self.fit.noise[there] / sizes[there], initial=0.0))
+        measured = sizes > 0
+        return float(np.max(self.fit.noise[measured] / sizes[measured], initial=0.0))
 
     @property
     def is_exact(self) -> bool:
         """Whether its residuals are negligible, as small as between two simulations."""
-        return self.misses < CLOSE
+        return self.relative_misfit < EXACT_MISFIT
 
     @property
     def training(self) -> list[int]:
@@ -138,26 +139,26 @@ class Model:
 
 def refit_from(effects: tuple[str, ...], given: Prepared, start: Optimum, white: Whitener) -> Model:
     """A model fitted from a start to whitened residuals; its `fit` is evaluated without the filter."""
-    given, ended = polish_with_angle(with_whitening(given, white), start)
+    given, whitened = polish_with_angle(with_whitening(given, white), start)
     given = given._replace(problem=replace(given.problem, whitening=None))
     # no step: the unfiltered residuals at the same point
-    plain = polish(given.problem, ended.optimum, steps=0)
-    optimum = ended.optimum._replace(fitness=plain.fitness)
-    return model_of(effects, given, plain._replace(optimum=optimum))
+    unfiltered = polish(given.problem, whitened.optimum, steps=0)
+    optimum = whitened.optimum._replace(fitness=unfiltered.fitness)
+    return model_of(effects, given, unfiltered._replace(optimum=optimum))
 
 
-def model_of(effects: tuple[str, ...], given: Prepared, polished: Fit) -> Model:
-    """A fitted model, its rotor turned in each sample as recordings and fit together tell."""
+def model_of(effects: tuple[str, ...], given: Prepared, fit: Fit) -> Model:
+    """A fitted model, with the rotor angle of each sample estimated from recordings and fit together."""
     if not given.problem.depends_on_angle:  # with an effect of the angle, the fit has done this
-        given = given._replace(problem=with_rotor_angle(given.problem, polished))
-    return Model(effects, given, polished)
+        given = given._replace(problem=with_rotor_angle(given.problem, fit))
+    return Model(effects, given, fit)
 
 
 def final_fit(model: Model, white: Whitener) -> tuple[Prepared, Fit]:
     """The last fit of a model: to whitened residuals where `last_fit` allows it, else by plain least squares."""
     known = reweighted(model.given.problem, model.fit)
-    plainly = polish_with_angle(model.given, model.fit.optimum, known)
-    return last_fit(*plainly, model.fit, white)
+    given, unfiltered = polish_with_angle(model.given, model.fit.optimum, known)
+    return last_fit(given, unfiltered, model.fit, white)
 
 
 class RunSeries(NamedTuple):
@@ -169,7 +170,7 @@ class RunSeries(NamedTuple):
     simulated: Series
 
 
-def rows_of(model: Model) -> list[RunSeries]:
+def series_of_runs(model: Model) -> list[RunSeries]:
     """The fit of every training run, in the order of time."""
     evaluation, tape = model.fit.evaluation, model.given.problem.tape
     J = np.asarray(evaluation.jacobian) * model.fit.noise[:, None, None]

@@ -1,6 +1,7 @@
 """An external torque that is periodic in time: one line in the spectra of the residuals of most runs.
 
-No effect of the library has a frequency of its own, and the whitening filter would take a steady oscillation for noise.
+No effect of the library has a frequency of its own, and the whitening filter would absorb a steady oscillation as
+noise.
 """
 
 from __future__ import annotations
@@ -12,30 +13,30 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from .model import Model, rows_of
+from .model import Model, series_of_runs
 
 # Frequencies (bins) whose median power is the level around a line
-NEIGHBOURS = 41
-# Below the bin SLOWEST, where noise rises steeply, the level is taken from bins NEAR to FAR away; the bins up to NEAR
-# are not searched
-SLOWEST, NEAR, FAR = 12, 3, 6
+LEVEL_BINS = 41
+# Below the bin SLOW_BINS, where noise rises steeply, the level is taken from bins NEAREST to FARTHEST away; the bins up
+# to NEAREST are not searched
+SLOW_BINS, NEAREST, FARTHEST = 12, 3, 6
 # Least height of a line, power over the level around it. Measured on six runs each of motors that lack nothing: in
 # single runs with quantised speed up to 180, but at one frequency of three runs no more than 7 in any noise; a periodic
 # torque 200 and more in every run.
-STANDS_OUT = 50.0
-# ... and so many times that, on the geometric mean, with fewer than three runs
-ALONE = 10.0
-# A line that the drive has as well (higher than DRIVEN) counts only if it is ANSWERED times as high as the drive's: a
-# controller reacts to an external torque
-DRIVEN, ANSWERED = 10.0, 10.0
-# A drive whose autocorrelation reaches this repeats itself: any misfit then has lines at its harmonics
-REPEATED = 0.95
+MIN_HEIGHT = 50.0
+# With fewer than three runs, the geometric mean of the heights must be so many times as large
+FEW_RUNS_FACTOR = 10.0
+# A line that the drive has as well, higher than the first value, counts only if it is so many times as high as the
+# drive's: a controller reacts to an external torque
+MIN_DRIVE_HEIGHT, MIN_HEIGHT_OVER_DRIVE = 10.0, 10.0
+# A drive whose autocorrelation reaches this is periodic: any misfit then has lines at its harmonics
+PERIODIC_CORRELATION = 0.95
 # Highest lines of each run that are looked for in the other runs
-PEAKS = 5
+PEAKS_PER_RUN = 5
 
 
 class Line(NamedTuple):
-    """A steady oscillation that most runs have."""
+    """A steady oscillation in most runs."""
 
     low: float  # Hz
     high: float  # Hz
@@ -53,12 +54,12 @@ class Spectrum(NamedTuple):
 def line_of(model: Model) -> Line | None:
     """The steady oscillation that a model leaves in most of the runs, if it leaves one."""
     spectra = []
-    for run, fit in zip(model.given.training, rows_of(model), strict=True):
-        drives = (run.voltage, run.torque, run.load, run.current)
+    for run, fit in zip(model.given.training, series_of_runs(model), strict=True):
         # a current drives only where there is no voltage
-        there = [x for x in drives[: 3 + (run.voltage is None)] if x is not None]
+        current = run.current if run.voltage is None else None
+        drives = [x for x in (run.voltage, run.torque, run.load, current) if x is not None]
         residuals = np.where(fit.residual.known[:, None], fit.residual.values, 0.0)
-        driving = np.nan_to_num(np.stack(there, axis=1))
+        driving = np.nan_to_num(np.stack(drives, axis=1))
         spectra.append(spectrum(residuals[: len(driving)], driving, fit.residual.kind[0]))
     return common_line(spectra)
 
@@ -68,78 +69,83 @@ def spectrum(
     driving: Float[np.ndarray, "samples inputs"],
     step: float,
 ) -> Spectrum:
-    """The spectra of one run, sampled every `step` seconds; that of the residuals is zero if a drive repeats itself."""
-    shown = _over_level(residuals)
-    if any(_repeats(one) for one in driving.T):
-        shown = np.zeros_like(shown)
-    return Spectrum(shown, _over_level(driving), len(residuals) * step)
+    """The spectra of one run, sampled every `step` seconds; that of the residuals is zero if a drive is periodic."""
+    residual = _power_over_level(residuals)
+    if any(_is_periodic(drive) for drive in driving.T):
+        residual = np.zeros_like(residual)
+    return Spectrum(residual, _power_over_level(driving), len(residuals) * step)
 
 
 def common_line(spectra: Sequence[Spectrum]) -> Line | None:
     """The highest line that stands out at one frequency in more than half of the runs, if there is one."""
     longest = max(spectra, key=lambda s: s.duration)
-    enough = STANDS_OUT * (ALONE if len(spectra) < 3 else 1.0)
+    few = len(spectra) < 3
+    least = MIN_HEIGHT * (FEW_RUNS_FACTOR if few else 1.0)
     best = None
-    for one in spectra:
-        for peak in np.argsort(one.residual)[-PEAKS:]:
-            frequency = peak / one.duration
-            mine = [height for s in spectra if (height := _own_height(frequency, s)) > 0]
-            if 2 * sum(height > STANDS_OUT for height in mine) <= len(spectra):
+    for run in spectra:
+        for peak in np.argsort(run.residual)[-PEAKS_PER_RUN:]:
+            frequency = peak / run.duration
+            heights = [height for s in spectra if (height := _height(frequency, s)) > 0]
+            if 2 * sum(height > MIN_HEIGHT for height in heights) <= len(spectra):
                 continue
-            few = len(spectra) < 3
-            height = float(np.exp(np.mean(np.log(mine))) if few else np.median(mine))
-            if height < enough:
+            height = float(np.exp(np.mean(np.log(heights))) if few else np.median(heights))
+            if height < least:
                 continue
             if best is None or height > best.height:
-                near = _near(frequency, longest, 1 / one.duration)
-                sharp = near.start + int(np.argmax(longest.residual[near]))
-                low, high = (sharp - 1) / longest.duration, (sharp + 1) / longest.duration
+                near = _near(frequency, longest, 1 / run.duration)
+                sharpest = near.start + int(np.argmax(longest.residual[near]))
+                low, high = (sharpest - 1) / longest.duration, (sharpest + 1) / longest.duration
                 best = Line(low, high, height)
     return best
 
 
-def _own_height(frequency: float, one: Spectrum) -> float:
-    """The height of a line in the residuals of a run; zero if the line is the drive's."""
-    near = _near(frequency, one)
-    height, driving = (float(x[near].max(initial=0.0)) for x in (one.residual, one.driving))
-    return height if driving < max(DRIVEN, height / ANSWERED) else 0.0
+def _height(frequency: float, run: Spectrum) -> float:
+    """The height of a line in the residuals of a run; zero if the line is due to the drive."""
+    near = _near(frequency, run)
+    height, driving = (float(x[near].max(initial=0.0)) for x in (run.residual, run.driving))
+    return height if driving < max(MIN_DRIVE_HEIGHT, height / MIN_HEIGHT_OVER_DRIVE) else 0.0
 
 
-def _near(frequency: float, one: Spectrum, width: float = 0.0) -> slice:
+def _near(frequency: float, run: Spectrum, width: float = 0.0) -> slice:
     """The bins of a run's spectrum nearest to a frequency in Hz, or within `width` of it."""
-    low, high = (frequency - width) * one.duration, (frequency + width) * one.duration
+    low, high = (frequency - width) * run.duration, (frequency + width) * run.duration
     return slice(max(int(low) - 1, 0), int(high) + 3)
 
 
-def _over_level(signals: Float[np.ndarray, "samples signals"]) -> Float[np.ndarray, " frequencies"]:
+def _power_over_level(
+    signals: Float[np.ndarray, "samples signals"],
+) -> Float[np.ndarray, " frequencies"]:
     """Power at every frequency over the level of its neighbours, the largest of all signals."""
     centred = signals - signals.mean(0)
     power = np.abs(np.fft.rfft(centred, axis=0)) ** 2
-    level = ndimage.median_filter(power, (NEIGHBOURS, 1), mode="reflect") / np.log(2)
+    level = ndimage.median_filter(power, (LEVEL_BINS, 1), mode="reflect") / np.log(2)
     floor = 1e-9 * power.sum(0) + 1e-300
     ratio = (power / np.maximum(level, floor)).max(1)
-    slowest = ratio[:SLOWEST]
-    slowest[:] = 0.0
-    if len(ratio) > SLOWEST + FAR:
-        slowest[NEAR + 1 :] = _over_neighbours(centred, floor)
+    ratio[:SLOW_BINS] = 0.0
+    if len(ratio) > SLOW_BINS + FARTHEST:
+        ratio[NEAREST + 1 : SLOW_BINS] = _slow_power_over_level(centred, floor)
     return ratio
 
 
-def _over_neighbours(
+def _slow_power_over_level(
     centred: Float[np.ndarray, "samples signals"], floor: Float[np.ndarray, " signals"]
 ) -> Float[np.ndarray, " slow"]:
-    """The same for the bins from NEAR + 1 to SLOWEST - 1, tapered so that a line does not leak into its neighbours."""
+    """The same for the bins from NEAREST + 1 to SLOW_BINS - 1, tapered so that a line does not leak into its
+    neighbours."""
     taper = np.hanning(len(centred))[:, None]
-    power = np.abs(np.fft.rfft(centred * taper, axis=0)[: SLOWEST + FAR]) ** 2
+    power = np.abs(np.fft.rfft(centred * taper, axis=0)[: SLOW_BINS + FARTHEST]) ** 2
     ratios = []
-    for k in range(NEAR + 1, SLOWEST):
-        neighbours = [*range(max(k - FAR, 1), k - NEAR + 1), *range(k + NEAR, k + FAR + 1)]
-        level = np.median(power[neighbours], axis=0) / np.log(2)
+    for k in range(NEAREST + 1, SLOW_BINS):
+        below, above = (
+            range(max(k - FARTHEST, 1), k - NEAREST + 1),
+            range(k + NEAREST, k + FARTHEST + 1),
+        )
+        level = np.median(power[[*below, *above]], axis=0) / np.log(2)
         ratios.append(np.max(power[k] / np.maximum(level, floor)))
     return np.array(ratios)
 
 
-def _repeats(driving: Float[np.ndarray, " samples"]) -> bool:
+def _is_periodic(driving: Float[np.ndarray, " samples"]) -> bool:
     """Whether a signal repeats itself after a lag of 5 to 50 % of its length."""
     x, n = driving - driving.mean(), len(driving)
     if not np.any(x):
@@ -149,7 +155,7 @@ def _repeats(driving: Float[np.ndarray, " samples"]) -> bool:
     squares = np.append(0.0, np.cumsum(x**2))
     lags = np.arange(n // 20, n // 2)
     both = squares[n - lags] * (squares[n] - squares[lags])
-    alike = products[lags] / np.sqrt(np.maximum(both, 1e-300))
-    # a slow signal resembles itself at short lags without repeating itself: look beyond where it first differs
-    apart = np.flatnonzero(alike < 0.5)
-    return bool(len(apart) and np.any(alike[apart[0] :] > REPEATED))
+    correlation = products[lags] / np.sqrt(np.maximum(both, 1e-300))
+    # a slow signal resembles itself at short lags without being periodic: look beyond where it first differs
+    different = np.flatnonzero(correlation < 0.5)
+    return bool(len(different) and np.any(correlation[different[0] :] > PERIODIC_CORRELATION))

@@ -1,4 +1,4 @@
-"""From recordings to a `Diagnosis`: identify, gather evidence, name, refit, say what is left."""
+"""From recordings to a `Diagnosis`: identify, gather evidence, name the missing effects, refit, describe the rest."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..identify.solve import Solved, solve
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..recording_file import Runs
-from .assessment import ALARM
+from .assessment import FALSE_ALARM
 from .balance import electrical_misfit
 from .diagnosis import (
     Detectable,
@@ -34,19 +34,19 @@ from .diagnosis import (
 )
 from .evidence import Block
 from .experiment import next_experiment
-from .library import Library
+from .library import Curve, Library
 from .model import model_of
 from .naming import Naming, StepwiseSelection
-from .signals import Screen, log_chance
+from .signals import Screen, log_p_value
 
-# A knot of a curve with a misfit of so many standard errors is part of a region
-CLEAR = 4.0
-# Units of the curves of each equation; a speed reading swings by a share of the speed
-UNITS = {"mechanical": "N m", "electrical": "V", "sensor": ""}
+# A knot of a curve is part of a region if its misfit is so many standard errors
+REGION_Z = 4.0
+# Units of the curves of each equation; that of a sensor is a share of the speed
+CURVE_UNITS = {"mechanical": "N m", "electrical": "V", "sensor": ""}
 # An effect with a smaller p-value without it is kept even if the runs give no interval of any of its parameters
-CERTAIN = 1e-30
-# ... and one whose interval of the amplitude reaches down to this share of the estimate may be none
-NOTHING = 1e-2
+CERTAIN_P_VALUE = 1e-30
+# ... and one whose interval of the amplitude reaches down to this share of the estimate may be absent
+ABSENT_SHARE = 1e-2
 
 
 @double_precision
@@ -83,16 +83,15 @@ def diagnose(
     named = time.perf_counter()
     report("estimating the uncertainty", naming.chosen.fit.fitness)
     base = results_of(given, solved)
-    final = _judged(naming, solved)
-    while (idle := _idle(naming, final, selection.library)) is not None:
-        naming = selection.without(naming, idle)
-        final = _judged(naming, solved)
-    before, electrical = (electrical_misfit(m) for m in (selection.base, naming.chosen))
-    breaks = breaks_electrical_equation(before, electrical)
-    verdict = "not_in_library" if breaks else _verdict(naming)
-    gaps = _gaps(base, final, naming.noise_share if verdict == "not_in_library" else 1.0)
-    total = _total(gaps, base)
-    if unlike_held_out(total):
+    final = _identification(naming, solved)
+    while (unneeded := _unneeded_effect(naming, final, selection.library)) is not None:
+        naming = selection.without(naming, unneeded)
+        final = _identification(naming, solved)
+    before, after = (electrical_misfit(m) for m in (selection.base, naming.chosen))
+    verdict = "not_in_library" if breaks_electrical_equation(before, after) else _verdict(naming)
+    gaps = _gaps_of_runs(base, final, naming.noise_share if verdict == "not_in_library" else 1.0)
+    gaps_of_roles = _gaps_of_roles(gaps, base)
+    if unlike_held_out(gaps_of_roles):
         verdict = "not_in_library"
     seconds = {
         "identify": identified - began,
@@ -104,63 +103,65 @@ def diagnose(
         verdict=verdict,
         effects=_effects(naming, final),
         where=_regions(naming),
-        gap=total,
+        gap=gaps_of_roles,
         gap_of_run=gaps,
-        closed_fraction=_closed(total) if naming.chosen.effects else None,
+        closed_fraction=_closed_fraction(gaps_of_roles) if naming.chosen.effects else None,
         next_experiment=next_experiment(naming, given.training) if verdict == "ambiguous" else None,
-        curves=_learned(naming) if verdict == "not_in_library" else (),
-        detectable=_detectable(naming.last),
+        curves=_learned_curves(naming) if verdict == "not_in_library" else (),
+        detectable=_detectable_effects(naming.chosen_screen),
         base=base,
         final=final,
         p_nothing=naming.p_nothing,
-        electrical_misfit=electrical,
+        electrical_misfit=after,
         electrical_misfit_before=before,
         seconds=seconds,
-        leaves_noise=naming.p_nothing_more >= ALARM,
+        leaves_noise=naming.p_nothing_more >= FALSE_ALARM,
     )
 
 
-def _judged(naming: Naming, solved: Solved) -> Identification:
-    ended, polished = naming.ended
-    return results_of(ended, solved._replace(fit=polished))
+def _identification(naming: Naming, solved: Solved) -> Identification:
+    """The identification of the chosen motor."""
+    given, fit = naming.final_fit
+    return results_of(given, solved._replace(fit=fit))
 
 
-def _idle(naming: Naming, final: Identification, library: Library) -> str | None:
-    """The one of several effects that the runs need least, if they need none of it: by its p-value, as its amplitude
-    may be none, or as they determine none of its parameters and its p-value is not below `CERTAIN`."""
-    if len(naming.without) < 2:
+def _unneeded_effect(naming: Naming, final: Identification, library: Library) -> str | None:
+    """The one of several effects that the runs need least, if they do not need it: by its p-value, as its amplitude may
+    be zero, or as they determine none of its parameters and its p-value is not below `CERTAIN_P_VALUE`."""
+    if len(naming.p_without) < 2:
         return None
     amplitude = {c.effect: c.amplitude for c in library.candidates if c.amplitude}
-    idle = {
-        effect: chance
-        for effect, chance in naming.without.items()
-        if chance > ALARM
-        or (effect in amplitude and may_be_none(final, effect, amplitude[effect]))
-        or (
-            chance > CERTAIN
-            and all(final.parameters[f"{effect}.{f}"].ci95 is None for f in EFFECTS[effect].ranges)
-        )
-    }
-    return max(idle, key=lambda effect: idle[effect], default=None)
+
+    def is_unneeded(effect: str, p_value: float) -> bool:
+        if p_value > FALSE_ALARM:
+            return True
+        if effect in amplitude and may_be_absent(final, effect, amplitude[effect]):
+            return True
+        intervals = [final.parameters[f"{effect}.{f}"].ci95 for f in EFFECTS[effect].ranges]
+        return p_value > CERTAIN_P_VALUE and all(interval is None for interval in intervals)
+
+    unneeded = {e: p for e, p in naming.p_without.items() if is_unneeded(e, p)}
+    return max(unneeded, key=lambda effect: unneeded[effect], default=None)
 
 
-def may_be_none(final: Identification, effect: str, amplitude: str) -> bool:
+def may_be_absent(final: Identification, effect: str, amplitude: str) -> bool:
     """Whether the 95 % interval of an effect's amplitude includes zero, or, if it is strictly positive, the larger of
-    its lower bound and the share `NOTHING` of the estimate."""
+    its lower bound and the share `ABSENT_SHARE` of the estimate."""
     found, about = final.parameters[f"{effect}.{amplitude}"], EFFECTS[effect].ranges[amplitude]
     if found.value is None or found.ci95 is None:
         return False
-    least = about.lower * (1 + 1e-6)  # as its logarithm gives it back
-    nothing = max(least, NOTHING * found.value) if about.scale == "log" else 0.0
-    return found.ci95[0] <= nothing <= found.ci95[1]
+    least = about.lower * (1 + 1e-6)  # the bound after its logarithm and back
+    absent = max(least, ABSENT_SHARE * found.value) if about.scale == "log" else 0.0
+    return found.ci95[0] <= absent <= found.ci95[1]
 
 
 def _verdict(naming: Naming) -> Verdict:
+    """The verdict by the evidence against the motor without effects and against the chosen one."""
     if naming.line is not None:
         return "not_in_library"
-    if naming.p_nothing >= ALARM:
+    if naming.p_nothing >= FALSE_ALARM:
         return "none_detected"
-    if naming.p_nothing_more < ALARM and not naming.explained:
+    if naming.p_nothing_more < FALSE_ALARM and not naming.may_be_model_form_error:
         return "not_in_library"
     if not naming.chosen.effects:
         return "not_in_library"
@@ -174,7 +175,7 @@ def _effects(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:
             name,
             EFFECTS[name].equation,
             {f: final.parameters[f"{name}.{f}"] for f in EFFECTS[name].ranges},
-            naming.without[name],
+            naming.p_without[name],
             rivals,
         )
         for name in naming.chosen.effects
@@ -183,33 +184,33 @@ def _effects(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:
 
 def _regions(naming: Naming) -> tuple[Region, ...]:
     """Where the curves of the motor without effects are far from zero, the clearest first; also a line in frequency."""
-    found, line = naming.first, naming.line
+    found, line = naming.base_screen, naming.line
     base = found.evidence.regress().squares
     regions = []
-    for curve, block in zip(found.curves, found.of_curve, strict=True):
-        fit = found.evidence.regress([block])
-        if (
-            log_chance(base - fit.squares, found.evidence.freedom(block)) > np.log(1e-4)
-            or curve.own
-        ):
+    for curve, block in zip(found.curves, found.curve_blocks, strict=True):
+        if curve.per_run:
             continue
-        z = np.array([_alone(found, column) for column in block.columns])
-        regions += _stretches(curve.equation, curve.variable, curve.knots, z)
+        gain = base - found.evidence.regress([block]).squares
+        if log_p_value(gain, found.evidence.degrees_of_freedom(block)) > np.log(1e-4):
+            continue
+        z = np.array([_z_of_column(found, column) for column in block.columns])
+        regions += _regions_of_curve(curve, z)
     if line is not None:
         region = (line.low, line.high)
         regions.append(Region("mechanical", "frequency", region, float(np.sqrt(line.height))))
     return tuple(sorted(regions, key=lambda r: -abs(r.z))[:12])
 
 
-def _alone(found: Screen, column: int) -> float:
+def _z_of_column(found: Screen, column: int) -> float:
     """The misfit at one knot over its standard error; regressed alone, as neighbours would share what they explain."""
     fit = found.evidence.regress([Block((column,))])
     error = float(fit.errors[0][0])
     return float(fit.coefficients[0][0]) / error if error > 0 else 0.0
 
 
-def _stretches(equation: str, variable: str, knots: np.ndarray, z: np.ndarray) -> list[Region]:
-    clear = np.abs(z) > CLEAR
+def _regions_of_curve(curve: Curve, z: np.ndarray) -> list[Region]:
+    """The stretches of neighbouring knots where a curve is clearly different from zero, with one sign."""
+    knots, clear = curve.knots, np.abs(z) > REGION_Z
     regions, first = [], None
     for k in range(len(knots) + 1):
         inside = k < len(knots) and clear[k] and (first is None or z[k] * z[first] > 0)
@@ -217,69 +218,69 @@ def _stretches(equation: str, variable: str, knots: np.ndarray, z: np.ndarray) -
             part = z[first:k]
             peak = float(part[np.argmax(np.abs(part))])
             ends = float(knots[max(first - 1, 0)]), float(knots[min(k, len(knots) - 1)])
-            regions.append(Region(equation, variable, ends, peak))
+            regions.append(Region(curve.equation, curve.variable, ends, peak))
             first = k if k < len(knots) and clear[k] else None
         elif inside and first is None:
             first = k
     return regions
 
 
-def _learned(naming: Naming) -> tuple[LearnedCurve, ...]:
+def _learned_curves(naming: Naming) -> tuple[LearnedCurve, ...]:
     """The curves that the data still show, at most three, the most significant first; none for a line in frequency."""
-    found = naming.last
-    if naming.p_nothing_more >= ALARM:
+    found = naming.chosen_screen
+    if naming.p_nothing_more >= FALSE_ALARM:
         return ()
     base = found.evidence.regress().squares
     learned = []
-    for curve, block in zip(found.curves, found.of_curve, strict=True):
+    for curve, block in zip(found.curves, found.curve_blocks, strict=True):
         # directions that the motor's own parameters can imitate are no part of the curve
-        fit = found.evidence.regress([block], visible=1e-3)
-        chance = log_chance(base - fit.squares, found.evidence.freedom(block))
+        fit = found.evidence.regress([block], min_eigenvalue=1e-3)
+        log_p = log_p_value(base - fit.squares, found.evidence.degrees_of_freedom(block))
         value, error = fit.coefficients[0], fit.errors[0]
-        if curve.own:  # of the run that shows it most clearly
+        if curve.per_run:  # of the run that shows it most clearly
             clearest = np.argmax(np.sum(np.square(value / np.maximum(error, 1e-300)), axis=1))
             value, error = value[clearest], error[clearest]
-        of_data = LearnedCurve(
+        estimated = LearnedCurve(
             curve.equation,
             curve.variable,
-            UNITS[curve.equation],
+            CURVE_UNITS[curve.equation],
             curve.knots,
             curve.values(value),
             curve.errors(error),
-            float(np.exp(chance)),
+            float(np.exp(log_p)),
             curve.reverses,
         )
-        learned.append((chance, of_data))
-    return tuple(of_data for _, of_data in sorted(learned, key=lambda pair: pair[0])[:3])
+        learned.append((log_p, estimated))
+    return tuple(curve for _, curve in sorted(learned, key=lambda pair: pair[0])[:3])
 
 
-def _detectable(found: Screen) -> tuple[Detectable, ...]:
-    """The smallest amplitude of each effect that would have been detected nine times of ten, where one is physical."""
+def _detectable_effects(found: Screen) -> tuple[Detectable, ...]:
+    """The smallest amplitude of each effect that would be detected with a probability of 90 %, if it is physical."""
     count = len(found.candidates) + len(found.curves)
-    needed = stats.norm.isf(ALARM / count / 2) + stats.norm.isf(0.1)
+    needed = stats.norm.isf(FALSE_ALARM / count / 2) + stats.norm.isf(0.1)
     smallest: dict[str, Detectable] = {}
-    for candidate, block in zip(found.candidates, found.of_candidate, strict=True):
+    for candidate, block in zip(found.candidates, found.candidate_blocks, strict=True):
         field = candidate.amplitude
         if field is None:
             continue
         error = float(np.min(found.evidence.regress([block]).errors[0][..., -1]))
-        error *= np.sqrt(found.evidence.gained_by_rounding(block))
-        amplitude = max(float(needed * error * candidate.unit), found.hidden(candidate))
-        before = smallest.get(candidate.effect)
-        if error > 0 and amplitude < (before.amplitude if before else candidate.largest):
+        error *= np.sqrt(found.evidence.rounding_dispersion(block))
+        amplitude = max(float(needed * error * candidate.unit), found.sensor_floor(candidate))
+        known = smallest.get(candidate.effect)
+        if error > 0 and amplitude < (known.amplitude if known else candidate.max_amplitude):
             unit = EFFECTS[candidate.effect].ranges[field].unit
             smallest[candidate.effect] = Detectable(candidate.effect, field, amplitude, unit)
     return tuple(smallest.values())
 
 
-def _gaps(base: Identification, final: Identification, share: float) -> dict[str, Gap]:
+def _gaps_of_runs(base: Identification, final: Identification, share: float) -> dict[str, Gap]:
     """By run, the misfit before and after, over the noise.
 
-    The noise is the final model's residuals in the training runs times `share`, below 1 where part of them is no noise,
-    and at least `MIN_RELATIVE_NOISE` times what was measured; all as root mean squares of each channel.
+    The noise is the final model's residuals in the training runs times `share`, below 1 where part of them is not
+    noise, and at least `MIN_RELATIVE_NOISE` times what was measured; all as root mean squares of each channel.
     """
     noise = {
-        c: max(share * _rms_residual(final, c), MIN_RELATIVE_NOISE * _size(final, c))
+        c: max(share * _rms_residual(final, c), MIN_RELATIVE_NOISE * _rms_signal(final, c))
         for c in ("current", "speed")
     }
 
@@ -300,38 +301,41 @@ def _gaps(base: Identification, final: Identification, share: float) -> dict[str
 
 def _rms_residual(found: Identification, channel: str) -> float:
     """Root mean square of a channel's residuals in the training runs."""
-    return _rms_of_all((getattr(f, f"{channel}_rmse"), len(f.time)) for f in _fitted(found))
+    return _pooled_rms((getattr(f, f"{channel}_rmse"), len(f.time)) for f in _training_runs(found))
 
 
-def _size(found: Identification, channel: str) -> float:
+def _rms_signal(found: Identification, channel: str) -> float:
     """Root mean square of a channel in the training runs."""
-    values = ((getattr(f, channel), len(f.time)) for f in _fitted(found))
-    return _rms_of_all((None if x is None else np.sqrt(np.nanmean(x**2)), n) for x, n in values)
+    values = ((getattr(f, channel), len(f.time)) for f in _training_runs(found))
+    return _pooled_rms((None if x is None else np.sqrt(np.nanmean(x**2)), n) for x, n in values)
 
 
-def _fitted(found: Identification) -> list[RunFit]:
+def _training_runs(found: Identification) -> list[RunFit]:
     return [f for f in found.fit.values() if f.role == "train"]
 
 
-def _rms_of_all(runs: Iterable[tuple[float | None, int]]) -> float:
+def _pooled_rms(runs: Iterable[tuple[float | None, int]]) -> float:
     """Root mean square over several runs, each given by its own and its number of samples; zero if none has any."""
     known = [(rms, samples) for rms, samples in runs if rms is not None]
     samples = sum(n for _, n in known)
     return float(np.sqrt(sum(x * x * n for x, n in known) / samples)) if samples else 0.0
 
 
-def _total(gaps: Mapping[str, Gap], base: Identification) -> dict[Role, Gap]:
-    total: dict[Role, Gap] = {}
+def _gaps_of_roles(gaps: Mapping[str, Gap], base: Identification) -> dict[Role, Gap]:
+    """The gaps of all training runs together, and of all hold-outs: root mean squares over the samples."""
+    gaps_of_roles: dict[Role, Gap] = {}
     for role in ("train", "holdout"):
-        mine = [(gaps[name], len(f.time)) for name, f in base.fit.items() if f.role == role]
-        if mine:
-            weights = np.array([n for _, n in mine], float)
-            squares = np.array([[g.before, g.after, g.floor] for g, _ in mine]) ** 2
-            total[role] = Gap(*(float(x) for x in np.sqrt(weights @ squares / weights.sum())))
-    return total
+        of_role = [(gaps[name], len(f.time)) for name, f in base.fit.items() if f.role == role]
+        if of_role:
+            weights = np.array([n for _, n in of_role], float)
+            squares = np.array([[g.before, g.after, g.floor] for g, _ in of_role]) ** 2
+            pooled = np.sqrt(weights @ squares / weights.sum())
+            gaps_of_roles[role] = Gap(*(float(x) for x in pooled))
+    return gaps_of_roles
 
 
-def _closed(total: Mapping[Role, Gap]) -> float | None:
-    gap = total.get("holdout") or total["train"]
+def _closed_fraction(gaps: Mapping[Role, Gap]) -> float | None:
+    """The share of the gap above its floor, in squares, that the effects close; of the hold-outs if there are any."""
+    gap = gaps.get("holdout") or gaps["train"]
     open_before = gap.before**2 - gap.floor**2
     return (gap.before**2 - gap.after**2) / open_before if open_before > 1e-9 else None

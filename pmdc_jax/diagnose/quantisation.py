@@ -1,6 +1,6 @@
 """Rounding errors of coarse converters, which even a complete model leaves.
 
-They last as long as the reading stands still, so no whitening filter removes them.
+They persist as long as the reading does not change, so no whitening filter removes them.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from ..identify.noise import quantum
 from .model import RunSeries
 
 # Simulated readings, each with the converter's steps at another offset
-READINGS = 8
-# Noise blurs the steps, and rounding errors are white, from residuals of this many steps on (root mean square), or if
-# the measured signal fluctuates from sample to sample this many times as much as the simulated readings, as differences
-# of an encoder's counts do
-BLURRED, RESTLESS = 0.6, 1.5
+ROUNDING_DRAWS = 8
+# Rounding errors are white, as noise blurs the steps, if the residuals are at least this many steps (root mean square),
+# or if the measured signal is this many times as rough as the simulated readings, as differences of an encoder's counts
+# are
+BLURRING_RESIDUAL, BLURRING_ROUGHNESS = 0.6, 1.5
 
 
-def readings(fit: RunSeries, run: int) -> Float[np.ndarray, "samples outputs readings"]:
+def rounding_errors(fit: RunSeries, run: int) -> Float[np.ndarray, "samples outputs draws"]:
     """Rounding errors of converters as coarse as the run's, reading the simulated outputs; zero where noise blurs the
     steps.
 
@@ -28,20 +28,20 @@ def readings(fit: RunSeries, run: int) -> Float[np.ndarray, "samples outputs rea
     """
     random = np.random.default_rng(run)
     known, values = fit.residual.known, fit.simulated.values
-    errors = np.zeros((*values.shape, READINGS))
+    errors = np.zeros((*values.shape, ROUNDING_DRAWS))
     pairs = zip(values.T, fit.residual.values.T, strict=True)
-    for k, (simulated, left) in enumerate(pairs):
-        measured = (simulated + left)[known]
+    for k, (simulated, residual) in enumerate(pairs):
+        measured = (simulated + residual)[known]
         step = quantum(np.diff(measured))
-        if np.mean(np.square(left[known])) >= (BLURRED * step) ** 2:
+        if np.mean(np.square(residual[known])) >= (BLURRING_RESIDUAL * step) ** 2:
             continue
-        exact = simulated[:, None] + step * random.uniform(size=READINGS)
+        exact = simulated[:, None] + step * random.uniform(size=ROUNDING_DRAWS)
         read = step * np.round(exact / step)
-        if _restlessness(measured) < RESTLESS * _restlessness(read[known]):
+        if _roughness(measured) < BLURRING_ROUGHNESS * _roughness(read[known]):
             errors[:, k] = read - exact
     return errors
 
 
-def _restlessness(signals: Float[np.ndarray, "samples *signals"]) -> float:
+def _roughness(signals: Float[np.ndarray, "samples *signals"]) -> float:
     """How much signals fluctuate from sample to sample: the standard deviation of their second differences."""
     return float(np.std(np.diff(signals, 2, axis=0)))

@@ -22,13 +22,14 @@ from ..identify.solve import POOR_FIT, Solved, search_and_refine
 from ..identify.uncertainty import information_of
 from ..progress import ReportProgress
 from ..threads import map_in_threads_until
-from .candidates import TRIALS, Values
+from .candidates import Values
 from .compare import Comparison
-from .effect_relations import CONTAINS, FULLER, spelt_out
+from .effect_relations import CONTAINS, FULLER, with_split_friction
 from .library import Library
 from .model import Model, model_of, refit_from
 from .shortlist import effect_of
 from .signals import Screen, Signal
+from .trials import TRIALS
 
 # Share of the gain promised by the evidence that a refit must realise; otherwise it is fitted in another way
 KEPT = 0.5
@@ -120,7 +121,7 @@ class Refits:
         """Start values, from the fit of the old effect, of one that resembles it or of a simple form never begun."""
         begins = TRIALS[old].alike.get(new)
         if new not in self.begun and new in FULLER and FULLER[new].effect == old:
-            begins = FULLER[new].reduced
+            begins = FULLER[new].to_simple
         if begins is None:
             return {}
         return {new: begins(next(e for e in current.motor.effects if e.name == old))}
@@ -158,7 +159,7 @@ class Refits:
         """The start of a refit with the fuller form of an effect, from the fit of the simple one."""
         fuller = FULLER[effect]
         simple = next(e for e in current.motor.effects if e.name == effect)
-        values = fuller.begun(simple, self.library.scales)
+        values = fuller.from_simple(simple, self.library.scales)
         return self._start(current, effects, {fuller.effect: values})
 
     def without(self, model: Model, effect: str, white: Whitener) -> Model:
@@ -281,7 +282,7 @@ class Refits:
             return None
         values = {candidate.effect: its}
         if "constant_load" in set(effects) - set(current.effects) - {candidate.effect}:
-            values["constant_load"] = {"torque_Nm": current.slanted}
+            values["constant_load"] = {"torque_Nm": current.friction_asymmetry}
         return self._start(current, effects, values, fit.moved, angles)
 
     def _start(
@@ -305,10 +306,10 @@ class Refits:
         before = dict(zip(names, np.asarray(unknowns.coordinates) + near, strict=True))
         for effect, new in values.items():
             self.begun.setdefault(effect, new)
-        coordinates, lost = [], current.lost
+        coordinates, undetermined = [], current.undetermined
         for name, log in zip(parameters.names, parameters.logarithmic, strict=True):
             effect, _, field = name.partition(".")
-            if name in before and not (field and name in lost):
+            if name in before and not (field and name in undetermined):
                 coordinates.append(before[name])
             else:
                 value = values.get(effect, self.begun.get(effect, {}))[field]
@@ -320,11 +321,11 @@ class Refits:
 
 
 def _with_another(here: tuple[str, ...], effect: str) -> tuple[str, ...]:
-    """A set of effects with one more in place of those that it contains: the others in order, those that `spelt_out`
-    puts in, and the new one last."""
+    """A set of effects with one more in place of those that it contains: the others in order, those that
+    `with_split_friction` adds, and the new one last."""
     contains, kept = CONTAINS.get(effect, set()), set(here)
-    if contains & spelt_out(kept):
-        kept = spelt_out(kept) - contains
+    if contains & with_split_friction(kept):
+        kept = with_split_friction(kept) - contains
     return (*(e for e in here if e in kept), *sorted(kept - set(here)), effect)
 
 

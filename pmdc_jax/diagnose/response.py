@@ -1,8 +1,8 @@
 """What an effect would change in the recorded outputs, to first order, along a free run of the motor.
 
-An effect changes the state in which each sample ends: it *kicks* the motor a little at every sample. The linear motor
-propagates the kicks, and their sum is the response: one column of a regression, whose coefficient is the amplitude of
-the effect. No measured signal is ever differentiated.
+An effect changes the state at the end of each sample; this change is its *kick*. The linear motor propagates the kicks,
+and their sum is the response: one column of a regression, whose coefficient is the amplitude of the effect. No measured
+signal is ever differentiated.
 """
 
 from __future__ import annotations
@@ -43,68 +43,68 @@ class Path(NamedTuple):
 def path_of(
     seen: Float[Array, "blocks 2 samples"],
     tape: Tape,
-    begun: Float[Array, " runs"],
-    dry: bool | Array,
+    start_angle: Float[Array, " runs"],
+    can_stick: bool | Array,
 ) -> Path:
     """The path of free runs.
 
-    **Arguments**: `seen`, simulated current in A and speed in rad/s; `begun`, the angle in rad where each run begins;
-    `dry`, whether the motor has friction that can hold the rotor.
+    **Arguments**: `seen`, simulated current in A and speed in rad/s; `start_angle`, the angle in rad where each run
+    begins; `can_stick`, whether the motor has friction that can hold the rotor.
     """
     current, speed = seen[:, 0].T, seen[:, 1].T
     drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid], tape.drive)
     current = drive.voltage * current + drive.current * jnp.asarray(tape.value).T
     step = jnp.asarray(tape.sample_time)[tape.grid][:, None]
     # the turn in a sample is its mean speed times its length
-    ahead = jnp.append(seen[:, 1].reshape(-1)[1:], 0.0).reshape(tape.turn.shape)
-    turn = jnp.where(jnp.isnan(tape.turn), (seen[:, 1] + ahead) / 2 * step, tape.turn)
+    next_speed = jnp.append(seen[:, 1].reshape(-1)[1:], 0.0).reshape(tape.turn.shape)
+    turn = jnp.where(jnp.isnan(tape.turn), (seen[:, 1] + next_speed) / 2 * step, tape.turn)
     before = jnp.append(0.0, jnp.cumsum(turn.reshape(-1))[:-1]).reshape(turn.shape)
     first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
-    angle = before - before[first, :1] + begun[tape.run][:, None]
-    return Path(current, speed, angle.T, (speed == 0) & dry)
+    angle = before - before[first, :1] + start_angle[tape.run][:, None]
+    return Path(current, speed, angle.T, (speed == 0) & can_stick)
 
 
 @compiled
 def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
     """The difference in current and speed between `motor` and `bare` one sample after each point of the path."""
-    after = _one_sample(motor, tape, path)
-    without = _one_sample(bare, tape, path)
+    after = _after_one_sample(motor, tape, path)
+    without = _after_one_sample(bare, tape, path)
     return jnp.stack([after.current - without.current, after.speed - without.speed], 1)
 
 
 @compiled
-def sensed(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
+def sensor_changes(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
     """The difference between what the sensors of `motor` and those of `bare` report of the path."""
-    return _seen_on(motor, tape, path) - _seen_on(bare, tape, path)
+    return _sensor_outputs(motor, tape, path) - _sensor_outputs(bare, tape, path)
 
 
 @compiled  # one trace of the bare motor serves all effects
-def _seen_on(motor: Motor, tape: Tape, path: Path) -> Outputs:
+def _sensor_outputs(motor: Motor, tape: Tape, path: Path) -> Outputs:
     """What the motor's sensors report of the path."""
-    along, acting = _of_blocks(motor, tape)
+    propagator, inputs = _propagator_and_inputs(motor, tape)
     state, steps = _states(motor, tape, path), steps_in_sample(motor, tape)
     mean = None
-    if along.mean is not None:
-        _, mean = held_step_and_mean(motor, along, acting, state, steps)
-    seen = outputs(motor, along, acting, state, steps, mean)
-    return _reported_in_time(motor, tape, jnp.moveaxis(seen, 0, 1))
+    if propagator.mean is not None:
+        _, mean = held_step_and_mean(motor, propagator, inputs, state, steps)
+    seen = outputs(motor, propagator, inputs, state, steps, mean)
+    return _reported_samples_first(motor, tape, jnp.moveaxis(seen, 0, 1))
 
 
-def _reported_in_time(
+def _reported_samples_first(
     motor: Motor, tape: Tape, seen: Float[Array, "samples outputs blocks"]
 ) -> Outputs:
-    """What the motor reports (`reported`) of outputs whose axes are in another order."""
+    """What the motor reports (`reported`) of outputs whose first axis is the samples."""
     return reported(motor, tape, seen.transpose(2, 1, 0)).transpose(2, 1, 0)
 
 
 @compiled
-def pushes(motor: Motor, tape: Tape) -> tuple[Outputs, Outputs]:
+def input_gains(motor: Motor, tape: Tape) -> tuple[Outputs, Outputs]:
     """The change of current and speed within one sample by 1 V, and by a torque of 1 N m that opposes motion."""
-    along, _ = _of_blocks(motor, tape)
+    propagator, _ = _propagator_and_inputs(motor, tape)
     ones = jnp.ones((tape.value.shape[1], 1, 1))
-    assert along.inputs is not None, "an effect would need a step of its own"
+    assert propagator.inputs is not None, "an effect would need a step of its own"
     voltage = jnp.asarray(tape.drive.voltage)[tape.grid]
-    return ones * along.inputs[:, 0, 0] * voltage, ones * along.inputs[:, 1, 0]
+    return ones * propagator.inputs[:, 0, 0] * voltage, ones * propagator.inputs[:, 1, 0]
 
 
 @compiled
@@ -116,52 +116,54 @@ def respond(
 ) -> Float[Array, "samples 2 blocks columns"]:
     """The response of the linear `motor` to the kicks of every column, in current and speed.
 
-    Blocks are simulated side by side from zero; then the state at the end of each is carried on into the next.
+    Blocks are simulated in parallel from zero; then the state at the end of each is carried on into the next.
     """
-    along, _ = _of_blocks(motor, tape)
-    whole = along.transition[:, :, 0]
+    propagator, _ = _propagator_and_inputs(motor, tape)
+    transition = propagator.transition[:, :, 0]
 
     def step(
         x: Columns,
         sample: tuple[Float[Array | np.ndarray, "2 blocks columns"], Float[Array, " blocks"]],
     ) -> tuple[Columns, Columns]:
         kick, held = sample
-        after = jnp.einsum("ijb,jbc->ibc", whole, x) + kick
+        after = jnp.einsum("ijb,jbc->ibc", transition, x) + kick
         # a rotor that sticks keeps no change of speed
         return after.at[1].multiply(1.0 - held[:, None]), x
 
     stuck = path.held.astype(kicks.dtype)
     zero = jnp.zeros(kicks.shape[1:])
-    end, driven = jax.lax.scan(step, zero, (kicks, stuck))
+    end, forced = jax.lax.scan(step, zero, (kicks, stuck))
     basis = jnp.broadcast_to(jnp.eye(2)[:, None, :], (2, kicks.shape[2], 2))
-    through, free = jax.lax.scan(step, basis, (jnp.zeros((*kicks.shape[:3], 2)), stuck))
+    free_end, free = jax.lax.scan(step, basis, (jnp.zeros((*kicks.shape[:3], 2)), stuck))
 
-    def follow(
+    def next_block(
         start: Float[Array, "2 columns"],
         block: tuple[Bool[Array, ""], Float[Array, "2 2"], Float[Array, "2 columns"]],
     ) -> tuple[Float[Array, "2 columns"], Float[Array, "2 columns"]]:
-        begins, passed, own = block
+        begins, block_transition, forced_end = block
         start = jnp.where(begins, 0.0, start)
-        return passed @ start + own, start
+        return block_transition @ start + forced_end, start
 
-    blocks = (jnp.asarray(tape.begins), through.transpose(1, 0, 2), end.transpose(1, 0, 2))
-    starts = jax.lax.scan(follow, jnp.zeros((2, kicks.shape[3])), blocks)[1]
-    response = driven + jnp.einsum("sibj,bjc->sibc", free, starts)
-    if along.mean is None:
+    blocks = (jnp.asarray(tape.begins), free_end.transpose(1, 0, 2), end.transpose(1, 0, 2))
+    starts = jax.lax.scan(next_block, jnp.zeros((2, kicks.shape[3])), blocks)[1]
+    response = forced + jnp.einsum("sibj,bjc->sibc", free, starts)
+    if propagator.mean is None:
         return response
     # a kick builds up evenly over its sample: half of it is in the mean
-    mean = jnp.einsum("jsb,sjbc->sbc", along.mean.transition[1], response) + kicks[:, 1] / 2
+    transition_of_mean = propagator.mean.transition[1]
+    mean = jnp.einsum("jsb,sjbc->sbc", transition_of_mean, response) + kicks[:, 1] / 2
     moving = mean * (1.0 - stuck[:, :, None])
     seen = jnp.concatenate([response, moving[:, None]], 1)
-    return jax.vmap(partial(_reported_in_time, motor, tape), in_axes=-1, out_axes=-1)(seen)
+    report = partial(_reported_samples_first, motor, tape)
+    return jax.vmap(report, in_axes=-1, out_axes=-1)(seen)
 
 
-def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Input]:
+def _propagator_and_inputs(motor: Motor, tape: Tape) -> tuple[Propagator, Input]:
     """The propagator of every block, and the inputs that act there, broadcast to (samples, blocks)."""
-    along, drive = pick_grid(grid_propagators(motor, tape), tape, tape.grid)
+    propagator, drive = pick_grid(grid_propagators(motor, tape), tape, tape.grid)
     samples = tape.value.shape[1]
 
-    def spread(leaf: Float[Array, "blocks ..."]) -> Float[Array, "... samples blocks"]:
+    def broadcast(leaf: Float[Array, "blocks ..."]) -> Float[Array, "... samples blocks"]:
         blocks_last = jnp.moveaxis(leaf, 0, -1)[..., None, :]
         return jnp.broadcast_to(
             blocks_last, (*blocks_last.shape[:-2], samples, blocks_last.shape[-1])
@@ -169,13 +171,15 @@ def _of_blocks(motor: Motor, tape: Tape) -> tuple[Propagator, Input]:
 
     value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T
     rise = None if tape.rise is None else jnp.asarray(tape.rise).T
-    return jax.tree.map(spread, along), Input(drive, value, load, rise)
+    return jax.tree.map(broadcast, propagator), Input(drive, value, load, rise)
 
 
 @compiled  # one trace of the bare motor serves all effects
-def _one_sample(motor: Motor, tape: Tape, path: Path) -> State:
-    along, acting = _of_blocks(motor, tape)
-    return held_step(motor, along, acting, _states(motor, tape, path), steps_in_sample(motor, tape))
+def _after_one_sample(motor: Motor, tape: Tape, path: Path) -> State:
+    """The motor's states one sample after each point of the path."""
+    propagator, inputs = _propagator_and_inputs(motor, tape)
+    states, steps = _states(motor, tape, path), steps_in_sample(motor, tape)
+    return held_step(motor, propagator, inputs, states, steps)
 
 
 # Whether a run begins, the effects' initial states, current, speed, value of the drive, load, and index of the block
@@ -188,20 +192,23 @@ def _states(motor: Motor, tape: Tape, path: Path) -> State:
     start = motor.initial_state(path.current, path.speed, load, path.angle)
     if not set(motor.states) - {"angle"}:
         return start
-    (along, acting), steps = _of_blocks(motor, tape), steps_in_sample(motor, tape)
+    propagator, inputs = _propagator_and_inputs(motor, tape)
+    steps = steps_in_sample(motor, tape)
     begins = jnp.zeros(load.shape, bool).at[0].set(tape.begins)
 
     def advance(extra: Extra, sample: OfSample) -> tuple[Extra, Extra]:
-        begins, rest, current, speed, value, load, block = sample
-        extra = jax.tree.map(lambda new, old: jnp.where(begins, new, old), rest, extra)
-        here = jax.tree.map(lambda leaf: leaf[..., 0, block], along)
-        drive = jax.tree.map(lambda share: share[block], acting.drive)
+        begins, initial, current, speed, value, load, block = sample
+        extra = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, extra)
+        block_propagator = jax.tree.map(lambda leaf: leaf[..., 0, block], propagator)
+        drive = jax.tree.map(lambda share: share[block], inputs.drive)
         state = State(current, speed, extra)
-        return held_step(motor, here, Input(drive, value, load), state, steps).extra, extra
+        return held_step(
+            motor, block_propagator, Input(drive, value, load), state, steps
+        ).extra, extra
 
     block = jnp.broadcast_to(jnp.arange(load.shape[1]), load.shape)
-    samples = (begins, start.extra, path.current, path.speed, acting.value, load, block)
+    samples = (begins, start.extra, path.current, path.speed, inputs.value, load, block)
     in_time = jax.tree.map(lambda x: x.T.reshape(-1), samples)
-    nothing = jax.tree.map(lambda x: 0.0 * x[0], in_time[1])
-    extra = jax.lax.scan(advance, nothing, in_time)[1]
+    zero = jax.tree.map(lambda x: 0.0 * x[0], in_time[1])
+    extra = jax.lax.scan(advance, zero, in_time)[1]
     return start._replace(extra=jax.tree.map(lambda x: x.reshape(load.shape[::-1]).T, extra))

@@ -1,4 +1,4 @@
-"""How sure the chosen set of effects is: other sets that do as well, and the likelihood ratio without each effect."""
+"""Confidence in the chosen effects: other sets that are as good, and the likelihood ratio without each effect."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from scipy import stats
 
 from ..effects import EFFECTS
 from ..identify.noise_model import Whitener
-from .assessment import ALARM, Assessment
-from .compare import MARGIN, Comparison
+from .assessment import FALSE_ALARM, Assessment
+from .compare import BIC_MARGIN, Comparison
 from .effect_relations import FULLER, are_rivals
 from .model import Model
 from .refits import Refits
 
 # A fuller form of an effect is ruled out if it leaves so many more squares, in noise variances: two standard errors
 RULED_OUT = 4.0
-# Share of what the chosen set does not explain that widens the margin within which rivals are not told apart
-OF_UNEXPLAINED = 0.1
+# Share of what the chosen set does not explain that widens the margin within which other sets are rivals
+UNEXPLAINED_SHARE = 0.1
 
 
 def rivals_of(
@@ -27,25 +27,26 @@ def rivals_of(
     models = [chosen, *(m for m in refits.models.values() if m.is_possible)]
     ranked = comparison.ranked(models, white)
     least = next(f.criterion for f in ranked if f.model is chosen)
-    margin = MARGIN + (OF_UNEXPLAINED * found.clearest.gain if found.p_value < ALARM else 0.0)
+    unexplained = found.clearest.gain if found.p_value < FALSE_ALARM else 0.0
+    margin = BIC_MARGIN + UNEXPLAINED_SHARE * unexplained
     near = [f.model for f in ranked if f.criterion < least + margin]
     rivals = [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]
-    # the fuller form clearly there: a free fit would fall back on the simple form where the runs show too little
+    # with the fuller form held clearly present: a free fit would return to the simple form where the runs show little
     simple = [effect for effect in chosen.effects if effect in FULLER]
     fuller = [refits.clearly_in_full(chosen, white, effect) for effect in simple]
-    enough = comparison.fitted(chosen, white).squares + RULED_OUT
-    return rivals + [m for m in fuller if comparison.fitted(m, white).squares < enough]
+    limit = comparison.fitted(chosen, white).squares + RULED_OUT
+    return rivals + [m for m in fuller if comparison.fitted(m, white).squares < limit]
 
 
-def chances_without(
+def p_values_without(
     chosen: Model, white: Whitener, refits: Refits, comparison: Comparison
 ) -> dict[str, float]:
     """By effect of the chosen set, the p-value of the runs without it: a likelihood-ratio test, chi-squared with one
     degree of freedom for each of the effect's parameters."""
-    chances = {}
+    p_values = {}
     for effect in chosen.effects:
         smaller = refits.without(chosen, effect, white)
         squares = {f.model.effects: f.squares for f in comparison.ranked([chosen, smaller], white)}
         gain = squares[smaller.effects] - squares[chosen.effects]
-        chances[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
-    return chances
+        p_values[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
+    return p_values

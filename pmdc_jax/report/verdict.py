@@ -16,7 +16,7 @@ from ..diagnose.diagnosis import (
     unlike_held_out,
     worse_held_out,
 )
-from ..diagnose.effect_relations import CONTAINS, unbalances
+from ..diagnose.effect_relations import CONTAINS, unbalanced_equation
 from ..identify.identification import Estimate, Role, RunFit
 from .notation import (
     effect_words,
@@ -229,7 +229,7 @@ def _equation_and_variable(region: Region) -> tuple[str, str]:
 
 def _disagreement_sentence(diagnosis: Diagnosis) -> str:
     # parameters that compensate for what is missing make the other equation disagree, too: leave that out
-    of = {unbalances(effect.equation) for effect in diagnosis.effects}
+    of = {unbalanced_equation(effect.equation) for effect in diagnosis.effects}
     regions = [region for region in diagnosis.where if region.equation in of] or diagnosis.where
     return f"Simulation and measurement disagree {disagreement(regions, diagnosis.base.fit)}."
 
