@@ -120,6 +120,11 @@ def test_more_than_noise_is_said_to_be_left():
     """By itself a named effect promises that its formula is nature's."""
     assert not any("another formula" in s for s in verdict_sentences(named()))
     assert any("another formula" in s for s in verdict_sentences(named(leaves_noise=False)))
+    angle, ripple = np.linspace(0, 2 * np.pi / 14, 9), 0.01 * np.sin(np.linspace(0, 2 * np.pi, 9))
+    curve = LearnedCurve("sensor", "angle", "", angle, ripple, 0.1 * ripple, 1e-9, False)
+    sentences = verdict_sentences(named(leaves_noise=False, curves=(curve,)))
+    assert any("oscillates 14.0 times per turn" in s for s in sentences)
+    assert not any("another formula" in s for s in sentences)
 
 
 def test_a_named_effect_in_words():

@@ -105,7 +105,8 @@ class Diagnosis:
     # of the gap, in squares, on hold-outs where there are any; None without effects or gap
     closed_fraction: float | None
     next_experiment: NextExperiment | None  # for the verdict "ambiguous", where a run was found
-    curves: tuple[LearnedCurve, ...]  # what is left, for the verdict "not_in_library"
+    # what is left, for the verdict "not_in_library" or where it is a ripple of the speed sensor
+    curves: tuple[LearnedCurve, ...]
     detectable: tuple[Detectable, ...]
     base: Identification  # without effects
     final: Identification  # with the effects that were found

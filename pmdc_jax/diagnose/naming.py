@@ -62,6 +62,7 @@ class Naming(NamedTuple):
     p_nothing: float  # p-value of the evidence if nothing were missing
     p_nothing_more: float  # p-value of what is left if nothing more were missing
     may_be_model_form_error: bool  # what is left, of the chosen effects
+    leaves_sensor_ripple: bool  # whether what is left is most like that
     # root mean square of the chosen one's residuals beyond all curves, over that of all; 1 if nothing more is missing
     noise_share: float
     p_without: dict[str, float]  # by effect of the chosen model: p-value of the data without it
@@ -247,6 +248,7 @@ class StepwiseSelection:
             p_nothing=base.p_value,
             p_nothing_more=found.p_value,
             may_be_model_form_error=found.may_be_model_form_error(current),
+            leaves_sensor_ripple=more_missing and found.is_sensor_ripple(),
             noise_share=np.sqrt(share_beyond_curves(found.screen)) if more_missing else 1.0,
             p_without=p_values_without(current, found.screen.white, self.refits, self.comparison),
             final_fit=final_fit(current, self.comparison.filter_of(current)),

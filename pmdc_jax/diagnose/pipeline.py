@@ -93,6 +93,7 @@ def diagnose(
     gaps_of_roles = _gaps_of_roles(gaps, base)
     if unlike_held_out(gaps_of_roles):
         verdict = "not_in_library"
+    curves_tell_more = verdict == "not_in_library" or naming.leaves_sensor_ripple
     seconds = {
         "identify": identified - began,
         "name": named - identified,
@@ -107,7 +108,7 @@ def diagnose(
         gap_of_run=gaps,
         closed_fraction=_closed_fraction(gaps_of_roles) if naming.chosen.effects else None,
         next_experiment=next_experiment(naming, given.training) if verdict == "ambiguous" else None,
-        curves=_learned_curves(naming) if verdict == "not_in_library" else (),
+        curves=_learned_curves(naming) if curves_tell_more else (),
         detectable=_detectable_effects(naming.chosen_screen),
         base=base,
         final=final,

@@ -315,6 +315,8 @@ def _gap_sentence(diagnosis: Diagnosis) -> str:
 def _formula_sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.leaves_noise or not diagnosis.effects:
         return ""
+    if diagnosis.curves:
+        return f"Not only noise is left. {_curve_sentence(diagnosis.curves[0])}"
     return (
         "The remaining error is small compared with the effect, but exceeds the noise: as much as another formula of"
         " the same effect would leave. The intervals do not cover it."
