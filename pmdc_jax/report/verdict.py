@@ -109,7 +109,9 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
         sentences.append("Something is missing that no effect of the library explains.")
     if diagnosis.curves:
         sentences.append(_curve_sentence(diagnosis.curves[0]))
-    if diagnosis.breaks_electrical_equation:
+    # a misread speed leaves the electrical equation unbalanced, too
+    misread = any(curve.equation == "sensor" for curve in diagnosis.curves[:1])
+    if diagnosis.breaks_electrical_equation and not misread:
         sentences.append(
             "From sample to sample the current deviates from the prediction by voltage and speed by"
             f" {significant(diagnosis.electrical_misfit)} times what the sensor noise explains, which no torque"
