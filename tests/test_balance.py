@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from paper_bench import PAPER, recording_of
 from scipy.signal import lfilter
 
 from benchmarks import virtual_bench as vb
-from pmdc_jax import Recording
 from pmdc_jax.diagnose.balance import electrical_misfit
 from pmdc_jax.diagnose.diagnosis import MAX_ELECTRICAL
 from pmdc_jax.diagnose.model import Model, model_of
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.solve import solve
-from pmdc_jax.motor import PARAMETERS
 
-MOTOR = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS} | {"brush_drop_V": 0.6}
+MOTOR = PAPER | {"brush_drop_V": 0.6}
 SLOW_TORQUE = vb.Noise(0.1, 0.5, torque_Nm=0.05, torque_correlation_s=0.3)
 
 
@@ -33,11 +32,9 @@ def fitted(current_mean_samples: int = 1, voltage_noise: float = 0.0) -> Model:
             vb.BenchMotor(**MOTOR), excitation._replace(voltage=applied), rng, SLOW_TORQUE
         )
         columns["voltage_V"] = excitation.voltage
-        time, voltage, current, speed = (
-            columns[q] for q in ("time_s", "voltage_V", "current_A", "speed_rad_s")
-        )
-        current = lfilter(np.ones(current_mean_samples) / current_mean_samples, 1.0, current)
-        runs.append(Recording(name, time, voltage, current, speed, columns["load_torque_Nm"]))
+        average = np.ones(current_mean_samples) / current_mean_samples
+        columns["current_A"] = lfilter(average, 1.0, columns["current_A"])
+        runs.append(recording_of(name, columns))
     given = prepare(runs, (), effects=[EFFECTS["brush_voltage_drop"]])
     given, solved = solve(given, "cma_es", 0)
     return model_of(("brush_voltage_drop",), given, solved.fit)

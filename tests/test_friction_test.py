@@ -7,6 +7,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from paper_bench import recording_of
 from scipy.signal import lsim
 
 from benchmarks import virtual_bench as vb
@@ -33,8 +34,7 @@ def recorded(coulomb_Nm: float, seed: int, **torque_noise: float) -> list[Record
     found = []
     for name, driven in runs.items():
         columns = vb.record(motor, driven, rng, noise)
-        signals = (columns[q] for q in ("time_s", "voltage_V", "current_A", "speed_rad_s"))
-        found.append(Recording(name, *signals, load=columns["load_torque_Nm"]))
+        found.append(recording_of(name, columns))
     return found
 
 

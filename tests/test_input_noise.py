@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from paper_bench import recording_of
 from scipy.signal import cont2discrete
 
 from benchmarks import virtual_bench as vb
@@ -52,10 +53,8 @@ def recorded(applied_noise: float, sensor_noise: float) -> list[Recording]:
             voltage=excitation.voltage + applied_noise * noise(rng, excitation)
         )
         columns = vb.record(vb.paper_motor(), driven, rng, vb.Noise(0.1, 0.5))
-        seen = columns["voltage_V"] + sensor_noise * noise(rng, excitation)
-        names = ("time_s", "current_A", "speed_rad_s")
-        time, current, speed = (columns[n] for n in names)
-        found.append(Recording(name, time, seen, current, speed, load=columns["load_torque_Nm"]))
+        columns["voltage_V"] = columns["voltage_V"] + sensor_noise * noise(rng, excitation)
+        found.append(recording_of(name, columns))
     return found
 
 
