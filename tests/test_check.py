@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from attrs import evolve
-from scipy.linalg import expm
+from paper_bench import exact_step
 
 from pmdc_jax.check import check
 from pmdc_jax.plausibility import speed_of
@@ -20,15 +20,12 @@ EXCITATIONS = ("steps", "prbs", "staircase", "triangle", "load_cycles", "spin_up
 
 def simulate(motor, dt, voltage, load, coulomb=0.0):
     """Current and speed of a motor by the exact step between samples, from rest."""
-    R, L, Kb, Kt, J, f = motor
-    A = np.array([[-R / L, -Kb / L], [Kt / J, -f / J]])
-    B = np.array([[1 / L, 0.0], [0.0, -1 / J]])
-    step = expm(np.block([[A, B], [np.zeros((2, 4))]]) * dt)
+    A, B = exact_step(motor, dt)
     state, states = np.zeros(2), []
     for v, torque in zip(voltage, load, strict=True):
         states.append(state)
-        state = step[:2, :2] @ state + step[:2, 2:] @ [v, torque]
-        slowed = abs(state[1]) - dt * coulomb / J
+        state = A @ state + B @ [v, torque]
+        slowed = abs(state[1]) - dt * coulomb / motor["J"]
         state = np.array([state[0], np.sign(state[1]) * max(slowed, 0.0)])
     return np.array(states).T
 
@@ -59,7 +56,8 @@ def good_run(seed, kind=None, samples=3000, noise=None, coulomb=None):
     R, Kb = 10 ** rng.uniform(-1, 1), 10 ** rng.uniform(-2, np.log10(0.5))
     mechanical = 10 ** rng.uniform(-1.7, -0.3)
     J = mechanical * Kb**2 / R
-    motor = (R, R * mechanical * 10 ** rng.uniform(-2.5, -0.8), Kb, Kb, J, 0.03 * Kb**2 / R)
+    L, f = R * mechanical * 10 ** rng.uniform(-2.5, -0.8), 0.03 * Kb**2 / R
+    motor = {"R": R, "L": L, "Kb": Kb, "Kt": Kb, "J": J, "f": f}
     settle = int(10 ** rng.uniform(1, 2.3))
     dt = mechanical / settle
     rated = Kb * 24 / R
@@ -317,7 +315,8 @@ def test_a_blocked_shaft_gives_a_warning():
 def test_slow_sampling_is_noted():
     found = check([good_run(0, "steps")]), check([good_run(5, "steps", samples=3000)])
     assert all(isinstance(findings, tuple) for findings in found)
-    motor, count = (1.0, 1e-5, 0.05, 0.05, 1e-4, 1e-6), 2000
+    motor = {"R": 1.0, "L": 1e-5, "Kb": 0.05, "Kt": 0.05, "J": 1e-4, "f": 1e-6}
+    count = 2000
     voltage = 12.0 * (np.arange(count) // 200 % 2)
     i, w = simulate(motor, 1e-3, voltage, np.zeros(count))
     (note,) = check([Recording("slow", np.arange(count) * 1e-3, voltage, i, w)])

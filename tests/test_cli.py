@@ -31,7 +31,7 @@ def replace_function(monkeypatch, module: str, name: str, function) -> None:
 
 
 @pytest.fixture
-def faked(monkeypatch, tmp_path):
+def faked(monkeypatch, tmp_path, no_terminal):
     """Fakes of reading, identifying, diagnosing and saving, which store their arguments."""
     calls = SimpleNamespace(identify=None, read=[], saved=[], result=fake_identification(400))
     calls.diagnosis = named()
@@ -58,8 +58,6 @@ def faked(monkeypatch, tmp_path):
     replace_function(monkeypatch, "pmdc_jax.diagnose", "diagnose", diagnose)
     replace_function(monkeypatch, "pmdc_jax.recording_file", "read_recording", read_recording)
     replace_function(monkeypatch, "pmdc_jax.motor_file", "save_motor", save_motor)
-    for variable in ("FORCE_COLOR", "TTY_COMPATIBLE"):  # rich takes these for a terminal
-        monkeypatch.delenv(variable, raising=False)
     monkeypatch.chdir(tmp_path)
     return calls
 
