@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from paper_bench import PAPER, recording_of
+from linear_motor import PAPER
 from scipy.signal import lfilter
 
 from benchmarks import virtual_bench as vb
+from experiments.bench import recording
 from pmdc_jax.diagnose.balance import electrical_misfit
 from pmdc_jax.diagnose.diagnosis import MAX_ELECTRICAL
 from pmdc_jax.diagnose.model import Model, model_of
@@ -34,7 +35,7 @@ def fitted(current_mean_samples: int = 1, voltage_noise: float = 0.0) -> Model:
         columns["voltage_V"] = excitation.voltage
         average = np.ones(current_mean_samples) / current_mean_samples
         columns["current_A"] = lfilter(average, 1.0, columns["current_A"])
-        runs.append(recording_of(name, columns))
+        runs.append(recording(name, columns))
     given = prepare(runs, (), effects=[EFFECTS["brush_voltage_drop"]])
     given, solved = solve(given, "cma_es", 0)
     return model_of(("brush_voltage_drop",), given, solved.fit)

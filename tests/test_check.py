@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from attrs import evolve
-from paper_bench import exact_step
+from linear_motor import exact_step
 
 from pmdc_jax.check import check
 from pmdc_jax.plausibility import speed_of

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from paper_bench import PAPER, exact_step, state_space
+from linear_motor import PAPER, exact_step, state_space
 from scipy.optimize import brentq
 
 from pmdc_jax import InputError

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from attrs import evolve
-from paper_bench import PAPER, recording_of
+from linear_motor import PAPER
 from scipy import stats
 
 from benchmarks import virtual_bench as vb
+from experiments.bench import recording
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import naming
 from pmdc_jax.diagnose.assessment import Assessment
@@ -656,7 +657,7 @@ def test_effects_that_need_a_current_are_not_tried_without_one(x64):
     """Voltage and speed alone do not determine the scale of the current."""
     rng = np.random.default_rng(7)
     columns = vb.record(vb.BenchMotor(**PAPER), vb.prbs(rng, 2.0), rng, vb.Noise())
-    run = evolve(recording_of("no current", columns), current=None, load=None)
+    run = evolve(recording("no current", columns), current=None, load=None)
     given = prepare([run], [], unloaded=True)
     coordinates = jnp.log(jnp.asarray([PAPER[n] for n in PARAMETERS]))
     start = Unknowns(coordinates, RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1))))

@@ -7,11 +7,12 @@ from importlib import resources
 import attrs
 import numpy as np
 import pytest
-from paper_bench import PAPER, recording_of
+from linear_motor import PAPER
 
 from benchmarks import virtual_bench as vb
 from benchmarks.naming.cases import Bench, record
 from benchmarks.naming.plant import Plant
+from experiments.bench import recording
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import diagnose
 from pmdc_jax.recording_file import read_recording
@@ -30,7 +31,7 @@ def recorded(motor: vb.BenchMotor, seed: int, noise: vb.Noise) -> list[Recording
     """Runs of the virtual bench, which shares no code with the package."""
     rng = np.random.default_rng(seed)
     return [
-        recording_of(name, vb.record(motor, excitation, rng, noise))
+        recording(name, vb.record(motor, excitation, rng, noise))
         for name, excitation in excitations(rng).items()
     ]
 
@@ -127,7 +128,7 @@ def test_a_voltage_quantised_to_ten_bits_is_not_diagnosed_as_a_dead_zone():
     }.items():
         columns = vb.record(vb.BenchMotor(**PAPER), driven, rng, vb.Noise(0.05, 0.2))
         columns["voltage_V"] = bit * np.trunc(columns["voltage_V"] / bit)
-        runs.append(recording_of(name, columns))
+        runs.append(recording(name, columns))
     assert diagnose(runs).verdict == "none_detected"
 
 
@@ -160,7 +161,7 @@ def recorded_from(plant: Plant, seed: int, noise: vb.Noise) -> list[Recording]:
     """Runs of the naming benchmark's plant, which has more effects."""
     rng = np.random.default_rng(seed)
     return [
-        recording_of(name, record(plant, excitation, rng, noise, Bench({})))
+        recording(name, record(plant, excitation, rng, noise, Bench({})))
         for name, excitation in excitations(rng).items()
     ]
 
@@ -219,7 +220,7 @@ def test_effects_that_are_equivalent_in_the_given_runs_are_rivals():
     for name in ("first", "second", "third"):
         excitation = vb.prbs(rng, 2.0, offset=12.0, hold=0.03)
         columns = record(plant, excitation, rng, NOISE, Bench({}))
-        runs.append(attrs.evolve(recording_of(name, columns), current=None, load=None))
+        runs.append(attrs.evolve(recording(name, columns), current=None, load=None))
     found = diagnose(runs[:2], runs[2:], unloaded=True)
     assert found.verdict == "ambiguous"
     chosen = {effect.name for effect in found.effects}
@@ -246,7 +247,7 @@ def test_stribeck_friction_of_a_rotor_that_sticks_for_long_is_named():
     load = np.repeat(rng.uniform(-0.018, 0.018, 10), len(excitation.time) // 10)
     noise = vb.Noise(current_A=0.019, speed_rad_s=1.05)
     columns = record(plant, excitation._replace(load=load), rng, noise, Bench({}))
-    found = diagnose([recording_of("staircase", columns)])
+    found = diagnose([recording("staircase", columns)])
     assert found.verdict == "named"
     (effect,) = found.effects
     assert effect.name == "stribeck_friction"
@@ -270,7 +271,7 @@ def test_a_load_that_exceeds_friction_is_named_with_it():
     }.items():
         excitation, bench = vb.Excitation(time, voltage, 0 * time), Bench({}, encoder_lines=256)
         columns = record(plant, excitation, rng, vb.Noise(0.01, 0.0), bench)
-        runs.append(attrs.evolve(recording_of(name, columns), load=None))
+        runs.append(attrs.evolve(recording(name, columns), load=None))
     found = diagnose(runs, unloaded=True, tie=[("Kt", "Kb")])
     assert found.verdict == "named"
     by_name = {effect.name: effect.parameters["torque_Nm"].value for effect in found.effects}

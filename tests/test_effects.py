@@ -14,7 +14,7 @@ import numpy as np
 import pint
 import pytest
 from attrs import evolve
-from paper_bench import PAPER
+from linear_motor import PAPER
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 
 from benchmarks import virtual_bench as vb

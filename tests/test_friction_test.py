@@ -7,10 +7,10 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from paper_bench import recording_of
 from scipy.signal import lsim
 
 from benchmarks import virtual_bench as vb
+from experiments.bench import recording
 from pmdc_jax import Motor, identify
 from pmdc_jax.identify.friction_test import (
     MissingFriction,
@@ -34,7 +34,7 @@ def recorded(coulomb_Nm: float, seed: int, **torque_noise: float) -> list[Record
     found = []
     for name, driven in runs.items():
         columns = vb.record(motor, driven, rng, noise)
-        found.append(recording_of(name, columns))
+        found.append(recording(name, columns))
     return found
 
 

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from paper_bench import recording_of
 from scipy.integrate import cumulative_simpson
 from scipy.signal import lfilter, lsim
 
 from benchmarks import virtual_bench as vb
 from benchmarks.naming.plant import Plant, simulate
+from experiments.bench import recording
 from pmdc_jax import InputError, identify
 from pmdc_jax.control.spread import drawn_motors
 from pmdc_jax.effects import EFFECTS
@@ -59,7 +59,7 @@ def light_and_loaded(seed: int, motor=PAPER, step=1e-3, noise=NOISE, **known) ->
     light = vb.prbs(rng, duration, step, hold=10 * step)
     loaded = vb.loaded(rng, duration, step, hold=duration / 16)
     return [
-        recording_of(name, vb.record(motor, excitation, rng, noise, **known))
+        recording(name, vb.record(motor, excitation, rng, noise, **known))
         for name, excitation in (("light", light), ("loaded", loaded))
     ]
 
@@ -69,7 +69,7 @@ def unloaded(seed: int, motor=PAPER) -> list[Recording]:
     rng = np.random.default_rng(seed)
     excitations = {"first": vb.prbs(rng, 1.0), "second": vb.prbs(rng, 1.0, offset=-4.0)}
     return [
-        recording_of(name, vb.record(motor, e, rng, NOISE, load_known=False))
+        recording(name, vb.record(motor, e, rng, NOISE, load_known=False))
         for name, e in excitations.items()
     ]
 
@@ -315,7 +315,7 @@ def test_current_and_speed_identify_the_mechanical_half():
     for name, load in (("a", 0.6), ("b", 0.9)):
         excitation = vb.drive(rng, (SAMPLES + cut) * 5e-4, 5e-4, load=load)
         columns = vb.record(PAPER, excitation, rng, replace(NOISE, current_A=0.02))
-        smooth = recording_of(name, {q: values[cut:] for q, values in columns.items()})
+        smooth = recording(name, {q: values[cut:] for q, values in columns.items()})
         runs.append(attrs.evolve(smooth, voltage=None))
     result = identify(runs)
     assert_accurate(result, PAPER, ("Kt", "J"), percent=1.0)
@@ -623,7 +623,7 @@ def test_the_rotor_angle_is_that_of_the_true_speed_not_of_a_slow_sensor(x64, sen
         reported = lsim(([1.0], [delay, 1.0]), speed - speed[0], time)[1] + speed[0]
     else:
         reported = np.interp(time - delay, time, speed)
-    run = attrs.evolve(recording_of("slow", truth), speed=reported)
+    run = attrs.evolve(recording("slow", truth), speed=reported)
     kinds = [EFFECTS[sensor], EFFECTS["cogging_torque"]]
     given = prepare([run], []).with_effects(kinds)
     parameters = given.problem.parameters

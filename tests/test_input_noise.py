@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from paper_bench import recording_of
 from scipy.signal import cont2discrete
 
 from benchmarks import virtual_bench as vb
+from experiments.bench import recording
 from pmdc_jax import identify
 from pmdc_jax.identify.corrections.input_noise import denoised
 from pmdc_jax.recording import Recording
@@ -54,7 +54,7 @@ def recorded(applied_noise: float, sensor_noise: float) -> list[Recording]:
         )
         columns = vb.record(vb.paper_motor(), driven, rng, vb.Noise(0.1, 0.5))
         columns["voltage_V"] = columns["voltage_V"] + sensor_noise * noise(rng, excitation)
-        found.append(recording_of(name, columns))
+        found.append(recording(name, columns))
     return found
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from paper_bench import PAPER
+from linear_motor import PAPER
 
 from pmdc_jax.motor import PARAMETERS, Drive, Motor
 

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from paper_bench import PAPER
+from linear_motor import PAPER
 
 from pmdc_jax import InputError, load_motor, save_motor
 from pmdc_jax.effects import EFFECTS

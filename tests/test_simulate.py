@@ -14,7 +14,7 @@ import pytest
 from attrs import evolve
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from paper_bench import PAPER, exact_step, state_space
+from linear_motor import PAPER, exact_step, state_space
 from scipy import linalg, signal
 from scipy.integrate import solve_ivp
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 from attrs import evolve
-from paper_bench import PAPER
+from linear_motor import PAPER
 
 from pmdc_jax import InputError, cli, load_controller, load_uncertainty, save_motor, tune
 from pmdc_jax.control.specification import LoopRequirements

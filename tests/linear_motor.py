@@ -1,4 +1,4 @@
-"""The motor of the wheelchair paper, its exact step by scipy, and recordings of the virtual bench."""
+"""The motor of the wheelchair paper, and the exact step of linear motors by scipy."""
 
 from __future__ import annotations
 
@@ -8,15 +8,8 @@ import numpy as np
 from scipy.linalg import expm
 
 from benchmarks import virtual_bench as vb
-from pmdc_jax.recording import Recording
 
 PAPER = {name: getattr(vb.paper_motor(), name) for name in vb.SIX}
-
-
-def recording_of(name: str, columns: vb.Columns) -> Recording:
-    """The run with these columns of the virtual bench."""
-    quantities = ("time_s", "voltage_V", "current_A", "speed_rad_s")
-    return Recording(name, *(columns[q] for q in quantities), load=columns.get("load_torque_Nm"))
 
 
 def state_space(motor: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
