@@ -1,9 +1,9 @@
-"""Closed-loop simulations a second: `python -m benchmarks.closed_loop`.
+"""Closed-loop simulations per second: `python -m benchmarks.closed_loop`.
 
 1,024 PID loops of the paper's motor, 200 samples of 1 ms with a sample of delay, saturation and
-back-calculation, double precision. Ours beside the same law in numba (threads, and vectors where
-LLVM finds them); beside `control.forced_response`, which knows no limits and so is compared without
-any; and beside the motor of gym-electric-motor, which has one constant for torque and back-EMF.
+back-calculation, double precision. Ours beside the same law in numba (with threads, and vectorised
+where LLVM can); beside `control.forced_response`, compared without limits because it has none; and
+beside the motor of gym-electric-motor, which has one constant for torque and back-EMF.
 """
 
 import equinox as eqx
@@ -25,7 +25,7 @@ SAMPLES = 200  # of each
 STEP = 1e-3  # sample time, s
 SETPOINT = 481.0  # rad/s
 VOLTS = 30.0  # limit of the voltage, V
-UNLIMITED = 1e6  # V, which no loop asks for
+UNLIMITED = 1e6  # V, which no loop reaches
 MOTOR = Motor(**{name: getattr(vb.paper_motor(), name) for name in PARAMETERS})
 ONE_CONSTANT = eqx.tree_at(lambda motor: motor.Kt, MOTOR, MOTOR.Kb)
 
@@ -104,7 +104,7 @@ def gym_electric_motor(count: int = 32) -> Row:
 
 
 def table(title: str, rows: list[Row]) -> Table:
-    """Loops a second, time against the first row, largest difference of a largest speed."""
+    """Loops per second, time relative to the first row, and the largest difference of the peak speeds."""
     timings = interleaved(rows)
     shown = Table(title=title, caption=machine())
     shown.add_column("way, loops")
@@ -116,8 +116,8 @@ def table(title: str, rows: list[Row]) -> Table:
         difference = np.abs(timed.result[:count, 1] - best.result[:count, 1]).max()
         shown.add_row(
             timed.row.name,
-            f"{1e6 / timed.microseconds_a_unit:,.0f}",
-            f"{timed.microseconds_a_unit / best.microseconds_a_unit:,.1f}",
+            f"{1e6 / timed.microseconds_per_unit:,.0f}",
+            f"{timed.microseconds_per_unit / best.microseconds_per_unit:,.1f}",
             f"{timed.first:.2f}",
             f"{difference:.0e}",
         )

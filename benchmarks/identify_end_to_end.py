@@ -1,8 +1,8 @@
-"""Whole identifications, ours beside scripts: `python -m benchmarks.identify_end_to_end`.
+"""Complete identifications, ours beside scripts: `python -m benchmarks.identify_end_to_end`.
 
-Seven runs, 33,000 samples, from one drawn motor; every way gets all seven to fit. `solving` is the
+Seven runs, 33,000 samples, from one random motor; every method fits all seven. `solving` is the
 median of interleaved repeats in one warm process, `first` the first call there, and `process` a
-fresh interpreter that reads the seven CSV files, identifies and ends, caches on disk being warm.
+fresh interpreter that reads the seven CSV files, identifies and exits, with warm caches on disk.
 """
 
 import subprocess
@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-# only what every way needs: the fresh processes below pay for their own imports
+# only what all methods need: the fresh processes below include the time of their own imports
 from benchmarks.timing import Row, Timed, interleaved, machine
 
 ROOT = Path(__file__).parents[1]
@@ -78,7 +78,7 @@ NAMES = {
 
 @cache
 def truth():
-    """The drawn motor that made the runs."""
+    """The random motor of which the runs are."""
     from benchmarks import virtual_bench as vb
 
     return vb.drawn_motor(np.random.default_rng(0))
@@ -111,7 +111,7 @@ def worst_error_percent(found: Mapping[str, float]) -> float:
 
 
 def table(timings: list[Timed], processes: list[float]) -> Table:
-    """Seconds of each way, its ratio to the script, and how right it was."""
+    """Seconds of each method, relative to the script, and its largest error."""
     shown = Table(title="Whole identification, 7 runs, 33,000 samples", caption=machine())
     shown.add_column("way")
     for heading in ("solving s", "x script", "first s", "process s", "worst parameter error %"):
@@ -124,7 +124,7 @@ def table(timings: list[Timed], processes: list[float]) -> Table:
 
 
 def row(way: str, runs: Runs) -> Row:
-    """One way as a row of the table."""
+    """One method as a row of the table."""
     return Row(NAMES[way], lambda: WAYS[way](runs), repeats=5)
 
 

@@ -1,7 +1,7 @@
 """Make the packaged sample, `pmdc_jax/sample/*.csv`: `python -m benchmarks.make_sample`.
 
-The truth stays in this script. It is a plausible 24 V catalogue motor, linear but for the dry friction of its
-brushes and bearings: about 3,600 rev/min and 0.9 A without load, 40 A at stall, time constants 1.1 ms and 19 ms.
+The true parameters are in this script only. It is a plausible 24 V catalogue motor, linear except for the dry friction
+of its brushes and bearings: about 3,600 rev/min and 0.9 A without load, 40 A at stall, time constants 1.1 ms and 19 ms.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ DECIMALS = {"current_A": 2, "speed_rad_s": 2, "Current (mA)": 0, "Speed [rpm]": 
 
 
 def excitations(rng: np.random.Generator) -> dict[str, vb.Excitation]:
-    """What each file drives the motor with; the free runs say their load is zero."""
+    """The excitation of each file; runs without load have a load column of zeros."""
     return {
         "staircase": vb.staircase(duration=4.0),
         "prbs": vb.prbs(rng, duration=2.0, dt=5e-4, hold=0.005),
@@ -28,13 +28,13 @@ def excitations(rng: np.random.Generator) -> dict[str, vb.Excitation]:
 
 
 def applied(excitation: vb.Excitation) -> vb.Excitation:
-    """Voltage in steps of 0.01 V, load of 0.001 N m: the short numbers in the files are exact."""
+    """Voltage rounded to 0.01 V and load to 0.001 N m, so that the short numbers in the files are exact."""
     time, voltage, load = excitation
     return vb.Excitation(time, np.round(voltage, 2), np.round(load, 3))
 
 
 def in_mixed_units(columns: vb.Columns) -> vb.Columns:
-    """The same record as another logger would write it: mA and rev/min under its own headers."""
+    """The same record as by another logger: mA and rev/min, with other headers."""
     foreign = {
         "current_A": ("Current (mA)", 1e3),
         "speed_rad_s": ("Speed [rpm]", 30.0 / np.pi),

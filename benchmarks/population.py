@@ -1,9 +1,9 @@
 """Cost of a population of candidate motors on one record: `python -m benchmarks.population [--sizes 20 256 1024 8192]`.
 
 2,000 samples at 1 ms, current and speed, double precision. Ours beside the peers in one run; the
-ratio is to the numba roofline of as many candidates, or of the most. `error` is the largest relative
-difference of a cost from the exact one; a solver that takes one explicit step a sample has an error
-where the motor is stiff. Ours runs where JAX does by default: on an accelerator, if there is one.
+ratio is to the numba roofline of the same number of candidates, or of the most. `error` is the
+largest relative difference of a cost from the exact one; a solver with one explicit step per sample
+has a large one if the motor is stiff. Ours runs on JAX's default device: an accelerator, if any.
 """
 
 import argparse
@@ -31,7 +31,7 @@ COULOMB_NM, DROP_V, ALPHA, RTH, THERMAL_S = 0.05, 0.8, 0.0039, 3.0, 20.0
 
 
 def columns() -> vb.Columns:
-    """The record: known load steps at voltage steps, both directions."""
+    """The record: known steps of the load together with steps of the voltage, in both directions."""
     rng = np.random.default_rng(0)
     return vb.record(vb.paper_motor(), vb.loaded(rng, duration=2.0), rng)
 
@@ -44,7 +44,7 @@ def candidates(count: int) -> NDArray[np.float64]:
 
 
 def recording(record: vb.Columns) -> Recording:
-    """The same record as our package takes it."""
+    """The same record as a recording of the package."""
     load = record.get("load_torque_Nm")
     signals = (record[n] for n in ("time_s", "voltage_V", "current_A", "speed_rad_s"))
     return Recording("bench", *signals, load=load)
@@ -114,14 +114,14 @@ def linear_rows(sizes: Sequence[int]) -> list[Row]:
 
 
 def effects_rows(sizes: Sequence[int]) -> list[Row]:
-    """With friction, brush drop and heating; ours really sticks, the roofline smooths."""
+    """With friction, brush drop and heating; ours has exact sticking, which the roofline smooths."""
     *smaller, most = sizes
     peers = [roofline_with_effects(size) for size in (most, *smaller)]
     return [*peers, *(ours(size, effects=True) for size in sizes)]
 
 
 def table(title: str, timings: list[Timed], with_error: bool) -> Table:
-    """Microseconds a candidate, ratio to the roofline, largest relative error of a cost."""
+    """Microseconds per candidate, ratio to the roofline, largest relative error of a cost."""
     shown = Table(title=title, caption=machine())
     shown.add_column("way, candidates")
     for heading in ("µs / candidate", "x roofline", "first call s", "error"):
@@ -131,8 +131,8 @@ def table(title: str, timings: list[Timed], with_error: bool) -> Table:
     for timed in timings:
         beside = rooflines.get(timed.row.work, best)
         cells = [
-            f"{timed.microseconds_a_unit:,.2f}",
-            f"{timed.microseconds_a_unit / beside.microseconds_a_unit:,.1f}",
+            f"{timed.microseconds_per_unit:,.2f}",
+            f"{timed.microseconds_per_unit / beside.microseconds_per_unit:,.1f}",
             f"{timed.first:.2f}",
         ]
         count = min(timed.result.shape[1], best.result.shape[1])

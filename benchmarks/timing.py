@@ -1,4 +1,4 @@
-"""Timing rows side by side: interleaved repeats, so that a busy machine is unfair to all alike."""
+"""Timing with interleaved repeats, so that other work on the machine affects all rows alike."""
 
 import os
 import platform
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 
 class Row(NamedTuple):
-    """One way of computing the same thing; `work` is what one call does, in the table's unit."""
+    """One method of computing the same result; `work` is that of one call, in the unit of the table."""
 
     name: str
     run: Callable[[], Any]
@@ -19,7 +19,7 @@ class Row(NamedTuple):
 
 
 class Timed(NamedTuple):
-    """Median seconds a call, seconds of the first call (compilation included), and its result."""
+    """Median seconds per call, seconds of the first call (compilation included), and its result."""
 
     row: Row
     seconds: float
@@ -27,28 +27,28 @@ class Timed(NamedTuple):
     result: Any
 
     @property
-    def microseconds_a_unit(self) -> float:
+    def microseconds_per_unit(self) -> float:
         """Median microseconds for one unit of work."""
         return 1e6 * self.seconds / self.row.work
 
 
 def _clocked(run: Callable[[], Any], calls: int = 1) -> tuple[float, Any]:
-    """Seconds a call, and the last result."""
+    """Seconds per call, and the last result."""
     begin = time.perf_counter()
     for _ in range(calls):
         result = run()
     return (time.perf_counter() - begin) / calls, result
 
 
-def _calls_a_turn(run: Callable[[], Any]) -> int:
-    """Calls to fill 30 ms: in a single short call, waking the threads up would be all one sees."""
+def _calls_per_turn(run: Callable[[], Any]) -> int:
+    """Number of calls that take 30 ms: a single short call would measure only the wake-up of threads."""
     return max(1, int(0.03 / _clocked(run)[0]))
 
 
 def interleaved(rows: Sequence[Row]) -> list[Timed]:
-    """Warm every row up, then take turns until each has had its repeats."""
+    """Warm up every row, then call them in turn until all repeats are done."""
     firsts = [_clocked(row.run) for row in rows]
-    calls = [_calls_a_turn(row.run) for row in rows]
+    calls = [_calls_per_turn(row.run) for row in rows]
     seconds: list[list[float]] = [[] for _ in rows]
     for turn in range(max(row.repeats for row in rows)):
         for row, count, taken in zip(rows, calls, seconds, strict=True):
@@ -61,7 +61,7 @@ def interleaved(rows: Sequence[Row]) -> list[Timed]:
 
 
 def machine() -> str:
-    """Where and with what the numbers were measured."""
+    """The machine and the packages with which the numbers were measured."""
     packages = ", ".join(f"{name} {version(name)}" for name in ("jax", "diffrax", "numba", "scipy"))
     load = f"load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "load unknown"
     return f"{os.cpu_count()} cores of {platform.machine()}, {load}; {packages}"

@@ -4,9 +4,9 @@
     J dw/dt    = Kt i - f w - T_load - friction(w) - disturbance(t)
     dTemp/dt   = (Rth R i^2 - Temp) / tau
 
-Integration is RK4 in fine steps (20 or more a sample, 40 or more an electrical time constant).
-Coulomb friction and the brush drop are set-valued: at zero speed (zero current) they take whatever
-value within their level holds it there, and entering and leaving that state are located in time.
+Integration is RK4 in fine steps (20 or more per sample, 40 or more per electrical time constant).
+Coulomb friction and the brush drop are set-valued: at zero speed (zero current) they take the value
+within their level that keeps it there, and the times of entering and leaving that state are found.
 Row k of a record is the state at t_k, before the voltage of row k acts; that voltage is then held
 until t_(k+1). All quantities are SI.
 """
@@ -28,12 +28,12 @@ Columns = dict[str, NDArray[np.float64]]
 SIX = ("R", "L", "Kb", "Kt", "J", "f")
 
 
-# ------------------------------------------------------------------------------ what is simulated
+# ------------------------------------------------------------------------------ motor and noise
 
 
 @dataclass(frozen=True)
 class BenchMotor:
-    """The truth: six constants, and effects that are absent unless asked for.
+    """The true motor: six constants, and effects that are absent by default.
 
     R ohm, L H, Kb V s/rad, Kt N m/A, J kg m^2, f N m s/rad.
     """
@@ -45,7 +45,7 @@ class BenchMotor:
     J: float
     f: float
     coulomb_Nm: float = 0.0
-    constant_load_Nm: float = 0.0  # opposes positive motion, and no record mentions it
+    constant_load_Nm: float = 0.0  # opposes positive motion, and is in no record
     brush_drop_V: float = 0.0
     brush_onset_A: float = 0.0  # 0: set-valued; otherwise drop = brush_drop tanh(i / onset)
     copper_alpha_per_K: float = 0.0
@@ -63,7 +63,7 @@ class BenchMotor:
 
 @dataclass(frozen=True)
 class Noise:
-    """What disturbs the motor and its measurement: white sensors, coloured torque, an encoder."""
+    """Disturbances of the motor and its measurement: white sensor noise, coloured torque noise, a quantised speed."""
 
     current_A: float = 0.1
     speed_rad_s: float = 0.5
@@ -133,7 +133,7 @@ def _rk4(i, w, temp, v, load, mode_i, mode_w, h, p):
 
 @njit(cache=True)
 def _leaves_mode(x, drive, level, mode):
-    """Has a dry element left its mode: come through zero, or been driven beyond its level?"""
+    """Whether a dry element has left its mode: crossed zero, or been driven beyond its level."""
     if level == 0.0:
         return False
     return abs(drive) > level if mode == 0 else x * mode < 0.0
@@ -153,7 +153,7 @@ def _settle(x, drive, level, mode):
 def _advance(i, w, temp, v, load, mode_i, mode_w, h, p):
     """One fine step, broken where a dry element starts or stops slipping."""
     Kb, Kt, coulomb, sharp = p[2], p[3], p[6], p[7]
-    for _ in range(16):  # more events in one fine step than ever occur
+    for _ in range(16):  # more events than occur in one fine step
         i1, w1, temp1 = _rk4(i, w, temp, v, load, mode_i, mode_w, h, p)
         if not (
             _leaves_mode(i1, v - Kb * w1, sharp, mode_i)
@@ -218,7 +218,7 @@ def _ornstein_uhlenbeck(white, decay, sd):
 
 
 def _substeps(motor: BenchMotor, dt: float) -> int:
-    """Fine steps a sample: at least 20, and at least 40 an electrical time constant.
+    """Fine steps per sample: at least 20, and at least 40 per electrical time constant.
 
     Four times as many when the current sweeps through a smooth, hence narrow, brush onset.
     """
@@ -295,7 +295,7 @@ def _clock(duration: float, dt: float) -> NDArray[np.float64]:
 
 def _held(levels: NDArray[np.float64], time: NDArray[np.float64], hold: float) -> NDArray:
     """Each level held for `hold` seconds, starting again when they run out."""
-    # the small shift keeps a sample that rounding put just before its step on the right side
+    # the small shift is for samples that rounding puts just before their step
     return levels[((time - time[0]) / hold + 1e-6).astype(int) % len(levels)]
 
 

@@ -1,1 +1,1 @@
-"""One question a script: `python -m experiments.NAME`. What was measured is in RESULTS.md."""
+"""Each script answers one question: `python -m experiments.NAME`. The results are in RESULTS.md."""

@@ -9,7 +9,7 @@ from pmdc_jax import Recording
 
 
 def recording(name: str, columns: vb.Columns) -> Recording:
-    """A bench record as the package reads it."""
+    """A record of the virtual bench as a recording."""
     signals = (columns[c] for c in ("time_s", "voltage_V", "current_A", "speed_rad_s"))
     return Recording(name, *signals, load=columns.get("load_torque_Nm"))
 

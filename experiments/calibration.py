@@ -1,10 +1,10 @@
-"""Do 95 % intervals hold the truth 95 times in 100, in white and in coloured noise?
+"""Do 95 % intervals contain the truth in 95 of 100 cases, in white and in coloured noise?
 
 `python -m experiments.calibration [--repeats 200] [--noise white fast slow]`
 
-One motor, the paper's, recorded again and again by the virtual bench on the same excitations (six
-of the standard runs); only the noise differs. Torque noise is an Ornstein-Uhlenbeck process of
-0.02 N m that decorrelates in 0.02 s (fast) or 0.2 s (slow). Every repeat is identified from
+The paper's motor, recorded repeatedly by the virtual bench with the same excitations (six of the
+standard runs); only the noise differs. Torque noise is an Ornstein-Uhlenbeck process of
+0.02 N m with a correlation time of 0.02 s (fast) or 0.2 s (slow). Every repeat is identified from
 scratch with default options. The standard error of a coverage of 95 % in 200 repeats is 1.5 %.
 """
 
@@ -33,7 +33,7 @@ TRUTH = np.array([getattr(MOTOR, name) for name in vb.SIX])
 
 
 class Repeats(NamedTuple):
-    """What was found in each repeat, (repeats, 6)."""
+    """Estimates of each repeat, (repeats, 6)."""
 
     value: NDArray
     stderr: NDArray
@@ -43,7 +43,7 @@ class Repeats(NamedTuple):
 
 
 def excitations() -> dict[str, vb.Excitation]:
-    """The standard runs less the one meant for hold-out."""
+    """The standard runs without the one for hold-out."""
     runs = vb.standard_excitations(np.random.default_rng(7))
     return {name: excitation for name, excitation in runs.items() if name != "drive"}
 
@@ -82,7 +82,7 @@ def study(noise: vb.Noise, repeats: int) -> Repeats:
 
 
 def table(studies: dict[str, Repeats]) -> Table:
-    """Coverage, and claimed over actual spread, of every parameter in every noise."""
+    """Coverage, and standard error over actual scatter, of every parameter in every noise."""
     shown = Table(title="Coverage of 95 % intervals, %; claimed standard error / actual scatter")
     for heading in ("noise", "repeats", "", *vb.SIX, "all"):
         shown.add_column(heading, justify="right")
@@ -104,7 +104,7 @@ def table(studies: dict[str, Repeats]) -> Table:
 
 
 def picture(studies: dict[str, Repeats]):
-    """Coverage by parameter and noise, with the band in which chance leaves a right one."""
+    """Coverage by parameter and noise, with the band in which correct intervals are by chance."""
     from experiments.figures import panels, save
 
     figure, axes = panels(1, 3.2)

@@ -1,4 +1,4 @@
-"""Where the measured records lie: in the folder PMDC_DATA, else in ../shared/data."""
+"""The folder of the measured records: PMDC_DATA, otherwise ../shared/data."""
 
 import os
 from pathlib import Path
@@ -17,17 +17,17 @@ OWNERS = {
 
 
 def data_folder() -> Path:
-    """The folder of all records, which need not exist."""
+    """The folder of all records, which may be absent."""
     return Path(os.environ.get("PMDC_DATA") or BESIDE)
 
 
 def available(name: str) -> bool:
-    """Is there a folder of this name among the records?"""
+    """Whether there is a folder of this name among the records."""
     return (data_folder() / name).is_dir()
 
 
 def data_file(name: str, file: str) -> Path:
-    """A file of the records `name`; ends the program with one message where it is absent."""
+    """A file of the records `name`; exits with one message if it is absent."""
     path = data_folder() / name / file
     if not path.is_file():
         raise SystemExit(

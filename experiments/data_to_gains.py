@@ -1,11 +1,11 @@
-"""What is a recording worth to the controller? From data to a closed-loop metric, differentiated in one line.
+"""How does a recording affect the controller? From data to a closed-loop metric, differentiated in one line.
 
 `python -m experiments.data_to_gains`
 
 Samples -> estimate (a Gauss-Newton step at the optimum, which is the estimate to first order) -> motor
--> sampled, limited PID loop -> overshoot and settling time. The gradient of the last by the first says
-how each volt, ampere and rad/s of the recording moves the loop; by the estimate it says what an ohm of
-uncertainty costs. Both are checked against finite differences of the whole chain.
+-> sampled PID loop with limits -> overshoot and settling time. The gradient by the samples shows how
+each volt, ampere and rad/s of the recording affects the loop, and that by the estimate how the
+uncertainty of each parameter does. Both are checked against finite differences of the whole chain.
 """
 
 import jax
@@ -24,7 +24,7 @@ from pmdc_jax.simulate import Tape, free_run, uniform
 RUNS = ("prbs", "loaded")
 SETPOINT = 200.0  # rad/s
 VOLTS = 18.0  # limit of the voltage, V
-SAMPLES = 200  # of the step, 1 ms each
+SAMPLES = 200  # of 1 ms in the simulated step
 GAINS = PID(0.3, 25.0, 0.0003, 0.001, 1.0, 0.2)
 
 
@@ -34,7 +34,7 @@ def motor_of(logarithms) -> Motor:
 
 
 def loop_metrics(logarithms, nominal: Motor):
-    """Overshoot (%) and settling (s) of a loop designed for `nominal` on the motor as estimated."""
+    """Overshoot (%) and settling time (s) of a loop designed for `nominal`, with the estimated motor."""
     law = Law.of(GAINS, Hardware(1e-3, VOLTS, None, None, 1), nominal)
     course = Course(jnp.full(SAMPLES, SETPOINT), jnp.zeros(SAMPLES), jnp.zeros(SAMPLES))
     response = closed_loop(motor_of(logarithms), law, course, 4)
@@ -76,7 +76,7 @@ def main() -> None:
 
 
 def report(found, at, by_estimate, by_data, tape: Tape) -> None:
-    """What each parameter's uncertainty costs, and which recording the metrics hang on."""
+    """The effect of each parameter's uncertainty, and of each recording, on the metrics."""
     console = Console(width=110)
     covariance = np.asarray(found.covariance)
     shown = Table(title="What uncertainty of each parameter costs the loop")

@@ -1,11 +1,10 @@
-"""What does the diagnosis say of two real motors, of which others have published what they are like?
+"""How does the diagnosis of two real motors compare with what others have published about them?
 
 `python -m experiments.diagnoses [emps] [undcmotor]`; data: see experiments/data.py.
 
-EMPS has Coulomb friction with an offset by the published model, which while moving is friction that differs with
-direction. Its force error is that of experiments/emps.py. Of UNDCMotor the owners publish a delay of 20 ms and a
-dead zone; only voltage and speed are recorded. Either is begun without load and with viscous friction alone. Reports
-go to experiments/out.
+By its published model EMPS has Coulomb friction with an offset, which in motion is asymmetric friction. Its force error
+is that of experiments/emps.py. For UNDCMotor the owners publish a delay of 20 ms and a dead zone; only voltage and
+speed are recorded. Both diagnoses start without load and with viscous friction only. Reports go to experiments/out.
 """
 
 import argparse
@@ -22,7 +21,7 @@ OUT = Path(__file__).parent / "out"
 
 
 def terms_of(found: Diagnosis) -> dict[str, float]:
-    """The completed EMPS axis by the names of the inverse dynamic model."""
+    """Parameters of the EMPS axis with the added effects, by the names of the inverse dynamic model."""
     parameters = found.final.parameters
     terms = {"M": parameters["J"].value, "Fv": parameters["f"].value}
     value = {name: estimate.value for name, estimate in parameters.items()}

@@ -1,4 +1,4 @@
-"""Does the mechanical half identify a real axis, EMPS, as the published least squares does?
+"""Is a real axis, EMPS, identified by its mechanical half as well as by the published least squares?
 
 `python -m experiments.emps`; data: see experiments/data.py.
 
@@ -6,7 +6,7 @@ EMPS is a brushed motor on a ball screw, position-controlled, with force (drive 
 signal) and position at 1 kHz. Mass stands for J, N for N m, m for rad. We estimate in free-run
 simulation of speed from the recorded force; the published estimates minimise the error of force in
 the inverse dynamic model F = M a + Fv v + Fc sign(v) + offset on filtered, differentiated position.
-Both are judged by the latter, 100 |e| / |F|, which is re-measured here with plain least squares.
+Both are compared by the latter, 100 |e| / |F|, which is computed here for plain least squares, too.
 """
 
 from typing import NamedTuple
@@ -24,12 +24,16 @@ ESTIMATION, VALIDATION = "DATA_EMPS", "DATA_EMPS_PULSES"
 TERMS = ("M", "Fv", "Fc", "offset")
 UNITS = {"M": "kg", "Fv": "N s/m", "Fc": "N", "offset": "N"}
 PUBLISHED = dict(zip(TERMS, (95.109, 203.50, 20.39, -3.165), strict=True))
-CUTOFF_HZ, DECIMATION, TRIM = 100.0, 10, 50  # of the published practice; reproduce its numbers
+CUTOFF_HZ, DECIMATION, TRIM = (
+    100.0,
+    10,
+    50,
+)  # as in the published method, whose numbers they reproduce
 COULOMB = "coulomb_friction.torque_Nm"
 
 
 class Fit(NamedTuple):
-    """One way to fit: its options, and the terms by which plain least squares does the same."""
+    """A fit: its options, and the terms of the equivalent plain least squares."""
 
     name: str
     options: dict
@@ -44,7 +48,7 @@ FITS = (
 
 
 def record(name: str) -> Recording:
-    """One record; `gtau * vir` is the total force, also where `pulses_N` says what was added."""
+    """One record; `gtau * vir` is the total force, including the pulses in `pulses_N`."""
     columns = loadmat(data_file("emps", f"{name}.mat"))
     force = columns["gtau"].item() * columns["vir"].ravel()
     return Recording(name, columns["t"].ravel(), torque=force, angle=columns["qm"].ravel())
@@ -81,7 +85,7 @@ def least_squares(run: Recording, terms: tuple[str, ...]) -> dict[str, float]:
 
 
 def thinned(run: Recording, every: int) -> Recording:
-    """Every so many-th sample: force averaged as it was held, speed filtered without phase shift."""
+    """One sample in `every`: force averaged while held, speed filtered without phase shift."""
     whole = len(run) // every * every
     force = run.torque[:whole].reshape(-1, every).mean(1)
     kept = slice(0, whole, every)
@@ -89,7 +93,7 @@ def thinned(run: Recording, every: int) -> Recording:
 
 
 def ours(fit: Fit, every: int = 1) -> Identification:
-    """The package's estimate, the other record kept out; optionally from thinned records."""
+    """The estimate of the package with the validation record held out; optionally from thinned records."""
     runs = [record(name) for name in (ESTIMATION, VALIDATION)]
     if every > 1:
         runs = [thinned(run, every) for run in runs]
@@ -147,7 +151,7 @@ def error_table(results: dict[str, Identification]) -> Table:
 
 
 def picture(results: dict[str, Identification]):
-    """Free-run speed on the validation record, and the force that each model leaves."""
+    """Free-run speed on the validation record, and the residual force of each model."""
     from experiments.figures import panels, save
 
     run = record(VALIDATION)

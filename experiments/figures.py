@@ -1,4 +1,4 @@
-"""Where the experiments put their pictures, and how these look."""
+"""Folder and style of the figures of the experiments."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The wheelchair-motor paper, done again: `python -m experiments.paper`, the same as `pmdc paper`."""
+"""The wheelchair-motor paper reproduced: `python -m experiments.paper`, the same as `pmdc paper`."""
 
 from rich.console import Console
 

@@ -4,8 +4,8 @@
 
 Each motor is drawn about the paper's Table 1 (log-normal, 25 %) and recorded by the virtual bench:
 staircase, PRBS, slow triangle, loaded, 60 s of load cycles, with current noise of 0.02 to 0.2 A and
-speed noise of 0.1 to 1 rad/s. `identify` gets the recordings and nothing else. Of 120 right
-estimates with right standard errors 0.3 lie beyond 3 by chance.
+speed noise of 0.1 to 1 rad/s. `identify` gets only the recordings. Of 120 correct estimates
+with correct standard errors 0.3 lie beyond 3 by chance.
 """
 
 import argparse
@@ -25,7 +25,7 @@ ERRORS, PERCENT = 3.0, 1.0
 
 
 class Case(NamedTuple):
-    """One motor, how noisily it was recorded, and what was found."""
+    """One motor, the noise of its recordings, and the identification."""
 
     seed: int
     motor: vb.BenchMotor
@@ -37,23 +37,23 @@ class Case(NamedTuple):
         return 100 * (self.found.parameters[name].value / getattr(self.motor, name) - 1)
 
     def standard_errors(self, name: str) -> float:
-        """Error of one parameter in its standard errors; infinite where none is claimed."""
+        """Error of one parameter in its standard errors; infinite if it has none."""
         estimate = self.found.parameters[name]
         error = estimate.value - getattr(self.motor, name)
         return error / estimate.stderr if estimate.stderr else float("inf")
 
     @property
     def passed(self) -> bool:
-        """Is every parameter within both limits?"""
+        """Whether every parameter is within both limits."""
         return not any(self.misses(name) for name in vb.SIX)
 
     def misses(self, name: str) -> bool:
-        """Is this parameter beyond either limit?"""
+        """Whether this parameter is beyond either limit."""
         return abs(self.percent(name)) > PERCENT or abs(self.standard_errors(name)) > ERRORS
 
 
 def drawn_noise(rng: np.random.Generator) -> vb.Noise:
-    """Noise of a cheap to a good logger, drawn evenly in logarithms."""
+    """Noise of a cheap to a good logger, log-uniform."""
     current, speed = np.exp(rng.uniform(np.log([0.02, 0.1]), np.log([0.2, 1.0])))
     return vb.Noise(current_A=float(current), speed_rad_s=float(speed))
 
@@ -85,7 +85,7 @@ def _cell(c: Case, name: str) -> str:
 
 
 def verdict(cases: list[Case]) -> str:
-    """The count, and whether the standard errors are those of a normal distribution."""
+    """The number of motors that pass, and whether errors over standard errors are normally distributed."""
     z = np.array([c.standard_errors(name) for c in cases for name in vb.SIX])
     percent = np.array([c.percent(name) for c in cases for name in vb.SIX])
     expected = 2 * stats.norm.sf(ERRORS) * z.size

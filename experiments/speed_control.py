@@ -1,11 +1,11 @@
-"""How close do tuned controllers come to what is physically possible? The paper's motor, 0 to 481 rad/s.
+"""How close do tuned controllers come to the fastest possible settling? The paper's motor, 0 to 481 rad/s.
 
 `python -m experiments.speed_control ideal|sampled|robust [--volts 30 36]`
 
 ideal: 0.1 ms sampling, no delay, overshoot of 0.06 % allowed; the same gains are then simulated in
 continuous time. sampled: 1 ms, one sample of delay, speed in steps of 0.1 rad/s, 0.5 % allowed.
-robust: sampled, tuned for a spread of 10 % of every parameter and judged on 256 motors, each also
-beside its own fastest settling.
+robust: sampled, tuned for a spread of 10 % of every parameter and evaluated on 256 motors, also
+relative to the fastest settling of each.
 """
 
 import argparse
@@ -34,7 +34,7 @@ def tuned(kind: str, volts: float, **options) -> Tuning:
 
 
 def in_continuous_time(tuning: Tuning) -> tuple[float, float]:
-    """Settling over the limit, and overshoot (%), of the same gains without any sampling."""
+    """Settling time over the fastest possible, and overshoot (%), of the same gains without sampling."""
     with jax.enable_x64(True):
         times = jnp.linspace(0.0, 3 * tuning.fastest_possible_settling, 6001)
         volts = tuning.hardware.voltage_limit
@@ -44,7 +44,7 @@ def in_continuous_time(tuning: Tuning) -> tuple[float, float]:
 
 
 def nominal_table(volts: list[float], options: dict, continuous: bool) -> Table:
-    """Settling over the limit, overshoot, and what a load does, a row a controller and voltage."""
+    """Settling time over the fastest possible, overshoot and response to a load, per controller and voltage."""
     shown = Table(title=f"0 to {SETPOINT:g} rad/s, {options}")
     for heading in ("V", "controller", "limit s", "settling / limit", "overshoot %", "load N m"):
         shown.add_column(heading, justify="right")
@@ -80,7 +80,7 @@ def _cells(volts: float, kind: str, found: Tuning, continuous: bool) -> list[str
 
 
 def own_limits(volts: float, seed: int) -> np.ndarray:
-    """The fastest settling of each of the drawn motors, s; infinite where 481 rad/s is out of reach."""
+    """The fastest settling of each random motor, s; infinite if 481 rad/s is out of reach."""
     with jax.enable_x64(True):
         motors = drawn_motors(PRINTED, even_spread(0.1), VALIDATION_MOTORS, seed)
         each = [jax.tree.map(lambda leaf: leaf[k], motors) for k in range(VALIDATION_MOTORS)]  # noqa: B023
@@ -88,7 +88,7 @@ def own_limits(volts: float, seed: int) -> np.ndarray:
 
 
 def robust_table(volts: list[float]) -> Table:
-    """95th percentiles: robust tuning, tuning for the nominal motor alone, and Ziegler-Nichols."""
+    """95th percentiles of robust tuning, tuning for the nominal motor only, and Ziegler-Nichols."""
     shown = Table(title="256 motors, every parameter spread by 10 %; limit of the nominal motor")
     for heading in ("V", "controller", "gains", "overshoot p95 %", "settling p95 / limit"):
         shown.add_column(heading, justify="right")

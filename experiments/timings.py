@@ -1,11 +1,11 @@
-"""Are motors found whose voltages are not held from their own samples on? Random motors, five kinds of log each.
+"""Are motors identified whose voltages are not held from sample to sample? Random motors, five kinds of log each.
 
 `python -m experiments.timings [--motors 10] [--first 2000]`
 
-Motors of 1 W to 20 kW, sampled 0.1 to 6 times in L / R, three runs of each, two of three under a load that comes and
-goes in one run. SciPy simulates the linear motor exactly (`expm`), with voltages that are held from their samples on;
-go straight from sample to sample; are recorded a sample late, with what came of them; act a sample late; or go
-straight while the speed is the difference of an encoder's counts. `identify` gets the recordings and nothing else.
+Motors of 1 W to 20 kW, sampled 0.1 to 6 times in L / R, three runs of each; two of three motors have a load that is
+switched on and off in one run. SciPy simulates the linear motor exactly (`expm`), with voltages that are held from
+sample to sample; are linear between samples; are recorded a sample late, beside their response; act a sample late; or
+are linear while the speed is the difference of encoder counts. `identify` gets only the recordings.
 """
 
 import argparse
@@ -25,19 +25,19 @@ EXCITATIONS = ("steps", "prbs", "chirp", "sines", "one way")
 LINES = 2048
 
 
-class Drawn(NamedTuple):
-    """A motor, and what it is made for."""
+class RandomMotor(NamedTuple):
+    """A motor, its rated values and its sample time."""
 
     parameters: dict[str, float]
     volts: float
     amperes: float
     speed: float
-    settles: float  # mechanical time constant, s
+    time_constant_s: float  # mechanical
     sample_time: float
 
 
-def drawn(rng: np.random.Generator) -> Drawn:
-    """A motor of any size by rules of thumb: what it takes, how fast it turns, what it loses in its winding."""
+def random_motor(rng: np.random.Generator) -> RandomMotor:
+    """A motor of any size, by rules of thumb for its supply, speed and losses."""
     watts = 10 ** rng.uniform(0, 4.3)
     volts = np.clip(6 * watts**0.3, 3, 400) * rng.uniform(0.7, 1.4)
     speed = np.clip(900 * watts**-0.15 * rng.uniform(0.6, 1.6), 60, 1500)
@@ -46,40 +46,41 @@ def drawn(rng: np.random.Generator) -> Drawn:
     R = volts / amperes * (1 - efficiency) * rng.uniform(0.4, 0.9)
     Kb = (volts - R * amperes) / speed
     Kt = Kb * rng.uniform(0.95, 1.03)
-    settles = 10 ** rng.uniform(-2.0, -0.3)
-    L = R * settles * 10 ** rng.uniform(-2, -0.7)
+    time_constant_s = 10 ** rng.uniform(-2.0, -0.3)
+    L = R * time_constant_s * 10 ** rng.uniform(-2, -0.7)
     f = Kt * amperes * rng.uniform(0.02, 0.15) / speed
-    motor = dict(zip(SIX, (R, L, Kb, Kt, settles * Kb * Kt / R, f), strict=True))
-    sample_time = max(L / R / 10 ** rng.uniform(-0.7, 0.9), settles / 200)
-    return Drawn(motor, volts, amperes, speed, settles, float(f"{sample_time:.1g}"))
+    motor = dict(zip(SIX, (R, L, Kb, Kt, time_constant_s * Kb * Kt / R, f), strict=True))
+    sample_time = max(L / R / 10 ** rng.uniform(-0.7, 0.9), time_constant_s / 200)
+    return RandomMotor(motor, volts, amperes, speed, time_constant_s, float(f"{sample_time:.1g}"))
 
 
-def voltage(kind: str, motor: Drawn, time: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """What the motor is driven with."""
-    volts, settles = motor.volts, motor.settles
+def voltage(
+    kind: str, motor: RandomMotor, time: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """An excitation of the given kind, V."""
+    volts, time_constant_s = motor.volts, motor.time_constant_s
     if kind == "steps":
         return volts * rng.uniform(-1, 1, 8)[np.minimum(8 * time / time[-1], 7).astype(int)]
     if kind == "prbs":
-        hold = max(0.7 * settles, 3 * motor.sample_time)
+        hold = max(0.7 * time_constant_s, 3 * motor.sample_time)
         return (
             0.8
             * volts
             * (2 * rng.integers(0, 2, int(time[-1] / hold) + 2) - 1)[(time / hold).astype(int)]
         )
     if kind == "chirp":
-        return 0.7 * volts * np.sin((0.2 + 1.4 * time / time[-1]) * time / settles)
-    sines = np.sin(np.geomspace(0.05, 2.5, 6) * time[:, None] / settles + rng.uniform(0, 6, 6)).sum(
-        1
-    )
+        return 0.7 * volts * np.sin((0.2 + 1.4 * time / time[-1]) * time / time_constant_s)
+    sines = np.sin(
+        np.geomspace(0.05, 2.5, 6) * time[:, None] / time_constant_s + rng.uniform(0, 6, 6)
+    ).sum(1)
     return volts * (0.25 * sines if kind == "sines" else 0.5 + 0.08 * sines)
 
 
-def motion(motor: Drawn, v: np.ndarray, load: np.ndarray, straight: bool) -> np.ndarray:
+def motion(motor: RandomMotor, v: np.ndarray, load: np.ndarray, straight: bool) -> np.ndarray:
     """Current, speed and angle from rest, (samples, 3)."""
     R, L, Kb, Kt, J, f = (motor.parameters[name] for name in SIX)
-    rates = np.zeros(
-        (6, 6)
-    )  # of current, speed, angle, voltage, load and of how fast the voltage rises
+    # of current, speed, angle, voltage, load and the slope of the voltage
+    rates = np.zeros((6, 6))
     rates[0, [0, 1, 3]] = -R / L, -Kb / L, 1 / L
     rates[1, [0, 1, 4]] = Kt / J, -f / J, -1 / J
     rates[2, 1] = rates[3, 5] = 1.0
@@ -91,9 +92,13 @@ def motion(motor: Drawn, v: np.ndarray, load: np.ndarray, straight: bool) -> np.
     return states
 
 
-def log(motor: Drawn, way: str, kind: str, loaded: bool, rng: np.random.Generator) -> Recording:
-    """One run, logged so."""
-    samples = int(np.clip(rng.uniform(20, 60) * motor.settles / motor.sample_time, 600, 8000))
+def log(
+    motor: RandomMotor, way: str, kind: str, loaded: bool, rng: np.random.Generator
+) -> Recording:
+    """One run, with this kind of log."""
+    samples = int(
+        np.clip(rng.uniform(20, 60) * motor.time_constant_s / motor.sample_time, 600, 8000)
+    )
     time = motor.sample_time * np.arange(samples)
     v = voltage(kind, motor, time, rng)
     torque = motor.parameters["Kt"] * motor.amperes * rng.uniform(0.3, 0.7)
@@ -113,17 +118,17 @@ def log(motor: Drawn, way: str, kind: str, loaded: bool, rng: np.random.Generato
 
 
 def errors(seed: int, way: str) -> tuple[float, float]:
-    """The largest error of any parameter that is claimed, in standard errors; and of any but f in per cent."""
+    """The largest error of the identified parameters in standard errors, and of those but f in per cent."""
     rng = np.random.default_rng(seed)
-    motor = drawn(rng)
+    motor = random_motor(rng)
     loaded = rng.random() < 2 / 3
     kinds = rng.choice(EXCITATIONS, 3, replace=False)
     runs = [log(motor, way, kind, loaded and kind == kinds[1], rng) for kind in kinds]
     found = {n: e for n, e in identify(runs).parameters.items() if e.status == "identified"}
-    off = {name: e.value - motor.parameters[name] for name, e in found.items()}
+    error = {name: e.value - motor.parameters[name] for name, e in found.items()}
     return (
-        max(abs(off[name]) / e.stderr for name, e in found.items()),
-        max(100 * abs(off[name]) / motor.parameters[name] for name in found if name != "f"),
+        max(abs(error[name]) / e.stderr for name, e in found.items()),
+        max(100 * abs(error[name]) / motor.parameters[name] for name in found if name != "f"),
     )
 
 

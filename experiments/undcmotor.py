@@ -1,11 +1,11 @@
-"""How well does the linear motor reproduce a laboratory motor's speed, voltage being all we know?
+"""How well does the linear motor reproduce the speed of a laboratory motor from its voltage?
 
 `python -m experiments.undcmotor`; data: see experiments/data.py.
 
 PRBS record at 50 Hz, volts and deg/s, no current. Identified on its first half; the second half is
-simulated freely from its first sample, with the load found on the first. Without current only the
-gain, natural frequency and damping can be seen: three numbers for six parameters. The owners fit a
-delay of 20 ms; the linear motor has none, and its second order (an L far too large) stands in for it.
+simulated in free run from its first sample, with the load of the first half. Without current only
+the gain, natural frequency and damping are identifiable: three numbers for six parameters. The owners
+fit a delay of 20 ms; the linear motor has none, and too large an L compensates for it.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ DEGREE = np.pi / 180
 
 
 class Fit(NamedTuple):
-    """One way to fit, and what the data's README re-measured for it on the second half."""
+    """A fit, and the error on the second half of an equivalent model in the README of the data."""
 
     name: str
     options: dict
@@ -46,7 +46,7 @@ def halves() -> tuple[Recording, Recording]:
 
 
 def ours(fit: Fit) -> Identification:
-    """Identified on the first half alone."""
+    """Identified from the first half only."""
     return identify([halves()[0]], **fit.options)
 
 
@@ -78,7 +78,7 @@ def _load(result: Identification) -> str:
 
 
 def unseen(name: str, result: Identification) -> str:
-    """What the record cannot say about each parameter, and why."""
+    """The parameters that the record does not determine, and why."""
     status = ", ".join(f"{n} {e.status}" for n, e in result.parameters.items())
     reasons = (
         f"  {', '.join(d.parameters)}: {d.why}. {d.mend}." for d in result.unidentified_directions
@@ -87,7 +87,7 @@ def unseen(name: str, result: Identification) -> str:
 
 
 def seen(name: str, result: Identification) -> str:
-    """What the record does say, whatever the split between the parameters."""
+    """Gain, natural frequency and damping, which the record determines."""
     numerators, denominator = result.motor.transfer_function()
     gain = float(numerators["voltage -> speed"][0] / denominator[2]) / DEGREE
     inertial, resistive, stiff = (float(c) for c in denominator)
@@ -115,7 +115,7 @@ def picture(results: dict[str, Identification]):
 
 
 def main() -> None:
-    """Fit both ways, print, draw."""
+    """Make both fits, print, draw."""
     results = {fit.name: ours(fit) for fit in FITS}
     console = Console(width=120)
     console.print(table(results))

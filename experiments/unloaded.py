@@ -1,8 +1,8 @@
-"""What do unloaded logs say alone, and what with the tie Kt = Kb?
+"""What do logs without load identify, alone and with the tie Kt = Kb?
 
 `python -m experiments.unloaded`
 
-Staircase, PRBS and slow triangle of the virtual bench, free of load and said to be so. Two motors:
+Staircase, PRBS and slow triangle of the virtual bench, without load and declared as such. Two motors:
 the paper's with Kt = Kb, and the paper's as printed, whose Kt is 1.8 % above its Kb.
 """
 
@@ -21,7 +21,7 @@ TIE = [("Kt", "Kb")]
 
 
 def motors() -> dict[str, vb.BenchMotor]:
-    """Both truths."""
+    """Both true motors."""
     paper = vb.paper_motor()
     return {"Kt = Kb": replace(paper, Kt=paper.Kb), "as printed": paper}
 
@@ -41,7 +41,7 @@ def _cells(motor: vb.BenchMotor, result: Identification, name: str) -> tuple[str
 
 
 def table(name: str, motor: vb.BenchMotor, alone: Identification, tied: Identification) -> Table:
-    """Status, error and claimed standard error of every parameter, both ways."""
+    """Status, error and standard error of every parameter, alone and with the tie."""
     shown = Table(title=f"Unloaded logs, motor {name}: errors in %")
     for heading in ("", "alone", "error", "claimed", "tied", "error", "claimed"):
         shown.add_column(heading, justify="right" if heading in ("error", "claimed") else "left")
@@ -52,7 +52,7 @@ def table(name: str, motor: vb.BenchMotor, alone: Identification, tied: Identifi
 
 
 def ratios(motor: vb.BenchMotor, result: Identification) -> str:
-    """Errors of what unloaded logs do see: the ratios of Kt, J and f."""
+    """Errors of the ratios of Kt, J and f, which logs without load identify."""
     value = {name: estimate.value for name, estimate in result.parameters.items()}
     pairs = (("J", "Kt"), ("f", "Kt"))
     errors = (

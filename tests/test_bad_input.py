@@ -1,6 +1,6 @@
-"""Broken and nasty recordings: each is refused with a message that names the file and the trouble.
+"""Invalid recordings: each is refused with a message that names the file and the problem.
 
-`cases()` is one table for Python and for the command line.
+`cases()` is the table of invalid files, with their arguments on the command line.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Case(NamedTuple):
 
 
 def rows(count=20, columns=4, start=0.0, step=0.01):
-    """Lines of a good recording."""
+    """Lines of a valid recording."""
     values = np.random.default_rng(0).normal(size=(count, columns)).round(4)
     values[:, 0] = start + step * np.arange(count)
     return [",".join(f"{x:.6g}" for x in row) for row in values]
@@ -52,8 +52,8 @@ def csv(*lines, name="run.csv", args=(), encoding="utf-8", end="\n"):
     return write
 
 
-def edited(line, text, header=HEADER, **kwargs):
-    """A good file with one line (counted from 1) replaced."""
+def with_line(line, text, header=HEADER, **kwargs):
+    """A valid file with one line (counted from 1) replaced."""
     lines = [header, *rows(columns=header.count(",") + 1)]
     lines[line - 1] = text
     return csv(*lines, **kwargs)
@@ -89,12 +89,12 @@ def frame(name="run.parquet", **columns):
     return write
 
 
-def missing(folder):
-    """A file that is not there."""
+def absent(folder):
+    """A path without a file."""
     return [folder / "absent.csv"], []
 
 
-def a_folder(folder):
+def folder_instead_of_file(folder):
     """A folder named like a file."""
     (folder / "run.csv").mkdir()
     return [folder / "run.csv"], []
@@ -107,13 +107,13 @@ def mapped(*columns, header="a,b,c,d"):
 
 
 def good_mat(**changes):
-    """Variables of a good MATLAB file with changes."""
+    """Variables of a valid MATLAB file with changes."""
     t = np.arange(50) * 0.01
     return {"time_s": t, "voltage_V": np.sin(t), "speed_rad_s": np.cos(t)} | changes
 
 
 def nan_share(share, column):
-    """A file with this share of empty cells in one column."""
+    """A file in which this share of the cells of one column is empty."""
     lines = [HEADER]
     for k, line in enumerate(rows(100)):
         cells = line.split(",")
@@ -124,9 +124,9 @@ def nan_share(share, column):
 
 
 def cases() -> Iterator[Case]:
-    """The table."""
-    yield Case("missing file", missing, "no such file")
-    yield Case("folder", a_folder, "folder")
+    """The table of cases."""
+    yield Case("missing file", absent, "no such file")
+    yield Case("folder", folder_instead_of_file, "folder")
     yield Case("empty file", raw(b""), "the file is empty")
     yield Case("only blank lines", raw(b"\n\n \n"), "no header")
     yield Case("only a byte order mark", raw(b"\xef\xbb\xbf"), "no header")
@@ -144,14 +144,14 @@ def cases() -> Iterator[Case]:
     yield Case("speed alone", csv("time_s,speed_rad_s", *rows(columns=2)), "too few columns")
     yield Case("blanks separate", csv("time_s voltage_V speed_rad_s", "0 1 2"), "separate them by")
     yield Case(
-        "text in a column", edited(7, "0.05,1,oops,2"), "line 7, column current_A: 'oops' is not"
+        "text in a column", with_line(7, "0.05,1,oops,2"), "line 7, column current_A: 'oops' is not"
     )
     yield Case(
         "line of wrong units",
         csv("time,voltage,current,speed", "s,V,A,furlong", *rows()),
         "column speed [furlong]: unknown unit 'furlong'",
     )
-    yield Case("clock time", edited(2, "12:00:01,1,2,3"), "line 2, column time_s: '12:00:01'")
+    yield Case("clock time", with_line(2, "12:00:01,1,2,3"), "line 2, column time_s: '12:00:01'")
     yield Case(
         "text after comments",
         csv("# bench 3", "", HEADER, "# begin", *rows(12), "", "0.5,1,x,2"),
@@ -162,17 +162,17 @@ def cases() -> Iterator[Case]:
         csv("time_s,voltage_V,speed_rad_s", *["0,01,1,0,2,0"] * 20),
         "line 2: it has 6 fields",
     )
-    yield Case("a thousand's comma", edited(5, '0.03,"1,234",1,1'), "line 5, column voltage_V")
-    yield Case("long row", edited(9, "0.07,1,2,3,4"), "line 9: it has 5 fields")
-    yield Case("short row", edited(11, "0.09,1"), "line 11: it has 2 fields")
-    yield Case("cut off in the middle", edited(21, "0.19,0."), "line 21: it has 2 fields")
-    yield Case("unclosed quote", edited(6, '0.04,"1,2,3'), "run.csv")
+    yield Case("a thousand's comma", with_line(5, '0.03,"1,234",1,1'), "line 5, column voltage_V")
+    yield Case("long row", with_line(9, "0.07,1,2,3,4"), "line 9: it has 5 fields")
+    yield Case("short row", with_line(11, "0.09,1"), "line 11: it has 2 fields")
+    yield Case("cut off in the middle", with_line(21, "0.19,0."), "line 21: it has 2 fields")
+    yield Case("unclosed quote", with_line(6, '0.04,"1,2,3'), "run.csv")
     yield Case(
         "Latin-1 header",
         csv("time_s,voltage_V,Winkel [°]", *rows(columns=3), encoding="latin-1"),
         "line 1: byte 26 (0xb0) is not UTF-8",
     )
-    yield Case("Latin-1 later", edited(8, "0.06,1,2,3 µ", encoding="latin-1"), "line 8: byte")
+    yield Case("Latin-1 later", with_line(8, "0.06,1,2,3 µ", encoding="latin-1"), "line 8: byte")
     yield Case("UTF-16", csv(HEADER, *rows(), encoding="utf-16"), "UTF-16")
     yield Case("binary junk", raw(bytes(range(256)) * 20), "not a text file")
     yield Case("gzip named csv", raw(gzip.compress(b"time_s" * 99)), "run.csv")
@@ -203,25 +203,29 @@ def cases() -> Iterator[Case]:
         csv("time_s,voltage_V,current_A,speed [1/s]", *rows()),
         "'1/s' does not measure speed",
     )
-    yield Case("time goes backwards", edited(12, "0.02,1,2,3"), "line 12, column time_s: time goes")
+    yield Case(
+        "time goes backwards", with_line(12, "0.02,1,2,3"), "line 12, column time_s: time goes"
+    )
     yield Case(
         "two runs in one file",
         csv(HEADER, *rows(15), *rows(15)),
         "line 17, column time_s: time goes backwards",
     )
-    yield Case("repeated time", edited(4, "0.01,1,2,3"), "line 4, column time_s: the time stamp")
+    yield Case("repeated time", with_line(4, "0.01,1,2,3"), "line 4, column time_s: the time stamp")
     yield Case(
         "time rounded away", csv(HEADER, *rows(step=0.0)), "line 3, column time_s: the time stamp"
     )
-    yield Case("time missing", edited(6, ",1,2,3"), "line 6, column time_s: 1 of 20 values")
-    yield Case("voltage missing", edited(6, "0.04,,2,3"), "line 6, column voltage_V: 1 of 20")
-    yield Case("voltage NaN", edited(3, "0.01,NaN,2,3"), "line 3, column voltage_V: 1 of 20")
+    yield Case("time missing", with_line(6, ",1,2,3"), "line 6, column time_s: 1 of 20 values")
+    yield Case("voltage missing", with_line(6, "0.04,,2,3"), "line 6, column voltage_V: 1 of 20")
+    yield Case("voltage NaN", with_line(3, "0.01,NaN,2,3"), "line 3, column voltage_V: 1 of 20")
     yield Case(
         "load missing",
-        edited(5, "0.03,1,2,NA", header="time_s,voltage_V,speed_rad_s,load_torque_Nm"),
+        with_line(5, "0.03,1,2,NA", header="time_s,voltage_V,speed_rad_s,load_torque_Nm"),
         "line 5, column load_torque_Nm",
     )
-    yield Case("infinite speed", edited(10, "0.08,1,2,inf"), "line 10, column speed_rad_s: 1 inf")
+    yield Case(
+        "infinite speed", with_line(10, "0.08,1,2,inf"), "line 10, column speed_rad_s: 1 inf"
+    )
     yield Case(
         "speed mostly missing",
         nan_share(0.3, 3),
@@ -229,7 +233,7 @@ def cases() -> Iterator[Case]:
     )
     yield Case(
         "driving current missing",
-        edited(6, "0.04,,3", header="time_s,current_A,speed_rad_s"),
+        with_line(6, "0.04,,3", header="time_s,current_A,speed_rad_s"),
         "line 6, column current_A",
     )
     yield Case(
@@ -298,7 +302,7 @@ def columns_of(args):
 
 
 @pytest.mark.parametrize("case", list(cases()), ids=lambda case: case.name)
-def test_is_refused_with_a_message_that_names_file_and_trouble(case, tmp_path):
+def test_an_invalid_file_is_refused_with_a_message_that_names_it_and_the_problem(case, tmp_path):
     paths, args = case.write(tmp_path)
     with pytest.raises(InputError) as caught:
         for path in paths:
@@ -310,24 +314,24 @@ def test_is_refused_with_a_message_that_names_file_and_trouble(case, tmp_path):
     assert caught.value.mend
 
 
-def test_there_are_many_cases():
+def test_there_are_many_cases_with_distinct_names():
     names = [case.name for case in cases()]
     assert len(names) == len(set(names)) >= 35
 
 
 def forbid(monkeypatch, mode):
-    """As root nothing is forbidden, so opening a file is made to fail."""
+    """Makes it fail to open a file in this mode, since root may open any file."""
     opened = Path.open
 
-    def refuse(self, how="r", *args, **kwargs):
-        if mode in how:
+    def refuse(self, file_mode="r", *args, **kwargs):
+        if mode in file_mode:
             raise PermissionError(13, "Permission denied")
-        return opened(self, how, *args, **kwargs)
+        return opened(self, file_mode, *args, **kwargs)
 
     monkeypatch.setattr(Path, "open", refuse)
 
 
-def test_no_permission_to_read(tmp_path, monkeypatch):
+def test_a_file_without_read_permission_is_refused(tmp_path, monkeypatch):
     (path,), _ = csv(HEADER, *rows())(tmp_path)
     forbid(monkeypatch, "r")
     with pytest.raises(InputError, match=r"run\.csv: no permission to read"):
@@ -335,7 +339,7 @@ def test_no_permission_to_read(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="root may read anything")
-def test_no_permission_to_read_for_real(tmp_path):
+def test_a_file_with_mode_0_is_refused(tmp_path):
     (path,), _ = csv(HEADER, *rows())(tmp_path)
     path.chmod(0)
     with pytest.raises(InputError, match=r"run\.csv: no permission to read"):
@@ -347,7 +351,7 @@ def good_recording():
     return Recording("run", t, voltage=np.sin(t), speed=np.cos(t))
 
 
-def test_no_permission_to_write(tmp_path, monkeypatch):
+def test_an_output_without_write_permission_is_refused(tmp_path, monkeypatch):
     forbid(monkeypatch, "w")
     with pytest.raises(InputError, match=r"out\.csv: it cannot be written \(Permission denied\)"):
         write_recording(good_recording(), tmp_path / "out.csv")
@@ -355,7 +359,7 @@ def test_no_permission_to_write(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("name", "what"), [("absent/out.csv", "No such"), ("out.mat", "of type")])
-def test_bad_output(tmp_path, name, what):
+def test_an_output_in_an_absent_folder_or_of_another_type_is_refused(tmp_path, name, what):
     with pytest.raises(InputError, match=what):
         write_recording(good_recording(), tmp_path / name)
 
@@ -369,13 +373,13 @@ def test_bad_output(tmp_path, name, what):
         ({"voltage": np.full(20, np.inf)}, "infinite"),
     ],
 )
-def test_recordings_made_in_python_are_checked_too(changes, what):
+def test_recordings_made_in_python_are_validated_too(changes, what):
     t = np.arange(20) / 10
     with pytest.raises(InputError, match=what):
         Recording(**{"name": "run", "time": t, "voltage": t, "speed": t} | changes)
 
 
-def test_a_voltage_alone_is_enough_to_simulate_and_nothing_to_identify(tmp_path):
+def test_a_voltage_alone_is_enough_to_simulate_but_not_to_identify(tmp_path):
     t = np.arange(20) / 10
     run = Recording("run", t, voltage=t)
     with pytest.raises(InputError, match="too few columns to identify a motor, only time, voltage"):
@@ -389,7 +393,7 @@ def test_a_voltage_alone_is_enough_to_simulate_and_nothing_to_identify(tmp_path)
         read_recording(tmp_path / "speed.csv", to_simulate=True)
 
 
-def test_damaged_text_is_read_or_refused_but_never_breaks(tmp_path):
+def test_damaged_text_is_read_or_refused_without_another_error(tmp_path):
     rng = np.random.default_rng(0)
     good = "\n".join([HEADER, *rows(12)]).encode()
     path = tmp_path / "run.csv"
@@ -408,7 +412,7 @@ def test_damaged_text_is_read_or_refused_but_never_breaks(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".mat", ".parquet"])
-def test_files_cut_short_are_refused(tmp_path, suffix):
+def test_truncated_files_are_refused(tmp_path, suffix):
     if suffix == ".mat":
         mat(**good_mat())(tmp_path)
     else:

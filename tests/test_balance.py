@@ -1,56 +1,56 @@
-"""The electrical equation, asked from sample to sample: torques do not trouble it, nor brushes that hold a current."""
+"""The misfit of the electrical equation: not affected by fluctuating torques or by brushes that block the current."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from linear_motor import PAPER
 from scipy.signal import lfilter
 
 from benchmarks import virtual_bench as vb
-from pmdc_jax import Recording
+from experiments.bench import recording
 from pmdc_jax.diagnose.balance import electrical_misfit
 from pmdc_jax.diagnose.diagnosis import MAX_ELECTRICAL
 from pmdc_jax.diagnose.model import Model, model_of
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.solve import solve
-from pmdc_jax.motor import PARAMETERS
 
-MOTOR = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS} | {"brush_drop_V": 0.6}
+MOTOR = PAPER | {"brush_drop_V": 0.6}
 SLOW_TORQUE = vb.Noise(0.1, 0.5, torque_Nm=0.05, torque_correlation_s=0.3)
 
 
-def fitted(averaged_A: int = 1, rough: float = 0.0) -> Model:
-    """A motor with brushes in slow torque noise, its recorded current a mean over so many samples, its voltage off by
-    a share of itself as `rough` as that."""
+def fitted(current_mean_samples: int = 1, voltage_noise: float = 0.0) -> Model:
+    """A fit to a motor with brushes and slow torque noise. The recorded current is a mean over `current_mean_samples`;
+    the applied voltage differs from the recorded one by multiplicative noise with the deviation `voltage_noise`."""
     rng, runs = np.random.default_rng(11), []
     excitations = {"prbs": vb.prbs(rng, 2.0), "triangle": vb.slow_triangle(2.0)}
     for name, excitation in excitations.items():
-        felt = excitation.voltage * (1 + rough * rng.standard_normal(len(excitation.time)))
+        applied = excitation.voltage * (
+            1 + voltage_noise * rng.standard_normal(len(excitation.time))
+        )
         columns = vb.record(
-            vb.BenchMotor(**MOTOR), excitation._replace(voltage=felt), rng, SLOW_TORQUE
+            vb.BenchMotor(**MOTOR), excitation._replace(voltage=applied), rng, SLOW_TORQUE
         )
         columns["voltage_V"] = excitation.voltage
-        time, voltage, current, speed = (
-            columns[q] for q in ("time_s", "voltage_V", "current_A", "speed_rad_s")
-        )
-        current = lfilter(np.ones(averaged_A) / averaged_A, 1.0, current)
-        runs.append(Recording(name, time, voltage, current, speed, columns["load_torque_Nm"]))
+        average = np.ones(current_mean_samples) / current_mean_samples
+        columns["current_A"] = lfilter(average, 1.0, columns["current_A"])
+        runs.append(recording(name, columns))
     given = prepare(runs, (), effects=[EFFECTS["brush_voltage_drop"]])
     given, solved = solve(given, "cma_es", 0)
     return model_of(("brush_voltage_drop",), given, solved.fit)
 
 
 @pytest.mark.usefixtures("x64")
-def test_brushes_that_hold_the_current_take_up_any_voltage():
+def test_brushes_that_block_the_current_cause_no_electrical_misfit():
     assert electrical_misfit(fitted()) < 1.5
 
 
 @pytest.mark.usefixtures("x64")
-def test_a_bridge_whose_pulses_do_not_end_with_the_samples_lacks_no_effect():
-    assert electrical_misfit(fitted(rough=0.2)) < 1.5
+def test_pulses_not_aligned_with_the_samples_cause_no_electrical_misfit():
+    assert electrical_misfit(fitted(voltage_noise=0.2)) < 1.5
 
 
 @pytest.mark.usefixtures("x64")
-def test_an_averaged_current_is_no_motor():
-    assert electrical_misfit(fitted(averaged_A=4)) > MAX_ELECTRICAL
+def test_an_averaged_current_breaks_the_electrical_equation():
+    assert electrical_misfit(fitted(current_mean_samples=4)) > MAX_ELECTRICAL

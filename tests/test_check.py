@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from attrs import evolve
-from scipy.linalg import expm
+from linear_motor import exact_step
 
 from pmdc_jax.check import check
 from pmdc_jax.plausibility import speed_of
@@ -20,15 +20,12 @@ EXCITATIONS = ("steps", "prbs", "staircase", "triangle", "load_cycles", "spin_up
 
 def simulate(motor, dt, voltage, load, coulomb=0.0):
     """Current and speed of a motor by the exact step between samples, from rest."""
-    R, L, Kb, Kt, J, f = motor
-    A = np.array([[-R / L, -Kb / L], [Kt / J, -f / J]])
-    B = np.array([[1 / L, 0.0], [0.0, -1 / J]])
-    step = expm(np.block([[A, B], [np.zeros((2, 4))]]) * dt)
+    A, B = exact_step(motor, dt)
     state, states = np.zeros(2), []
     for v, torque in zip(voltage, load, strict=True):
         states.append(state)
-        state = step[:2, :2] @ state + step[:2, 2:] @ [v, torque]
-        slowed = abs(state[1]) - dt * coulomb / J
+        state = A @ state + B @ [v, torque]
+        slowed = abs(state[1]) - dt * coulomb / motor["J"]
         state = np.array([state[0], np.sign(state[1]) * max(slowed, 0.0)])
     return np.array(states).T
 
@@ -59,7 +56,8 @@ def good_run(seed, kind=None, samples=3000, noise=None, coulomb=None):
     R, Kb = 10 ** rng.uniform(-1, 1), 10 ** rng.uniform(-2, np.log10(0.5))
     mechanical = 10 ** rng.uniform(-1.7, -0.3)
     J = mechanical * Kb**2 / R
-    motor = (R, R * mechanical * 10 ** rng.uniform(-2.5, -0.8), Kb, Kb, J, 0.03 * Kb**2 / R)
+    L, f = R * mechanical * 10 ** rng.uniform(-2.5, -0.8), 0.03 * Kb**2 / R
+    motor = {"R": R, "L": L, "Kb": Kb, "Kt": Kb, "J": J, "f": f}
     settle = int(10 ** rng.uniform(1, 2.3))
     dt = mechanical / settle
     rated = Kb * 24 / R
@@ -72,13 +70,14 @@ def good_run(seed, kind=None, samples=3000, noise=None, coulomb=None):
     if seed % 3 == 0:  # an encoder counted over the sampling time
         count = np.ptp(speed) / 300
         speed = count * np.round(speed / count)
-    stamps = rng.uniform(0, 100) + dt * np.arange(samples)
+    time = rng.uniform(0, 100) + dt * np.arange(samples)
     loaded = load if kind == "load_cycles" or seed % 2 else None
-    return Recording(f"{kind}-{seed}", stamps, voltage, current, speed, loaded)
+    return Recording(f"{kind}-{seed}", time, voltage, current, speed, loaded)
 
 
-def told(recordings, severity=("warning", "error")):
-    return [finding for finding in check(recordings) if finding.severity in severity]
+def problems(recordings):
+    """The findings that are warnings or errors."""
+    return [finding for finding in check(recordings) if finding.severity in ("warning", "error")]
 
 
 def shifted(run, **late):
@@ -91,64 +90,64 @@ def shifted(run, **late):
 
 
 @pytest.mark.parametrize("seed", range(50))
-def test_good_data_pass_in_silence(seed):
+def test_good_data_give_no_warning(seed):
     run = good_run(seed)
     angle = np.cumsum(run.speed) * run.sample_time
-    assert told([run]) == []
-    assert told([evolve(run, current=None), evolve(run, voltage=None)]) == []
-    assert told([evolve(run, angle=angle), evolve(run, angle=angle, speed=None)]) == []
+    assert problems([run]) == []
+    assert problems([evolve(run, current=None), evolve(run, voltage=None)]) == []
+    assert problems([evolve(run, angle=angle), evolve(run, angle=angle, speed=None)]) == []
 
 
-def test_a_current_that_leaps_is_known_only_beside_a_voltage():
+def test_jumps_of_a_current_are_noted_only_without_a_voltage():
     steps = good_run(0)
-    leaping = evolve(steps, current=np.repeat([1.0, -2.0], [700, len(steps) - 700]), voltage=None)
-    (note,) = [f for f in check([leaping]) if "jumps" in f.what]
+    jumping = evolve(steps, current=np.repeat([1.0, -2.0], [700, len(steps) - 700]), voltage=None)
+    (note,) = [f for f in check([jumping]) if "jumps" in f.what]
     assert "by up to 3 A" in note.what and "sample 700 " in note.where
-    smooth = evolve(leaping, current=np.sin(0.01 * np.arange(len(steps))))
-    beside = evolve(leaping, voltage=steps.voltage)
-    assert not any("jumps" in f.what for run in (smooth, beside) for f in check([run]))
+    smooth = evolve(jumping, current=np.sin(0.01 * np.arange(len(steps))))
+    with_voltage = evolve(jumping, voltage=steps.voltage)
+    assert not any("jumps" in f.what for run in (smooth, with_voltage) for f in check([run]))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.03])
 @pytest.mark.parametrize("kind", EXCITATIONS)
-def test_clean_and_very_noisy_data_pass_in_silence(kind, noise):
+def test_clean_and_very_noisy_data_give_no_warning(kind, noise):
     for seed in range(4):
-        assert told([good_run(seed, kind, noise=noise)]) == []
+        assert problems([good_run(seed, kind, noise=noise)]) == []
 
 
-def test_closed_loop_with_dry_friction_and_brush_drop_passes_in_silence():
+def test_a_closed_loop_with_dry_friction_and_brush_drop_gives_no_warning():
     for seed in range(4):
         rng = np.random.default_rng(seed)
         Kb, R, J, dt = 0.05, 0.8, 5e-5, 1e-3
-        state, total, rows = np.zeros(2), 0.0, []
+        state, integral, rows = np.zeros(2), 0.0, []
         for k in range(3000):
-            seen = state + rng.normal(size=2) * [0.05, 0.5]
-            error = 200 * np.sin(k // 300) - seen[1]
-            total += error * dt
-            voltage = np.clip(0.05 * error + 0.3 * total, -24, 24)
-            rows.append([voltage, *seen])
+            measured = state + rng.normal(size=2) * [0.05, 0.5]
+            error = 200 * np.sin(k // 300) - measured[1]
+            integral += error * dt
+            voltage = np.clip(0.05 * error + 0.3 * integral, -24, 24)
+            rows.append([voltage, *measured])
             current = (voltage - Kb * state[1] - 0.8 * np.tanh(state[0] / 0.1)) / R
             torque = Kb * current - 0.03 * np.tanh(state[1])
             state = np.array([0.3 * state[0] + 0.7 * current, state[1] + torque * dt / J])
         v, i, w = np.array(rows).T
-        assert told([Recording("loop", dt * np.arange(3000), v, i, w)]) == []
+        assert problems([Recording("loop", dt * np.arange(3000), v, i, w)]) == []
 
 
-def test_time_that_is_rounded_or_drifts_is_no_jitter():
+def test_rounded_or_drifting_time_stamps_are_not_jitter():
     run = good_run(1)
     grid = 1e-3 * np.arange(len(run))
     drifting = grid * (1 + 1e-4 * np.sin(grid))
-    for stamps in (np.round(grid, 5), drifting):
-        assert told([evolve(run, time=stamps)]) == []
+    for time in (np.round(grid, 5), drifting):
+        assert problems([evolve(run, time=time)]) == []
 
 
 def test_a_run_at_rest_among_others_is_only_noted():
     run, rng = good_run(0, "steps"), np.random.default_rng(0)
     current = 0.02 + 0.01 * rng.normal(size=len(run))
     rest = evolve(run, name="rest", voltage=0 * run.voltage, current=current, speed=0 * run.speed)
-    assert told([run, rest]) == []
+    assert problems([run, rest]) == []
     assert [f.run for f in check([run, rest]) if "no signal varies" in f.what] == ["rest"]
-    assert [f.severity for f in told([rest])] == ["error"]
+    assert [f.severity for f in problems([rest])] == ["error"]
 
 
 def test_a_load_of_zero_is_no_finding_and_a_constant_one_is_noted():
@@ -169,19 +168,19 @@ def with_jitter(run):
     return evolve(run, time=run.time + run.sample_time * scatter)
 
 
-def with_holes(run):
+def with_missing_values(run):
     speed = run.speed.copy()
     speed[100:400] = np.nan
     return evolve(run, speed=speed)
 
 
-def clip(run, quantity, share):
+def clipped(run, quantity, share):
     values = getattr(run, quantity)
     limit = np.min(values) + share * np.ptp(values)
     return evolve(run, **{quantity: np.minimum(values, limit)})
 
 
-def buried(run):
+def with_strong_noise(run):
     noise = np.random.default_rng(0).normal(size=len(run)) * 3 * np.std(run.speed)
     return evolve(run, speed=run.speed + noise)
 
@@ -195,18 +194,18 @@ def wrapped(run, step=0.05):
 
 
 @pytest.mark.parametrize("step", [0.0022, 0.05, 2.0])
-def test_a_wrapped_angle_is_noted_and_goes_on(step):
-    """Once in the run, often, and by a rotor that turns by a third from sample to sample."""
+def test_a_wrapped_angle_is_noted_and_unwrapped(step):
+    """Wrapped once in the run, often, and by a rotor that turns by a third of a turn per sample."""
     run = wrapped(good_run(1, "prbs"), step)
     (found,) = [f for f in check([run]) if f.column == "angle" and "turn" in f.what]
-    times = int(step * (len(run) - 1) / (2 * np.pi))
+    wraps = int(step * (len(run) - 1) / (2 * np.pi))
     assert found.severity == "note"
-    assert f"wraps after each turn, {times} time" in found.what
+    assert f"wraps after each turn, {wraps} time" in found.what
     for speed in (uniform(run).speed[1:], speed_of(run)):
         np.testing.assert_allclose(speed, step / run.sample_time)
 
 
-def test_stamps_that_jitter_are_noted_with_what_the_samples_are_taken_for():
+def test_jittered_time_stamps_are_noted():
     for seed in (1, 7, 13):
         (found,) = [f for f in check([with_jitter(good_run(seed, "prbs"))]) if f.column == "time"]
         assert found.severity == "note"
@@ -217,9 +216,9 @@ def test_stamps_that_jitter_are_noted_with_what_the_samples_are_taken_for():
 RPM = 30 / np.pi
 FAULTS = [
     ("gap", with_gap, "time", "1 gap in time, the longest"),
-    ("holes", with_holes, "speed", "300 of 3000 values are missing"),
-    ("clipped current", lambda run: clip(run, "current", 0.7), "current", "clipped at"),
-    ("clipped speed", lambda run: clip(run, "speed", 0.7), "speed", "clipped at"),
+    ("holes", with_missing_values, "speed", "300 of 3000 values are missing"),
+    ("clipped current", lambda run: clipped(run, "current", 0.7), "current", "clipped at"),
+    ("clipped speed", lambda run: clipped(run, "speed", 0.7), "speed", "clipped at"),
     ("voltage sign", lambda run: evolve(run, voltage=-run.voltage), "voltage", "sign"),
     ("speed sign", lambda run: evolve(run, speed=-run.speed), "speed", "sign"),
     ("current sign", lambda run: evolve(run, current=-run.current), "current", "sign"),
@@ -240,7 +239,7 @@ FAULTS = [
     ("late speed", lambda run: shifted(run, speed=8), "speed", "late"),
     ("early speed", lambda run: shifted(run, speed=-8), "speed", "early"),
     ("late both", lambda run: shifted(run, speed=8, current=8), "voltage", "8 samples"),
-    ("buried speed", buried, "speed", "it varies less than its noise"),
+    ("buried speed", with_strong_noise, "speed", "it varies less than its noise"),
     ("angle in degrees", lambda run: with_angle(run, 180 / np.pi), "angle", "in degrees"),
     ("speed in rpm by angle", lambda run: with_angle(run, 1 / RPM), "angle", "speed were in rpm"),
     ("angle the other way", lambda run: with_angle(run, -1), "angle", "wrong sign"),
@@ -255,12 +254,13 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "inject", "column", "what"), FAULTS, ids=[f[0] for f in FAULTS])
-def test_each_fault_is_found(name, inject, column, what):
-    del name
+@pytest.mark.parametrize(
+    ("inject", "column", "what"), [pytest.param(*fault, id=name) for name, *fault in FAULTS]
+)
+def test_each_fault_is_found(inject, column, what):
     for seed in (1, 7, 13):
         run = good_run(seed, "prbs", noise=1e-3)
-        found = told([inject(run)])
+        found = problems([inject(run)])
         assert any(f.column == column and what in f.what for f in found), (run.name, found)
 
 
@@ -274,55 +274,56 @@ def test_each_fault_is_found(name, inject, column, what):
         (lambda run: evolve(run, current=1e3 * run.current), "current", "in mA, not A"),
     ],
 )
-def test_a_known_load_shows_wrong_units_and_its_own_sign(fault, column, what):
+def test_a_known_load_reveals_wrong_units_and_a_wrong_sign_of_the_load(fault, column, what):
     for seed in range(1, 15, 2):
         runs = [good_run(seed, "steps"), good_run(seed, "load_cycles")]
-        assert told(runs) == []
-        found = told([fault(run) for run in runs])
+        assert problems(runs) == []
+        found = problems([fault(run) for run in runs])
         assert any(f.column == column and what in f.what for f in found)
 
 
-def test_signs_are_found_for_every_motor_and_excitation():
+def test_wrong_signs_are_found_for_every_motor_and_excitation():
     for seed in range(18):
         for column in ("voltage", "current", "speed"):
             run = good_run(seed)
-            found = told([evolve(run, **{column: -getattr(run, column)})])
+            found = problems([evolve(run, **{column: -getattr(run, column)})])
             assert [f.column for f in found if "sign" in f.what] == [column]
 
 
 @pytest.mark.parametrize("columns", [("speed",), ("current",), ("current", "speed")])
-def test_channels_without_a_sign_are_found(columns):
+def test_unsigned_channels_are_found(columns):
     for seed in range(6):
         run = good_run(seed, "steps")
-        bare = evolve(run, **{column: np.abs(getattr(run, column)) for column in columns})
-        found = [f for f in told([bare]) if "its sign is missing" in f.what]
+        unsigned = evolve(run, **{column: np.abs(getattr(run, column)) for column in columns})
+        found = [f for f in problems([unsigned]) if "its sign is missing" in f.what]
         assert [f.column for f in found] == list(columns), seed
 
 
-def test_nothing_at_all_is_an_error():
+def test_a_run_without_any_variation_is_an_error():
     t = np.arange(100) / 100
     flat = Recording("flat", t, np.full(100, 5.0), np.ones(100), np.full(100, 40.0))
     assert [f.severity for f in check([flat])] == ["error"]
 
 
-def test_a_blocked_shaft_is_said():
+def test_a_blocked_shaft_gives_a_warning():
     run = good_run(0, "steps")
     blocked = evolve(run, name="blocked", speed=np.zeros(len(run)))
-    assert [(f.column, f.severity) for f in told([blocked])] == [("speed", "warning")]
-    assert told([run, blocked]) == []
+    assert [(f.column, f.severity) for f in problems([blocked])] == [("speed", "warning")]
+    assert problems([run, blocked]) == []
 
 
 def test_slow_sampling_is_noted():
     found = check([good_run(0, "steps")]), check([good_run(5, "steps", samples=3000)])
     assert all(isinstance(findings, tuple) for findings in found)
-    motor, count = (1.0, 1e-5, 0.05, 0.05, 1e-4, 1e-6), 2000
+    motor = {"R": 1.0, "L": 1e-5, "Kb": 0.05, "Kt": 0.05, "J": 1e-4, "f": 1e-6}
+    count = 2000
     voltage = 12.0 * (np.arange(count) // 200 % 2)
     i, w = simulate(motor, 1e-3, voltage, np.zeros(count))
     (note,) = check([Recording("slow", np.arange(count) * 1e-3, voltage, i, w)])
     assert note.severity == "note" and "settles within one sample" in note.what
 
 
-def test_a_million_rows_take_less_than_a_second():
+def test_a_million_rows_are_checked_in_seconds():
     run, count = good_run(7, "prbs"), 1_000_000
     repeated = {q: np.resize(values, count) for q, values in run.columns().items()}
     big = evolve(run, **repeated | {"time": np.arange(count) * run.sample_time})

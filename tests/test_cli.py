@@ -1,4 +1,4 @@
-"""The command line: exit status, messages, and where the output goes; the long work is faked."""
+"""The command line: exit status, messages, and destinations of the output; computations are replaced by fakes."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def replace_function(monkeypatch, module: str, name: str, function) -> None:
 
 
 @pytest.fixture
-def faked(monkeypatch, tmp_path):
-    """Reading, identifying and saving replaced; what they were called with is kept."""
+def faked(monkeypatch, tmp_path, no_terminal):
+    """Fakes of reading, identifying, diagnosing and saving, which store their arguments."""
     calls = SimpleNamespace(identify=None, read=[], saved=[], result=fake_identification(400))
     calls.diagnosis = named()
 
@@ -58,14 +58,12 @@ def faked(monkeypatch, tmp_path):
     replace_function(monkeypatch, "pmdc_jax.diagnose", "diagnose", diagnose)
     replace_function(monkeypatch, "pmdc_jax.recording_file", "read_recording", read_recording)
     replace_function(monkeypatch, "pmdc_jax.motor_file", "save_motor", save_motor)
-    for variable in ("FORCE_COLOR", "TTY_COMPATIBLE"):  # rich takes these for a terminal
-        monkeypatch.delenv(variable, raising=False)
     monkeypatch.chdir(tmp_path)
     return calls
 
 
 def refused(capsys, *arguments: str) -> str:
-    """The one message of a command that must exit with 2 and print nothing else."""
+    """The message of a command, which must exit with 2 and print nothing else."""
     assert cli.main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -94,14 +92,14 @@ def test_help_is_quick():
         children = resource.getrusage(resource.RUSAGE_CHILDREN)
         return children.ru_utime + children.ru_stime
 
-    def once() -> float:
-        """Of the processor: it does one thing at a time, and other work beside does not count."""
+    def time_of_help() -> float:
+        """Processor time, which other processes do not affect."""
         start = used()
         shown = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
         assert b"identify" in shown.stdout
         return used() - start
 
-    assert min(once() for _ in range(10)) < 0.4
+    assert min(time_of_help() for _ in range(10)) < 0.4
 
 
 def test_importing_the_command_line_imports_nothing_heavy():
@@ -110,7 +108,7 @@ def test_importing_the_command_line_imports_nothing_heavy():
     assert not set(HEAVY) & set(shown.stdout.split())
 
 
-def test_identify_passes_every_option_on(faked, capsys):
+def test_identify_passes_on_every_option(faked, capsys):
     arguments = (
         "identify a.csv b.csv --holdout c.csv --seed 7 --column speed=rpm_meas:rpm --tie Kt=Kb"
         " --known R=0.157 --unloaded --effect coulomb_friction --search genetic"
@@ -148,7 +146,7 @@ def test_identify_prints_parameters_and_runs(faked, capsys):
     assert "Runs without voltage" in err
 
 
-def test_json_on_standard_output_stands_alone(faked, capsys):
+def test_json_is_all_that_goes_to_standard_output(faked, capsys):
     faked.result = partial_identification()
     assert cli.main(["identify", "a.csv", "--json", "-"]) == 0
     out, err = capsys.readouterr()
@@ -167,7 +165,7 @@ def test_outputs_are_written(faked, capsys, tmp_path):
     assert json.loads((tmp_path / "fit.json").read_text())["converged"] is True
 
 
-def test_diagnose_passes_every_option_on(faked, capsys):
+def test_diagnose_passes_on_every_option(faked, capsys):
     arguments = (
         "diagnose a.csv b.csv --holdout c.csv --seed 7 --column speed=rpm_meas:rpm --tie Kt=Kb"
         " --known R=0.157 --unloaded --search genetic"
@@ -190,7 +188,7 @@ def test_diagnose_passes_every_option_on(faked, capsys):
     assert err == ""
 
 
-def test_diagnose_writes_what_is_asked_for(faked, capsys, tmp_path):
+def test_diagnose_writes_the_requested_files(faked, capsys, tmp_path):
     faked.diagnosis = ambiguous()
     arguments = "diagnose a.csv --save m.json --json d.json --report d.html --experiment next.csv"
     assert cli.main(arguments.split()) == 0
@@ -199,7 +197,7 @@ def test_diagnose_writes_what_is_asked_for(faked, capsys, tmp_path):
     assert json.loads((tmp_path / "d.json").read_text())["verdict"] == "ambiguous"
 
 
-def test_diagnose_without_an_experiment_says_so(faked, capsys, tmp_path):
+def test_diagnose_states_if_there_is_no_experiment_to_write(faked, capsys, tmp_path):
     assert cli.main(["diagnose", "a.csv", "--json", "-", "--experiment", "next.csv"]) == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["verdict"] == "named"
@@ -207,7 +205,7 @@ def test_diagnose_without_an_experiment_says_so(faked, capsys, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_diagnose_tells_bad_input_in_one_message(faked, capsys):
+def test_diagnose_reports_bad_input_in_one_message(faked, capsys):
     faked.result = InputError("a.csv, line 3", "time runs backwards", "Sort the rows")
     assert "a.csv, line 3: time" in refused(capsys, "diagnose", "a.csv")
 
@@ -239,7 +237,7 @@ def test_diagnose_tells_bad_input_in_one_message(faked, capsys):
         ("simulate motor.json --input a.csv --out a.csv", ["--out", "an input"]),
     ],
 )
-def test_bad_arguments_are_refused_before_the_work(faked, capsys, arguments, names):
+def test_bad_arguments_are_refused_before_anything_is_read(faked, capsys, arguments, names):
     message = refused(capsys, *arguments.split())
     assert all(name in message for name in names), message
     assert faked.identify is None
@@ -257,18 +255,18 @@ def test_bad_arguments_are_refused_before_the_work(faked, capsys, arguments, nam
         (OSError(28, "No space left on device"), "No space left"),
     ],
 )
-def test_bad_input_is_told_in_one_message(faked, capsys, problem, text):
+def test_bad_input_is_reported_in_one_message(faked, capsys, problem, text):
     faked.result = problem
     assert text in refused(capsys, "identify", "a.csv")
 
 
-def test_interrupt(faked, capsys):
+def test_an_interrupt_exits_with_130(faked, capsys):
     faked.result = KeyboardInterrupt()
     assert cli.main(["identify", "a.csv"]) == 130
     assert capsys.readouterr() == ("", "pmdc: interrupted\n")
 
 
-def test_a_program_error_is_not_hidden(faked):
+def test_a_defect_of_the_program_is_not_hidden(faked):
     faked.result = ZeroDivisionError("a bug")
     with pytest.raises(ZeroDivisionError):
         cli.main(["identify", "a.csv"])
@@ -290,7 +288,7 @@ def test_simulate_reads_simulates_and_writes(faked, monkeypatch, capsys):
 
 @pytest.fixture
 def faked_tuning(monkeypatch):
-    """Tuning replaced, and the writing of what it comes to; what it was called with is kept."""
+    """Fakes of tuning, which stores its arguments, and of writing its results."""
     calls = SimpleNamespace(tune=None)
 
     def tune(motor, controller, **options):
@@ -329,13 +327,13 @@ def test_demo_refuses_a_file_as_folder(faked, capsys, tmp_path):
     assert faked.identify is None
 
 
-def test_short_work_is_silent_without_a_terminal(faked, capsys):
+def test_a_short_computation_prints_no_progress_without_a_terminal(faked, capsys):
     assert cli.main(["identify", "a.csv"]) == 0
     faked.identify[1]["progress"]("searching", fitness=1.0)
     assert capsys.readouterr().err == ""
 
 
-def test_long_work_speaks_now_and_then_without_a_terminal(monkeypatch, capsys):
+def test_a_long_computation_prints_progress_now_and_then_without_a_terminal(monkeypatch, capsys):
     seconds = iter([0.0, 14.0, 16.0, 16.0, 17.0])
     monkeypatch.setattr(terminal, "SECONDS_BETWEEN_LINES", 15.0)
     monkeypatch.setattr(terminal, "monotonic", lambda: next(seconds))
@@ -345,7 +343,7 @@ def test_long_work_speaks_now_and_then_without_a_terminal(monkeypatch, capsys):
     assert capsys.readouterr().err == "after 16 s: searching, best fitness 12.35\n"
 
 
-def test_progress_tells_what_it_does_on_a_terminal(monkeypatch, capsys):
+def test_progress_is_shown_on_a_terminal(monkeypatch, capsys):
     monkeypatch.setenv("FORCE_COLOR", "1")
     with terminal.progress() as report:
         report("searching, generation 12", fitness=1.0234, fraction=0.4)
@@ -359,7 +357,7 @@ CACHE = "JAX_COMPILATION_CACHE_DIR"
 
 
 def cache_folder(monkeypatch, **environment: str) -> str | None:
-    """Where JAX is told to keep what it compiles, in this environment."""
+    """The cache folder that JAX is given in this environment."""
     monkeypatch.setattr("os.environ", environment)
     keep_compiled()
     return environment.get(CACHE)
@@ -368,15 +366,15 @@ def cache_folder(monkeypatch, **environment: str) -> str | None:
 def test_compiled_code_goes_to_the_users_cache(monkeypatch, tmp_path):
     folder = cache_folder(monkeypatch, HOME=str(tmp_path), XDG_CACHE_HOME=str(tmp_path / "c"))
     assert "pmdc_jax" in folder
-    assert not Path(folder).exists()  # that is left to JAX, when there is something to keep
+    assert not Path(folder).exists()  # JAX makes it when it has something to store
 
 
-def test_compiled_code_goes_where_the_user_says(monkeypatch, tmp_path):
+def test_environment_variables_set_the_folder_of_compiled_code(monkeypatch, tmp_path):
     assert Path(cache_folder(monkeypatch, PMDC_CACHE=str(tmp_path / "new"))).parent.name == "new"
     assert cache_folder(monkeypatch, PMDC_CACHE=str(tmp_path), **{CACHE: "mine"}) == "mine"
 
 
-def test_no_compiled_code_is_kept_where_that_is_unwanted_or_impossible(monkeypatch, tmp_path):
+def test_no_compiled_code_is_kept_if_disabled_or_impossible(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     assert cache_folder(monkeypatch, PMDC_CACHE="") is None
     assert cache_folder(monkeypatch, PMDC_CACHE=str(tmp_path / "file")) is None
@@ -408,7 +406,7 @@ def test_jax_keeps_what_the_command_compiles(tmp_path, code, kept):
     assert bool(list(tmp_path.rglob("*-cache"))) == kept
 
 
-def test_a_parameter_that_no_run_knows_of_is_printed(faked, capsys):
+def test_a_parameter_without_a_value_is_printed(faked, capsys):
     R = Estimate(None, None, None, "ohm", "not_identifiable")
     faked.result = evolve(faked.result, parameters=faked.result.parameters | {"R": R})
     assert cli.main(["identify", "a.csv"]) == 0

@@ -1,4 +1,4 @@
-"""Records of uneven clocks: motors stepped exactly from stamp to stamp, and who is to be believed."""
+"""Recordings with uneven time stamps: samples taken unevenly, or evenly with only the stamps uneven."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from pmdc_jax.recording import Recording
 from pmdc_jax.simulate import uniform
 from pmdc_jax.simulate.uneven import mean_and_rise, pieces_of, seen_at_record
 
-# its current settles within a sample: L shows in when samples came
+# the current settles within a sample, so L is identified only if the sampling times are right
 MOTOR = {"R": 1.0, "L": 3.4e-4, "Kb": 0.07, "Kt": 0.07, "J": 1.16e-4, "f": 1.1e-4}
 NOISE = np.array([0.05, 0.3])
 STEP = 1e-3
 
 
 def stamps(kind: str, count: int, rng: np.random.Generator) -> np.ndarray:
-    """When samples are taken, s: about an even clock, with steps of any length, or at two rates."""
+    """Sampling times, s: even, jittered about even ones, with steps of random length, or at two rates."""
     if kind == "jitter":
         return STEP * (np.arange(count) + rng.uniform(-0.4, 0.4, count))
     steps = {
@@ -33,8 +33,8 @@ def stamps(kind: str, count: int, rng: np.random.Generator) -> np.ndarray:
     return STEP * np.append(0.0, np.cumsum(steps[1:]))
 
 
-def rates() -> np.ndarray:
-    """Of current, speed, voltage and load, 1/s; the latter two are held."""
+def state_matrix() -> np.ndarray:
+    """Of current, speed, voltage and load, 1/s; the last two are constant."""
     m = MOTOR
     A = np.zeros((4, 4))
     A[0, :3] = -m["R"] / m["L"], -m["Kb"] / m["L"], 1 / m["L"]
@@ -48,7 +48,7 @@ def record(time: np.ndarray, rng: np.random.Generator, noise: np.ndarray = NOISE
         : len(time)
     ]
     load = np.repeat(rng.uniform(-0.1, 0.1, len(time)), 150)[: len(time)]
-    values, vectors = np.linalg.eig(rates())
+    values, vectors = np.linalg.eig(state_matrix())
     back, states = np.linalg.inv(vectors), np.zeros((len(time), 2))
     for k, step in enumerate(np.diff(time)):
         whole = back @ np.r_[states[k], voltage[k], load[k]]
@@ -59,13 +59,13 @@ def record(time: np.ndarray, rng: np.random.Generator, noise: np.ndarray = NOISE
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["walk", "jitter", "two rates"])
-def test_motors_are_found_in_records_of_uneven_clocks(kind):
+def test_a_motor_is_identified_from_uneven_samples(kind):
     rng = np.random.default_rng(21)
     run = record(stamps(kind, 2400, rng), rng)
     result = pmdc_jax.identify([run])
     for name, true in MOTOR.items():
         estimate = result.parameters[name]
-        # of friction so short a run tells a per cent at best
+        # so short a run determines friction to a few per cent only
         assert abs(estimate.value / true - 1) < (0.05 if name == "f" else 0.01), name
         assert abs(estimate.value - true) < 3 * estimate.stderr, name
     fit = result.fit["r"]
@@ -82,8 +82,8 @@ def test_a_linear_motor_is_simulated_exactly_at_uneven_stamps(kind):
     np.testing.assert_allclose(found.current, run.current, atol=1e-9 * np.ptp(run.current))
 
 
-def test_what_goes_straight_between_uneven_stamps_has_its_mean_and_first_moment():
-    """By quadrature over each even sample; at the stamps, the motor against many short held steps."""
+def test_an_interpolated_voltage_keeps_its_mean_and_first_moment_in_every_even_sample():
+    """Against quadrature over each even sample; and the motor at the stamps against many short steps."""
     rng = np.random.default_rng(23)
     run = record(stamps("walk", 60, rng), rng, 0 * NOISE)
     even = uniform(run)
@@ -94,7 +94,7 @@ def test_what_goes_straight_between_uneven_stamps_has_its_mean_and_first_moment(
         assert mean[k] == pytest.approx(drive.mean(), abs=1e-4)
         assert rise[k] == pytest.approx(12 * np.mean((share - 0.5) * drive), abs=1e-3)
     fine, unloaded = 400, attrs.evolve(even, load=None, resampled_from=attrs.evolve(run, load=None))
-    line = expm(rates() * even.sample_time / fine)
+    transition = expm(state_matrix() * even.sample_time / fine)
     straight, true = np.zeros((2, len(even) * fine + 1, 4))
     middles = (np.arange(fine) + 0.5) / fine
     for k in range(len(even) * fine):
@@ -102,13 +102,14 @@ def test_what_goes_straight_between_uneven_stamps_has_its_mean_and_first_moment(
         now = even.time[at] + even.sample_time * middles[part]
         straight[k, 2] = mean[at] + rise[at] * (middles[part] - 0.5)
         true[k, 2] = np.interp(now, run.time, run.voltage)
-        straight[k + 1, :2], true[k + 1, :2] = (line @ straight[k])[:2], (line @ true[k])[:2]
+        for states in (straight, true):
+            states[k + 1, :2] = (transition @ states[k])[:2]
     seen = straight[:-1:fine, :2]
     then = seen_at_record(Motor(**MOTOR), Drive(), unloaded, seen, straight=True)
     times = even.time[0] + even.sample_time / fine * np.arange(len(true))
     for c in range(2):
         want = np.interp(run.time, times, true[:, c])
-        # by steps short beside any motion
+        # the error of the short steps
         np.testing.assert_allclose(then[:, c], want, atol=1e-4 * np.ptp(want))
 
 
@@ -121,16 +122,16 @@ def test_pieces_cover_every_even_sample_once():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_stamps_of_a_computer_beside_an_even_clock_are_not_believed(seed):
-    """Those of samples that were late themselves are: by what their speed says of it."""
+def test_jittered_stamps_of_even_samples_are_replaced_by_even_ones(seed):
+    """Stamps of samples that were truly taken unevenly are kept: the speed tells the two apart."""
     rng = np.random.default_rng(30 + seed)
-    late = stamps("jitter", 2000, rng)
-    true = record(late, rng)
+    jittered = stamps("jitter", 2000, rng)
+    true = record(jittered, rng)
     assert not is_even(evenly_stamped(true).time)
-    stamped = attrs.evolve(record(stamps("even", 2000, rng), rng), time=late)
-    believed = evenly_stamped(stamped)
-    assert is_even(believed.time)
-    assert believed.time[-1] == pytest.approx(STEP * 1999, abs=STEP / 10)
+    stamped = attrs.evolve(record(stamps("even", 2000, rng), rng), time=jittered)
+    corrected = evenly_stamped(stamped)
+    assert is_even(corrected.time)
+    assert corrected.time[-1] == pytest.approx(STEP * 1999, abs=STEP / 10)
 
 
 def test_a_long_gap_is_refused():

@@ -1,4 +1,4 @@
-"""Closed loops, their metrics and their limit, against closed forms, scipy and python-control."""
+"""Closed loops, their metrics and the fastest settling, against closed forms, scipy and python-control."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from linear_motor import PAPER, exact_step, state_space
 from scipy.optimize import brentq
 
-from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError
 from pmdc_jax.control import (
     CONTROLLERS,
@@ -41,7 +40,6 @@ from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.motor_file import Uncertainty
 from pmdc_jax.simulate.propagator import steps_within
 
-PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 MOTOR = Motor(**PAPER)
 SETPOINT = 481.0
 LAWS = {
@@ -57,21 +55,12 @@ run = eqx.filter_jit(closed_loop)
 
 @pytest.fixture(autouse=True)
 def _double(x64):
-    """All of this file in double precision."""
+    """Double precision in all tests of this file."""
 
 
 def course(samples: int, load: float = 0.0, load_from: int = 0, initial: float = 0.0) -> Course:
     loads = jnp.where(jnp.arange(samples) < load_from, 0.0, load)
     return Course(jnp.full(samples, SETPOINT), loads, jnp.zeros(samples), initial)
-
-
-def matrices(step: float) -> tuple[np.ndarray, np.ndarray]:
-    """The exact step of the paper's motor by scipy."""
-    R, L, Kb, Kt, J, f = PAPER.values()
-    whole = np.zeros((4, 4))
-    whole[:2] = [[-R / L, -Kb / L, 1 / L, 0.0], [Kt / J, -f / J, 0.0, -1 / J]]
-    moved = expm(whole * step)
-    return moved[:2, :2], moved[:2, 2:]
 
 
 @pytest.mark.parametrize("kind", CONTROLLERS.values(), ids=CONTROLLERS.keys())
@@ -80,7 +69,7 @@ def test_every_gain_has_a_unit_and_every_coordinate_a_range(kind):
     assert set(kind.coordinates) <= set(RANGES)
 
 
-# ------------------------------------------------------------------------------------------ limit
+# ------------------------------------------------------------------------------- fastest settling
 
 
 @pytest.mark.parametrize(
@@ -98,20 +87,19 @@ def test_every_gain_has_a_unit_and_every_coordinate_a_range(kind):
         (48, 50, 0.0900),
     ],
 )
-def test_the_fastest_settling_is_the_known_one(volts, amperes, seconds):
+def test_the_fastest_settling_matches_known_values(volts, amperes, seconds):
     found = fastest_settling(MOTOR, SETPOINT, float(volts), amperes and float(amperes))
     assert found == pytest.approx(seconds, abs=5.5e-5)  # they are given to four decimals
 
 
-def test_the_fastest_settling_brakes_in_time():
-    """At 400 V the current that gets there fastest would shoot through the band of a small step. The one switch whose
-    turning point just touches the far edge, by scipy from the motor's eigenvalues."""
+def test_the_fastest_settling_includes_braking_within_the_band():
+    """At 400 V the fastest acceleration to a small set point would overshoot its band. The expected time is that of the
+    one reversal of the voltage whose peak just touches the far edge, by scipy from the eigenvalues of the motor."""
     target, volts = 20.0, 400.0
-    R, L, Kb, Kt, J, f = PAPER.values()
-    A, B = np.array([[-R / L, -Kb / L], [Kt / J, -f / J]]), np.array([1 / L, 0.0])
-    values, vectors = (
-        part.real for part in np.linalg.eig(A)
-    )  # both are real, also where NumPy's type is not
+    A, B = state_space(PAPER)
+    B = B[:, 0]
+    # both are real, even if their type in NumPy is complex
+    values, vectors = (part.real for part in np.linalg.eig(A))
 
     def speeds(x, volts, times):
         rest = np.linalg.solve(A, -B * volts)
@@ -119,9 +107,9 @@ def test_the_fastest_settling_brakes_in_time():
         return rest[1] + (vectors[1] * modes * np.exp(np.outer(times, values))).sum(1)
 
     def after(switch):
-        moved, _ = matrices(switch)
+        transition, _ = exact_step(PAPER, switch)
         rest = np.linalg.solve(A, -B * volts)
-        return rest + moved @ -rest
+        return rest + transition @ -rest
 
     times = np.linspace(0, 1e-3, 100_001)
     switch = brentq(
@@ -130,18 +118,20 @@ def test_the_fastest_settling_brakes_in_time():
     braking = speeds(after(switch), -volts, times)
     best = switch + np.interp(0.98 * target, braking[: braking.argmax()], times[: braking.argmax()])
     found = fastest_settling(MOTOR, target, volts)
-    assert found == pytest.approx(best, rel=3e-4)  # twice the distance of its instants
-    flat_out = brentq(lambda t: speeds(np.zeros(2), volts, [t])[0] - 0.98 * target, 1e-4, 8e-4)
-    assert best > flat_out * 1.01
+    assert found == pytest.approx(best, rel=3e-4)  # twice its resolution in time
+    without_braking = brentq(
+        lambda t: speeds(np.zeros(2), volts, [t])[0] - 0.98 * target, 1e-4, 8e-4
+    )
+    assert best > without_braking * 1.01
 
 
-def test_what_is_out_of_reach_has_no_fastest_settling():
+def test_an_unreachable_set_point_has_no_fastest_settling():
     assert fastest_settling(MOTOR, 600.0, 24.0) is None
     # a torque that drives the motor through the band, whatever the voltage
     assert fastest_settling(MOTOR, SETPOINT, 30.0, load=-300.0) is None
 
 
-def test_braking_has_a_limit_too():
+def test_braking_has_a_shorter_fastest_settling_than_acceleration():
     down = fastest_settling(MOTOR, 240.5, 30.0, None, 481.0)
     up = fastest_settling(MOTOR, 481.0, 30.0, None, 240.5)
     assert 0 < down < up
@@ -151,7 +141,7 @@ def test_braking_has_a_limit_too():
 
 
 @pytest.mark.parametrize("damping", [0.2, 0.5, 0.8])
-def test_metrics_of_a_second_order_response_are_the_closed_form(damping):
+def test_metrics_of_a_second_order_response_match_the_closed_form(damping):
     natural, final, initial = 50.0, 481.0, 100.0
     time = np.linspace(0, 1.0, 200_001)
     damped = natural * np.sqrt(1 - damping**2)
@@ -162,10 +152,10 @@ def test_metrics_of_a_second_order_response_are_the_closed_form(damping):
     assert float(found.PeakTime) == pytest.approx(np.pi / damped, rel=1e-6)
 
     def root(level, low, high):
-        def off(t):
+        def error(t):
             return 1 - np.exp(-decay * t) * np.sin(damped * t + lag) / np.sin(lag) - level
 
-        return brentq(off, low, high, xtol=1e-15)
+        return brentq(error, low, high, xtol=1e-15)
 
     rise = root(0.9, 0, np.pi / damped) - root(0.1, 0, np.pi / damped)
     assert float(found.RiseTime) == pytest.approx(rise, rel=1e-6)
@@ -182,7 +172,7 @@ def test_metrics_agree_with_python_control():
     _, speed = ct.step_response(ct.tf([3.0, 900.0], [1.0, 25.0, 900.0]), time)
     theirs = ct.step_info(speed, time, SettlingTimeThreshold=0.02)
     ours = step_metrics(jnp.asarray(time), jnp.asarray(speed), float(speed[-1]))
-    for name in ("RiseTime", "SettlingTime", "PeakTime"):  # theirs are times of samples
+    for name in ("RiseTime", "SettlingTime", "PeakTime"):  # theirs are multiples of the sample time
         assert float(getattr(ours, name)) == pytest.approx(theirs[name], abs=1.5e-4)
     for name in ("Overshoot", "Peak"):
         assert float(getattr(ours, name)) == pytest.approx(theirs[name], rel=1e-3)
@@ -202,7 +192,7 @@ def test_a_dip_is_an_undershoot_and_not_an_overshoot():
     assert float(found.Overshoot) == 0
 
 
-def test_smooth_metrics_become_the_exact_ones():
+def test_smooth_metrics_converge_to_the_exact_ones():
     response = run(MOTOR, Law.of(LAWS["pid"], SAMPLED, MOTOR), course(128), 50)
     time, speed = response.time, response.speed
     exact = step_metrics(time, speed, SETPOINT)
@@ -242,18 +232,18 @@ def test_gradients_agree_with_finite_differences_in_saturation(name):
 # ------------------------------------------------------------------------------------------- loop
 
 
-def test_the_sampled_loop_is_that_of_an_independent_one():
-    """PI by hand in numpy: quantised speed, a sample of delay, saturation, back-calculation, a load."""
+def test_the_sampled_loop_matches_a_loop_in_numpy():
+    """A PI loop with quantised speed, a sample of delay, saturation, back-calculation and a load."""
     samples, step, volts, quantum, load = 150, 1e-3, 30.0, 0.1, 0.5
     kp, ki, weight, tracking = 0.3, 20.0, 1.2, 0.01
-    A, B = matrices(step)
+    A, B = exact_step(PAPER, step)
     x, integral, pending, speeds = np.zeros(2), 0.0, 0.0, []
     for k in range(samples):
         speeds.append(x[1])
         measured = np.round(x[1] / quantum) * quantum
-        asked = kp * (weight * SETPOINT - measured) + integral
-        applied = np.clip(asked, -volts, volts)
-        integral += step * (ki * (SETPOINT - measured) + (applied - asked) / tracking)
+        command = kp * (weight * SETPOINT - measured) + integral
+        applied = np.clip(command, -volts, volts)
+        integral += step * (ki * (SETPOINT - measured) + (applied - command) / tracking)
         x = A @ x + B @ [pending, load if k >= 100 else 0.0]
         pending = applied
     law = Law.of(LAWS["pi"], SAMPLED, MOTOR)
@@ -261,7 +251,7 @@ def test_the_sampled_loop_is_that_of_an_independent_one():
     np.testing.assert_allclose(found.speed, speeds, rtol=0, atol=1e-7)
 
 
-def test_what_lies_between_samples_changes_nothing_at_them():
+def test_steps_between_samples_do_not_change_the_response_at_samples():
     law = Law.of(LAWS["pid"], SAMPLED, MOTOR)
     coarse, fine = (run(MOTOR, law, course(80, 0.3, 40), n) for n in (1, 10))
     np.testing.assert_allclose(fine.speed[::10], coarse.speed, atol=1e-8)
@@ -269,7 +259,7 @@ def test_what_lies_between_samples_changes_nothing_at_them():
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_the_sampled_loop_becomes_the_continuous_one(name):
+def test_the_sampled_loop_converges_to_the_continuous_one(name):
     times = jnp.linspace(0, 0.06, 601)
     ideal = continuous_loop(MOTOR, LAWS[name], times, SETPOINT, 30.0)
     errors = []
@@ -282,7 +272,7 @@ def test_the_sampled_loop_becomes_the_continuous_one(name):
 
 
 @pytest.mark.parametrize("name", ["pi", "pid", "state-feedback-integral"])
-def test_integral_action_leaves_no_error_under_load(name):
+def test_integral_action_leaves_no_steady_state_error_under_load(name):
     law = Law.of(LAWS[name], Hardware(1e-3, 30.0, None, None, 1), MOTOR)
     response = run(MOTOR, law, course(600, 0.5, 150))
     found = load_metrics(response.time[150:], response.speed[150:], SETPOINT)
@@ -290,14 +280,14 @@ def test_integral_action_leaves_no_error_under_load(name):
     assert float(found.RecoveryTime) < 0.05
 
 
-def test_plain_state_feedback_keeps_the_error_that_its_gain_leaves():
+def test_state_feedback_without_integral_action_has_the_calculated_error_under_load():
     hardware = Hardware(1e-3, 30.0, None, None, 1)
     law = Law.of(state_feedback(MOTOR, [-300.0, -300.0], SETPOINT, 1e-3), hardware, MOTOR)
     response = run(MOTOR, law, course(600, 0.5, 150))
     K = law.controller
-    A, B = matrices(1e-3)
+    A, B = exact_step(PAPER, 1e-3)
     gain = np.array([float(K.current_gain), float(K.speed_gain)])
-    # unknowns i, w, v: the motor rests against the load; what is fed back was predicted without it
+    # unknowns i, w, v in steady state under the load; the state that is fed back was predicted without it
     balance = np.zeros((3, 3))
     balance[:2, :2], balance[:2, 2] = np.eye(2) - A, -B[:, 0]
     balance[2, :2], balance[2, 2] = gain @ A, 1 + gain @ B[:, 0]
@@ -307,7 +297,7 @@ def test_plain_state_feedback_keeps_the_error_that_its_gain_leaves():
     assert float(response.speed[-1]) == pytest.approx(speed, abs=1e-6)
 
 
-def test_a_held_motor_stays_where_it_is():
+def test_a_loop_that_starts_in_steady_state_stays_there():
     for controller in LAWS.values():
         law = Law.of(controller, Hardware(1e-3, 30.0, 100.0, None, 1), MOTOR)
         steady = Course(jnp.full(30, 300.0), jnp.zeros(30), jnp.zeros(30), 300.0)
@@ -324,9 +314,9 @@ def test_the_current_stays_within_its_limit(delay, measured):
     assert float(jnp.max(response.current)) > 59.0
 
 
-def test_the_observer_finds_the_current_whatever_the_load():
-    """State feedback from estimated current is that from measured current, a load step later as well."""
-    seen, estimated = (
+def test_the_observer_estimates_the_current_despite_a_load():
+    """State feedback of the estimated current matches that of the measured one, also after a load step."""
+    measured, estimated = (
         run(
             MOTOR,
             Law.of(LAWS["state-feedback-integral"], Hardware(1e-3, 30.0, None, None, 1, m), MOTOR),
@@ -334,11 +324,11 @@ def test_the_observer_finds_the_current_whatever_the_load():
         )
         for m in (True, False)
     )
-    np.testing.assert_allclose(estimated.speed[-50:], seen.speed[-50:], atol=0.02)
-    assert float(jnp.abs(estimated.speed - seen.speed).max()) < 2.0
+    np.testing.assert_allclose(estimated.speed[-50:], measured.speed[-50:], atol=0.02)
+    assert float(jnp.abs(estimated.speed - measured.speed).max()) < 2.0
 
 
-def test_friction_that_sticks_and_a_warming_winding_close_the_loop_too():
+def test_a_loop_with_dry_friction_and_heating_reaches_its_set_point():
     def scalar(value):
         return jnp.asarray(float(value))
 
@@ -367,7 +357,7 @@ def test_friction_that_sticks_and_a_warming_winding_close_the_loop_too():
         ("gear_backlash", {"gap_rad": 1e-2, "stiffness_Nm_rad": 2800.0, "load_share": 0.7}),
     ],
 )
-def test_a_loop_through_slow_sensors_and_loose_gears_comes_to_its_set_point(name, parameters):
+def test_a_loop_with_a_slow_sensor_or_backlash_reaches_its_set_point(name, parameters):
     values = {"damping_Nms_rad": 0.01} | parameters if "gap_rad" in parameters else parameters
     effect = EFFECTS[name](**{field: jnp.asarray(value) for field, value in values.items()})
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
@@ -380,18 +370,18 @@ def test_a_loop_through_slow_sensors_and_loose_gears_comes_to_its_set_point(name
     )
 
 
-def test_a_late_speed_is_the_same_as_late_samples():
-    """A sensor late by two samples and a law at once, against the loop written out in numpy."""
+def test_a_loop_with_a_delayed_speed_matches_a_loop_in_numpy():
+    """A sensor with a delay of two samples, and a law without delay."""
     effect = EFFECTS["speed_sensor_delay"](delay_s=jnp.asarray(2e-3))
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
     law = Law.of(PI(0.05, 1.0, 1.0, 0.02), Hardware(1e-3, 30.0), motor)
-    A, B = matrices(1e-3)
+    A, B = exact_step(PAPER, 1e-3)
     x, integral, speeds = np.zeros(2), 0.0, [0.0, 0.0, 0.0]
     for _ in range(150):
         speeds.append(x[1])
-        asked = 0.05 * (SETPOINT - speeds[-3]) + integral
-        applied = np.clip(asked, -30, 30)
-        integral += 1e-3 * ((SETPOINT - speeds[-3]) + (applied - asked) / 0.02)
+        command = 0.05 * (SETPOINT - speeds[-3]) + integral
+        applied = np.clip(command, -30, 30)
+        integral += 1e-3 * ((SETPOINT - speeds[-3]) + (applied - command) / 0.02)
         x = A @ x + B[:, 0] * applied
     np.testing.assert_allclose(run(motor, law, course(150)).speed, speeds[3:], atol=1e-6)
 
@@ -399,7 +389,7 @@ def test_a_late_speed_is_the_same_as_late_samples():
 # ------------------------------------------------------------------------------- rules and margins
 
 
-def test_ackermann_puts_the_poles_where_they_are_wanted():
+def test_ackermann_places_the_poles():
     rng = np.random.default_rng(3)
     A, B = rng.standard_normal((4, 4)), rng.standard_normal(4)
     poles = np.array([-1.0, -2.0, -3 + 1j, -3 - 1j])
@@ -409,7 +399,7 @@ def test_ackermann_puts_the_poles_where_they_are_wanted():
 
 
 @pytest.mark.parametrize("poles", [[-200.0, -300.0], [-150 + 80j, -150 - 80j, -100.0]])
-def test_sampled_state_feedback_has_the_sampled_poles(poles):
+def test_sampled_state_feedback_has_the_given_poles(poles):
     controller = state_feedback(MOTOR, poles, SETPOINT, 1e-3)
     law = Law.of(controller, Hardware(1e-3, 30.0), MOTOR)
     found = np.linalg.eigvals(np.asarray(linear_loop(MOTOR, law).closed))
@@ -417,7 +407,7 @@ def test_sampled_state_feedback_has_the_sampled_poles(poles):
         assert np.abs(found - np.exp(pole * 1e-3)).min() < 1e-7
 
 
-def test_the_ideal_motor_never_oscillates_and_the_rule_says_why():
+def test_ziegler_nichols_refuses_a_loop_that_never_oscillates():
     with pytest.raises(InputError, match="two poles") as refusal:
         ziegler_nichols(MOTOR, None, "pid")
     assert "sample time" in refusal.value.mend
@@ -431,22 +421,22 @@ def test_at_the_ultimate_gain_a_pole_lies_on_the_unit_circle(delay):
     gain, period = ultimate_gain(MOTOR, hardware)
     law = Law.of(PI(gain, 0.0, 1.0, 1.0), hardware, MOTOR)
     poles = np.linalg.eigvals(np.asarray(linear_loop(MOTOR, law).closed))
-    turning = poles[np.abs(np.angle(poles)) > 1e-3]
-    nearest = turning[np.argmin(np.abs(np.abs(turning) - 1))]
+    oscillating = poles[np.abs(np.angle(poles)) > 1e-3]
+    nearest = oscillating[np.argmin(np.abs(np.abs(oscillating) - 1))]
     assert abs(nearest) == pytest.approx(1.0, abs=1e-4)
     assert 2 * np.pi / np.abs(np.angle(nearest)) * 1e-3 == pytest.approx(period, rel=1e-3)
 
 
 @pytest.mark.parametrize("delay", [0, 1])
-def test_margins_are_those_of_python_control(delay):
+def test_margins_match_python_control(delay):
     step = 1e-3
     controller = PI(0.3, 20.0, 1.0, 0.01)
     law = Law.of(controller, Hardware(step, 30.0, None, None, delay), MOTOR)
-    A, B = matrices(step)
+    A, B = exact_step(PAPER, step)
     motor = ct.ss2tf(ct.ss(A, B[:, :1], [[0, 1]], 0, step))
     integral = ct.tf([step * 20.0], [1, -1], step)
-    late = ct.tf([1], [1, 0], step) if delay else 1
-    gain, phase, _, _, crossing, _ = ct.stability_margins((0.3 + integral) * motor * late)
+    delay_element = ct.tf([1], [1, 0], step) if delay else 1
+    gain, phase, _, _, crossing, _ = ct.stability_margins((0.3 + integral) * motor * delay_element)
     found = margins(MOTOR, law)
     assert found.stable
     assert found.gain_margin == pytest.approx(gain, rel=1e-3)
@@ -454,7 +444,7 @@ def test_margins_are_those_of_python_control(delay):
     assert found.delay_margin_s == pytest.approx(np.radians(phase) / crossing, rel=1e-3)
 
 
-def test_the_sensitivity_peak_is_that_of_the_loop_gain():
+def test_the_sensitivity_peak_matches_the_loop_gain():
     for controller in LAWS.values():
         loop = linear_loop(MOTOR, Law.of(controller, SAMPLED, MOTOR))
         angle = np.geomspace(1e-3, np.pi, 48)
@@ -462,16 +452,16 @@ def test_the_sensitivity_peak_is_that_of_the_loop_gain():
         assert float(sensitivity_peak(loop)) == pytest.approx(direct, rel=1e-8)
 
 
-def test_noise_amplification_is_that_of_a_noisy_simulation():
+def test_noise_amplification_matches_a_simulation_with_noise():
     law = Law.of(LAWS["pid"], Hardware(1e-3, 1000.0, None, None, 1), MOTOR)
     noise = jnp.asarray(np.random.default_rng(0).standard_normal(40_000))
-    still = Course(jnp.full(40_000, 300.0), jnp.zeros(40_000), noise, 300.0)
-    response, found = run(MOTOR, law, still), margins(MOTOR, law)
+    steady = Course(jnp.full(40_000, 300.0), jnp.zeros(40_000), noise, 300.0)
+    response, found = run(MOTOR, law, steady), margins(MOTOR, law)
     assert float(jnp.std(response.voltage)) == pytest.approx(found.voltage_per_noise, rel=0.03)
     assert float(jnp.std(response.speed)) == pytest.approx(found.speed_per_noise, rel=0.05)
 
 
-def test_an_unstable_loop_is_said_to_be():
+def test_an_unstable_loop_is_recognised():
     gain, _ = ultimate_gain(MOTOR, SAMPLED)
     assert not margins(MOTOR, Law.of(PI(1.1 * gain, 0.0, 1.0, 1.0), SAMPLED, MOTOR)).stable
 
@@ -488,7 +478,7 @@ def test_drawn_motors_have_the_covariance_they_were_drawn_from():
     assert np.ptp(np.asarray(drawn.L)) == 0
 
 
-def test_a_spread_moves_all_six_alike():
+def test_an_even_spread_applies_to_all_six_parameters():
     drawn = drawn_motors(MOTOR, even_spread(0.1), 4000, 1)
     for name in PARAMETERS:
         assert np.std(np.log(np.asarray(getattr(drawn, name)))) == pytest.approx(0.1, rel=0.05)

@@ -1,4 +1,4 @@
-"""The law on file and in C: written, read, compiled, and compared sample by sample."""
+"""Control laws as JSON files and as C code: written, read, compiled, and compared sample by sample."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_control import LAWS, MOTOR, SAMPLED, SETPOINT, course, run
+from test_motor_file import with_value
 
 from pmdc_jax import InputError, export, load_controller, save_controller
 from pmdc_jax.control import Hardware, Law
@@ -19,9 +20,9 @@ from pmdc_jax.control.controllers import Memory
 from pmdc_jax.control.law import LawState
 
 HARDWARE = {
-    "late, limited current": Hardware(1e-3, 30.0, 60.0, 0.1, 1),
-    "at once, no current sensor": Hardware(1e-3, 30.0, 45.0, None, 0, False),
-    "late, no current sensor or limit": Hardware(5e-4, 30.0, None, None, 1, False),
+    "delay, current limit": Hardware(1e-3, 30.0, 60.0, 0.1, 1),
+    "no delay, no current sensor": Hardware(1e-3, 30.0, 45.0, None, 0, False),
+    "delay, no current sensor or limit": Hardware(5e-4, 30.0, None, None, 1, False),
 }
 MAIN = r"""
 #include <stdio.h>
@@ -43,11 +44,11 @@ needs_gcc = pytest.mark.skipif(which("gcc") is None, reason="there is no gcc")
 
 @pytest.fixture(autouse=True)
 def _double(x64):
-    """All of this file in double precision."""
+    """Double precision in all tests of this file."""
 
 
 def inputs() -> np.ndarray:
-    """A drive that saturates, settles, reverses and shakes: reference, speed, current; (samples, 3)."""
+    """Reference, speed and current, (samples, 3), with which the law saturates, settles and reverses, in noise."""
     rng = np.random.default_rng(5)
     reference = np.repeat([481.0, 481.0, 240.5, -300.0, 0.0], 80)
     response = run(MOTOR, Law.of(LAWS["pid"], SAMPLED, MOTOR), course(400))
@@ -77,11 +78,11 @@ def in_c(folder, *options: str, samples: np.ndarray) -> np.ndarray:
 @needs_gcc
 @pytest.mark.parametrize("hardware", HARDWARE.values(), ids=HARDWARE.keys())
 @pytest.mark.parametrize("name", LAWS)
-def test_c_decides_what_python_decides(tmp_path, name, hardware):
+def test_the_law_in_c_matches_python(tmp_path, name, hardware):
     law, samples = Law.of(LAWS[name], hardware, MOTOR), inputs()
     export(law, tmp_path / "controller.h")
     expected = np.asarray(in_python(law, tuple(jnp.asarray(samples.T))))
-    assert np.ptp(expected) > 30, "the drive is too tame to show anything"
+    assert np.ptp(expected) > 30, "the inputs do not excite the law enough"
     np.testing.assert_allclose(in_c(tmp_path, samples=samples), expected, rtol=0, atol=1e-9)
     # single precision: speeds of 481 are held to 3e-5, which the gains magnify; the limits hide the rest
     single = in_c(tmp_path, "-DPMDC_REAL=float", samples=samples)
@@ -90,24 +91,15 @@ def test_c_decides_what_python_decides(tmp_path, name, hardware):
 
 @pytest.mark.parametrize("hardware", HARDWARE.values(), ids=HARDWARE.keys())
 @pytest.mark.parametrize("name", LAWS)
-def test_a_controller_file_round_trips_to_the_last_digit(tmp_path, name, hardware):
+def test_a_controller_file_round_trips_exactly(tmp_path, name, hardware):
     law, path = Law.of(LAWS[name], hardware, MOTOR), tmp_path / "controller.json"
     save_controller(path, law)
-    again = load_controller(path)
-    assert jax.tree.structure(again) == jax.tree.structure(jax.tree.map(float, law))
-    assert jax.tree.leaves(again) == [float(leaf) for leaf in jax.tree.leaves(law)]
+    loaded = load_controller(path)
+    assert jax.tree.structure(loaded) == jax.tree.structure(jax.tree.map(float, law))
+    assert jax.tree.leaves(loaded) == [float(leaf) for leaf in jax.tree.leaves(law)]
 
 
-def changed(content: dict, *path, to) -> dict:
-    content = json.loads(json.dumps(content))
-    inner = content
-    for step in path[:-1]:
-        inner = inner[step]
-    inner[path[-1]] = to
-    return content
-
-
-BAD = {
+INVALID = {
     "no type": (("type",), "fuzzy", "type"),
     "gain missing": (("gains",), {}, "proportional"),
     "gain a text": (("gains", "integral"), "x", "integral"),
@@ -125,12 +117,12 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(("path", "value", "says"), BAD.values(), ids=BAD.keys())
-def test_a_bad_controller_file_is_refused(tmp_path, path, value, says):
+@pytest.mark.parametrize(("path", "value", "expected"), INVALID.values(), ids=INVALID.keys())
+def test_an_invalid_controller_file_is_refused(tmp_path, path, value, expected):
     file = tmp_path / "controller.json"
     save_controller(file, Law.of(LAWS["pi"], SAMPLED, MOTOR))
-    file.write_text(json.dumps(changed(json.loads(file.read_text()), *path, to=value)))
-    with pytest.raises(InputError, match=says) as refusal:
+    file.write_text(json.dumps(with_value(json.loads(file.read_text()), *path, to=value)))
+    with pytest.raises(InputError, match=expected) as refusal:
         load_controller(file)
     assert str(file) in str(refusal.value)
 

@@ -1,4 +1,5 @@
-"""The diagnosis: its algebra against plain least squares, its columns against full simulation, whole cases."""
+"""Parts of a diagnosis: regression against least squares by numpy, first-order responses against full simulation,
+and the selection of effects."""
 
 from __future__ import annotations
 
@@ -9,9 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from attrs import evolve
+from linear_motor import PAPER
 from scipy import stats
 
 from benchmarks import virtual_bench as vb
+from experiments.bench import recording
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import naming
 from pmdc_jax.diagnose.assessment import Assessment
@@ -42,12 +46,11 @@ from pmdc_jax.identify.refine import Optimum
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, free_run
 
-PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 SCALES = Scales(10.0, 300.0, 10.0, 15.0, 0.5, PAPER["J"], 1e-3, 2.0, 500.0)
 
 
-def promises_of(gains: dict[str, float], unexplained: float) -> Assessment:
-    """Evidence of effects with such gains, the first of them the most significant."""
+def assessment_of(gains: dict[str, float], unexplained: float) -> Assessment:
+    """An assessment with these gains of effects, of which the first is the most significant."""
     candidates = [TRIALS[name].candidates(name, SCALES)[0] for name in gains]
     signals = [
         Signal(gain, -1e3 + k, candidate, Mock(spec=Block))
@@ -67,28 +70,28 @@ def promises_of(gains: dict[str, float], unexplained: float) -> Assessment:
 @pytest.mark.parametrize(
     ("gains", "first"),
     [
-        # what is left of a dead zone's own formula hides nothing that would explain fourteen times as much
+        # the formula error of a dead zone does not exclude an effect that explains fourteen times as much
         ({"input_dead_zone": 10.0, "coulomb_friction": 140.0}, ["coulomb_friction"]),
-        # ... and leaves no room for what explains as little as it does itself
+        # but one that explains hardly more than the dead zone itself
         ({"input_dead_zone": 10.0, "quadratic_drag": 11.0}, []),
     ],
 )
-def test_an_effects_own_formula_is_no_reason_to_leave_out_a_larger_one(gains, first):
+def test_the_shortlist_has_an_effect_that_is_larger_than_a_formula_error(gains, first):
     current = Mock(spec=Model, effects={"input_dead_zone": {"width_V": 0.8}})
-    listed = shortlist(current, promises_of(gains, unexplained=0.05))
+    listed = shortlist(current, assessment_of(gains, unexplained=0.05))
     assert [effect_of(signal) for signal in listed] == first
 
 
-def test_every_effect_has_a_row():
+def test_every_effect_has_trials():
     assert set(TRIALS) == set(EFFECTS)
 
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_candidates_are_within_the_ranges(name):
-    """Each shape is an effect that can be built, and of which a positive coefficient makes a legal one."""
+    """Each candidate can be built as an effect, and positive coefficients give valid parameters."""
     candidates = TRIALS[name].candidates(name, SCALES)
-    begins = TRIALS[name].starts
-    starts = begins(SCALES) if begins else []
+    starting_values = TRIALS[name].starts
+    starts = starting_values(SCALES) if starting_values else []
     assert candidates or starts
     for values in starts:
         assert values.keys() == EFFECTS[name].ranges.keys()
@@ -104,8 +107,8 @@ def test_candidates_are_within_the_ranges(name):
             assert r.scale == "linear" or built[field] > 0
 
 
-class Undecided(StepwiseSelection):
-    """Two sets of effects, each of which looks better by the filter of the other one."""
+class UndecidedSelection(StepwiseSelection):
+    """A selection from two models, each of which fits better than the other by the filter of that."""
 
     def __init__(self):
         self.base, self.one, self.other = (
@@ -129,15 +132,15 @@ class Undecided(StepwiseSelection):
     _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))
 
 
-def test_what_was_left_for_a_better_model_is_not_come_back_to():
-    selection = Undecided()
+def test_the_selection_does_not_return_to_a_superseded_model():
+    selection = UndecidedSelection()
     assert selection.name().chosen is selection.other
     assert selection.trials == 3
 
 
-def test_what_only_mends_a_formula_does_not_hide_what_plain_squares_find():
-    """A filter may swallow most of an effect: what it leaves then looks like the formula of another one."""
-    selection = Undecided()
+def test_a_correction_of_a_formula_does_not_hide_an_effect_found_without_a_filter():
+    """A filter may remove most of an effect; the rest then resembles a formula error of another one."""
+    selection = UndecidedSelection()
     selection._by_unfiltered_misfit = lambda current, found: selection.other
     selection._is_genuine_improvement = lambda current, found, better: better is selection.other
     selection._in_other_forms = lambda *models: []
@@ -145,29 +148,29 @@ def test_what_only_mends_a_formula_does_not_hide_what_plain_squares_find():
 
 
 @pytest.mark.parametrize(
-    ("gains", "least", "listed"),
+    ("gains", "min_gain", "listed"),
     [
-        # a fit far from the truth foretells badly: less than half as much is tried, too
+        # predictions from a poor fit are inaccurate, so less than half of the largest gain is tried, too
         ({"stribeck_friction": 87.0, "quadratic_drag": 37.0, "cogging_torque": 2.0}, 18.0, 2),
         ({"stribeck_friction": 87.0, "quadratic_drag": 37.0}, 40.0, 1),
         ({"coulomb_friction": 87.0, "torque_ripple": 60.0}, 90.0, 0),
     ],
 )
-def test_what_promises_little_by_plain_squares_is_not_tried(gains, least, listed):
-    found = most_promising(promises_of(gains, unexplained=0.0).candidate_signals, set(), least)
+def test_effects_of_little_expected_gain_are_not_tried(gains, min_gain, listed):
+    found = most_promising(assessment_of(gains, unexplained=0.0).candidate_signals, set(), min_gain)
     assert [effect_of(signal) for signal in found] == list(gains)[:listed]
 
 
-@pytest.mark.parametrize("settles", [True, False])
-def test_of_what_promises_little_beside_a_curve_that_is_kept_which_settles_it(settles):
-    """Friction and drag, which viscous friction makes up for: no single effect does much, and each more than it
-    seems."""
+@pytest.mark.parametrize("leaves_little", [True, False])
+def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(leaves_little):
+    """Friction and drag, for which viscous friction compensates: no single effect gains much, but each more than
+    predicted."""
     gains = {
         "torque_constant_saturation": 74.0,
         "stribeck_friction": 60.0,
         "brush_voltage_drop": 5.0,
     }
-    found = promises_of(gains, unexplained=np.inf)
+    found = assessment_of(gains, unexplained=np.inf)
     found.p_value, found.may_be_model_form_error, found.is_sensor_ripple = (
         0.0,
         lambda model: False,
@@ -179,20 +182,22 @@ def test_of_what_promises_little_beside_a_curve_that_is_kept_which_settles_it(se
     selection.assess = lambda model: found
     selection._better = lambda current, found, models: models[-1] if models else None
     selection._in_other_forms = lambda *models: []
-    selection._leaves_little = lambda current, better: settles
+    selection._leaves_little = lambda current, better: leaves_little
     better = selection._by_likeliest_effect(Mock(spec=Model, effects=()), found)
-    assert better is (tried if settles else None)
-    asked = [effect_of(call.args[1]) for call in selection.refits.with_signal.call_args_list]
-    assert asked == list(gains)[:2]
+    assert better is (tried if leaves_little else None)
+    calls = selection.refits.with_signal.call_args_list
+    assert [effect_of(call.args[1]) for call in calls] == list(gains)[:2]
 
 
-@pytest.mark.parametrize(("count", "p_value", "asked"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])
-def test_a_full_set_exchanges_what_acts_in_the_same_equation(monkeypatch, count, p_value, asked):
-    """Dry friction, a delay and an offset, where a peak of friction is what promises most."""
+@pytest.mark.parametrize(("count", "p_value", "exchanges"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])
+def test_a_full_set_exchanges_the_effect_in_the_same_equation(
+    monkeypatch, count, p_value, exchanges
+):
+    """Of dry friction, a delay and an offset the first, if Stribeck friction has the largest expected gain."""
     effects = ("asymmetric_friction", "speed_sensor_delay", "current_sensor_offset")[:count]
     peak = Mock(spec=Signal, candidate=Mock(effect="stribeck_friction"), gain=1.0)
     monkeypatch.setattr(naming, "clear_signals", lambda found: [peak])
-    selection = Undecided()
+    selection = UndecidedSelection()
     selection.refits = Mock(without=Mock(return_value=Mock(spec=Model)))
     selection.refits.with_signal.return_value = Mock(spec=Model)
     selection.assess = lambda model: Mock(
@@ -207,13 +212,13 @@ def test_a_full_set_exchanges_what_acts_in_the_same_equation(monkeypatch, count,
     )
     current = Mock(spec=Model, effects=effects)
     better = selection._by_exchange(current, found)
-    assert selection.refits.without.call_count == asked
-    if asked:
+    assert selection.refits.without.call_count == exchanges
+    if exchanges:
         selection.refits.without.assert_called_with(current, "asymmetric_friction", "white")
         assert better is selection.refits.with_signal.return_value
 
 
-def test_a_motor_that_cannot_be_simulated_suggests_no_run(x64):
+def test_an_unstable_motor_suggests_no_experiment(x64):
     time, rest = 1e-3 * np.arange(1000), np.zeros(500)
     volts = np.append(rest, 10 + rest)
     unstable = {**PAPER, "L": -1e-6}
@@ -224,12 +229,12 @@ def test_a_motor_that_cannot_be_simulated_suggests_no_run(x64):
     assert difference_between([motors[0], other], time, volts, np.ones(2)) > 1
 
 
-def test_only_waves_that_records_show_are_tried():
-    """At 40 rad/s, of samples of 20 ms, one of seven periods comes round in one and an eighth; and over a tenth of a
-    turn one of ten comes round once."""
-    seldom = SCALES._replace(slow_speed=40.0, sample_time=0.02)
+def test_only_periods_that_the_samples_resolve_are_tried():
+    """At 40 rad/s and samples of 20 ms a wave of seven periods per turn has 1.1 samples per period; over a tenth of a
+    turn one of ten periods comes only once."""
+    slowly_sampled = SCALES._replace(slow_speed=40.0, sample_time=0.02)
     tried = TRIALS["cogging_torque"].candidates
-    assert [c.columns[0]["periods"] for c in tried("", seldom)] == list(range(1, 8))
+    assert [c.columns[0]["periods"] for c in tried("", slowly_sampled)] == list(range(1, 8))
     assert max(c.columns[0]["periods"] for c in tried("", SCALES)) == 48
     short = SCALES._replace(travel=0.1 * 2 * np.pi)
     assert min(c.columns[0]["periods"] for c in tried("", short)) == 10
@@ -237,8 +242,8 @@ def test_only_waves_that_records_show_are_tried():
 
 
 @pytest.mark.parametrize("simple", [s for s, form in FULLER.items() if form.to_simple])
-def test_a_simple_form_begins_within_its_ranges(simple):
-    """Even where the rich one was fitted with nothing but a peak."""
+def test_a_simple_form_starts_within_its_ranges(simple):
+    """Even if the fit of the richer one has only a peak."""
     rich = FULLER[simple].effect
     sizes = dict(zip(EFFECTS[rich].ranges, (1e-10, 0.3, 20.0), strict=False))
     effect = EFFECTS[rich](**{field: np.asarray(x) for field, x in sizes.items()})
@@ -249,12 +254,12 @@ def test_a_simple_form_begins_within_its_ranges(simple):
         assert abs(values[field]) > 0.1 * sizes[list(sizes)[1]]
 
 
-LIKE = [(old, new) for old in TRIALS for new in TRIALS[old].alike]
+SIMILAR = [(old, new) for old in TRIALS for new in TRIALS[old].alike]
 
 
-@pytest.mark.parametrize(("old", "new"), LIKE)
-def test_what_is_alike_begins_alike(old, new):
-    """There and back again is where it was."""
+@pytest.mark.parametrize(("old", "new"), SIMILAR)
+def test_similar_effects_are_converted_into_each_other(old, new):
+    """Converted back, they have the same parameters."""
     effect = EFFECTS[old](**dict.fromkeys(EFFECTS[old].ranges, np.asarray(3e-3)))
     values = TRIALS[old].alike[new](effect)
     assert values.keys() == EFFECTS[new].ranges.keys()
@@ -264,8 +269,8 @@ def test_what_is_alike_begins_alike(old, new):
 
 
 @pytest.mark.parametrize("simple", FULLER)
-def test_a_fuller_form_begins_as_the_simple_one_with_more_to_it(simple):
-    """Possible, within its ranges, and as large as the simple one."""
+def test_a_richer_form_starts_with_the_values_of_the_simple_one(simple):
+    """It is possible, within its ranges, and as large as the simple one."""
     about = EFFECTS[simple].ranges
     effect = EFFECTS[simple](**{field: np.asarray(0.3) for field in about})
     fuller = FULLER[simple]
@@ -282,7 +287,7 @@ def test_a_fuller_form_begins_as_the_simple_one_with_more_to_it(simple):
 
 
 def evidence_of(J, own, X, r):
-    """By rows given in two parts."""
+    """The evidence from rows that come in two parts."""
     runs = (np.hstack([j, x, y[:, None], o]) for j, o, x, y in zip(J, own, X, r, strict=True))
     return gather_evidence(
         ((rows[:150], rows[150:]) for rows in runs), J[0].shape[1], own[0].shape[1]
@@ -297,8 +302,8 @@ def random_evidence(seed: int, runs: int = 3, rows: int = 400):
 
 
 @pytest.mark.parametrize("own_phase", [False, True])
-def test_regression_is_plain_least_squares(own_phase):
-    """Against numpy on the whole matrix, with every run's own columns written out."""
+def test_regression_matches_least_squares_by_numpy(own_phase):
+    """Applied to the whole matrix, with separate columns for each run's own unknowns."""
     J, own, X, r = random_evidence(0)
     evidence = evidence_of(J, own, X, r)
     fit = evidence.regress([Block((4, 6), own_phase)])
@@ -324,7 +329,7 @@ def test_regression_is_plain_least_squares(own_phase):
         np.testing.assert_allclose(fit.errors[0], errors[4:6], rtol=1e-8)
 
 
-def test_a_column_that_says_nothing_new_changes_nothing():
+def test_a_linearly_dependent_column_changes_nothing():
     J, own, X, r = random_evidence(1)
     X = [np.hstack([x, j[:, :1]]) for x, j in zip(X, J, strict=True)]
     evidence = evidence_of(J, own, X, r)
@@ -332,8 +337,8 @@ def test_a_column_that_says_nothing_new_changes_nothing():
     assert with_it.squares == pytest.approx(evidence.regress().squares, rel=1e-9)
 
 
-def test_a_column_that_belongs_to_the_run_as_well_says_nothing():
-    """But for rounding, which is no evidence."""
+def test_a_column_that_depends_on_the_runs_own_columns_has_no_coefficient():
+    """Up to rounding errors, which are no evidence."""
     J, own, X, r = random_evidence(2)
     X = [np.hstack([x, o[:, :1] + 1e-7 * x[:, :1]]) for x, o in zip(X, own, strict=True)]
     fit = evidence_of(J, own, X, r).regress([Block((4 + 5,))])
@@ -341,15 +346,15 @@ def test_a_column_that_belongs_to_the_run_as_well_says_nothing():
 
 
 @pytest.mark.parametrize("freedom", [1, 2, 12, 42])
-def test_chance_far_out_meets_the_exact_one(freedom):
-    """The leading term of the tail, where the exact one can still be computed."""
+def test_the_approximate_tail_matches_the_exact_one(freedom):
+    """The leading term of the tail of chi-squared, where the exact one can still be computed."""
     for gain in (520.0, 700.0):
         exact = stats.chi2.logsf(gain, freedom)
         assert log_p_value(gain, freedom) == pytest.approx(exact, abs=0.1 * freedom)
 
 
 @pytest.mark.parametrize(
-    ("effect", "field", "interval", "nothing"),
+    ("effect", "field", "interval", "may_be_zero"),
     [
         ("torque_ripple", "amplitude", (2e-5, 0.64), True),
         ("torque_ripple", "amplitude", (0.1, 0.64), False),
@@ -358,14 +363,16 @@ def test_chance_far_out_meets_the_exact_one(freedom):
         ("constant_load", "torque_Nm", (1e-3, 0.8), False),
     ],
 )
-def test_an_amplitude_that_may_be_next_to_nothing(effect, field, interval, nothing):
+def test_an_amplitude_with_an_interval_down_to_zero_may_be_none(
+    effect, field, interval, may_be_zero
+):
     estimate = Estimate(0.35, 0.1, interval, "", "identified")
     found = Mock(spec=Identification, parameters={f"{effect}.{field}": estimate})
-    assert may_be_absent(found, effect, field) is nothing
+    assert may_be_absent(found, effect, field) is may_be_zero
 
 
-def test_what_waves_of_any_period_gain_is_evidence_for_none():
-    """As where the residuals are slow: one period of cogging is asked for by what it gains beyond the others."""
+def test_a_gain_common_to_waves_of_all_periods_is_no_evidence():
+    """As with slow residuals: the evidence for one period of cogging is its gain beyond the others."""
     evidence = evidence_of(*random_evidence(0))
     cogging = TRIALS["cogging_torque"].candidates("cogging_torque", SCALES)
     others = TRIALS["constant_load"].candidates("constant_load", SCALES)
@@ -380,13 +387,13 @@ def test_what_waves_of_any_period_gain_is_evidence_for_none():
     by_chance = stats.chi2.rvs(freedom, size=len(cogging), random_state=rng)
     assert common(by_chance)["cogging_torque"] < 2.0
     slow = 40.0 + by_chance
-    slow[3] = 500.0  # one that is there raises the median by nothing
+    slow[3] = 500.0  # a true wave does not raise the median
     assert common(slow) == {"cogging_torque": pytest.approx(40.0, abs=2.0)}
 
 
-def test_what_a_coarse_reading_leaves_is_evidence_for_nothing():
-    """Speeds that stand still twenty times, read in whole rad/s: what bends with the speed explains the errors."""
-    alarms = {"as if white": 0, "by rounding": 0}
+def test_rounding_errors_of_a_coarse_reading_are_no_evidence():
+    """Twenty constant speeds, rounded to whole rad/s: a curve over the speed seems to explain the errors."""
+    false_alarms = {"as if white": 0, "by rounding": 0}
     for seed in range(50):
         speed = np.random.default_rng(seed).uniform(-6, 6, 20).repeat(100)[:, None]
         kind, known = (1e-3, (1,)), np.ones(len(speed), bool)
@@ -405,10 +412,10 @@ def test_what_a_coarse_reading_leaves_is_evidence_for_nothing():
         evidence, drag = gather_evidence([[rows]], 1, 1, ROUNDING_DRAWS), Block((1,))
         gain = evidence.regress().squares - evidence.regress([drag]).squares
         noise = evidence.rounding_dispersion(drag)
-        alarms["as if white"] += stats.chi2.sf(gain, 1) < 0.01
-        alarms["by rounding"] += stats.chi2.sf(gain / noise, 1) < 0.01
-    assert alarms["as if white"] > 25
-    assert alarms["by rounding"] <= 3
+        false_alarms["as if white"] += stats.chi2.sf(gain, 1) < 0.01
+        false_alarms["by rounding"] += stats.chi2.sf(gain / noise, 1) < 0.01
+    assert false_alarms["as if white"] > 25
+    assert false_alarms["by rounding"] <= 3
 
 
 @pytest.mark.parametrize(
@@ -416,12 +423,12 @@ def test_what_a_coarse_reading_leaves_is_evidence_for_nothing():
     [
         (lambda exact, rng: np.round(exact), True),
         (lambda exact, rng: np.round(exact + 2 * rng.normal(size=exact.shape)), False),
-        # counts of an encoder from sample to sample: no error lasts
+        # encoder counts from sample to sample: errors do not last
         (lambda exact, rng: np.diff(np.round(np.cumsum(exact, 0)), axis=0, prepend=0), False),
     ],
-    ids=["rounded", "blurred", "counted"],
+    ids=["rounded", "dithered", "counted"],
 )
-def test_only_steps_that_nothing_blurs_are_coarse(read, coarse):
+def test_only_rounding_without_dither_is_coarse(read, coarse):
     exact, known = np.linspace(0, 20, 2000)[:, None], np.ones(2000, bool)
     left, simulated = (
         Series(0.5 * x, known, (1e-3, (0,)))
@@ -439,7 +446,7 @@ def test_only_steps_that_nothing_blurs_are_coarse(read, coarse):
 
 
 def coloured(seed: int, samples: int, scale: float) -> np.ndarray:
-    """A torque that fluctuates slowly, seen in speed and a little in current, and white sensors."""
+    """Residuals of speed, and a little of current, under a slowly fluctuating torque, with white sensor noise."""
     rng = np.random.default_rng(seed)
     slow = np.zeros(samples)
     for k in range(1, samples):
@@ -447,7 +454,7 @@ def coloured(seed: int, samples: int, scale: float) -> np.ndarray:
     return scale * (np.stack([0.1 * slow, slow], 1) + rng.normal(size=(samples, 2)) * [0.3, 2.0])
 
 
-def test_what_is_filtered_is_white():
+def test_filtered_residuals_are_white():
     known = np.ones(6000, bool)
     series = [Series(coloured(k, 6000, s), known, (1e-3, (0, 1))) for k, s in enumerate((1.0, 5.0))]
     white = whitener(series)
@@ -459,73 +466,77 @@ def test_what_is_filtered_is_white():
             assert np.abs(correlation).max() < 5 / np.sqrt(len(rows)), lag
 
 
-def test_filter_does_not_look_across_what_is_missing():
-    """A sample that is missing spoils no row: the rows that need it are left out."""
+def test_the_filter_omits_rows_that_need_missing_samples():
+    """Whatever values the missing samples have."""
     values = coloured(0, 3000, 1.0)
     known = np.ones(3000, bool)
     known[1000:1010] = False
-    spoiled = values.copy()
-    spoiled[~known] = 1e9
+    damaged = values.copy()
+    damaged[~known] = 1e9
     clean = Series(values, known, (1e-3, (0, 1)))
     white = whitener([clean])
-    np.testing.assert_array_equal(white(0, clean), white(0, clean._replace(values=spoiled)))
+    np.testing.assert_array_equal(white(0, clean), white(0, clean._replace(values=damaged)))
 
 
 # ------------------------------------------------------------------------- lines in the spectrum
 
 
-def shaken(hertz: Sequence[float], driven: float | None = None, size: float = 1.5):
-    """Spectra of runs of 4, 6, 8, ... s of coloured noise, each with an oscillation of its own frequency."""
+def spectra_with_oscillations(
+    hertz: Sequence[float], drive_hertz: float | None = None, size: float = 1.5
+):
+    """Spectra of runs of 4, 6, 8, ... s of coloured noise, each with an oscillation of a given frequency."""
     found = []
     for k, f in enumerate(hertz):
         time = 1e-3 * np.arange(4000 + 2000 * k)
         noise = coloured(k, len(time), 1.0)
         noise[:, 1] += size * noise.std() * np.sin(2 * np.pi * f * time + k)
         drive = np.random.default_rng(k).normal(size=(len(time), 1))
-        if driven is not None:
-            drive[:, 0] += np.sin(2 * np.pi * driven * time)
+        if drive_hertz is not None:
+            drive[:, 0] += np.sin(2 * np.pi * drive_hertz * time)
         found.append(spectrum(noise, drive, 1e-3))
     return found
 
 
-def test_a_periodic_torque_from_outside_is_found_at_its_frequency():
-    line = common_line(shaken([7.3] * 4))
+def test_an_external_periodic_torque_is_found_at_its_frequency():
+    line = common_line(spectra_with_oscillations([7.3] * 4))
     assert line.low < 7.3 < line.high
     assert line.high - line.low < 0.3
 
 
-def test_a_slow_one_too_where_it_is_strong():
-    """Six turns of it in a run, where noise is strongest."""
-    line = common_line(shaken([1.26] * 4, size=6.0))
+def test_a_slow_periodic_torque_is_found_if_it_is_strong():
+    """Few periods in a run, at frequencies where the noise is strongest."""
+    line = common_line(spectra_with_oscillations([1.26] * 4, size=6.0))
     assert line.low < 1.26 < line.high
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0])
-def test_one_run_alone_must_show_a_line_far_more_clearly(size):
-    assert common_line(shaken([7.3], size=size)) is None
+def test_a_weak_line_in_a_single_run_is_ignored(size):
+    assert common_line(spectra_with_oscillations([7.3], size=size)) is None
 
 
 @pytest.mark.parametrize("hertz", [[7.3, 9.1, 12.4, 31.0], [7.3, 7.3, 21.0, 31.0]])
-def test_a_line_of_few_runs_is_none(hertz):
-    assert common_line(shaken(hertz)) is None
+def test_a_line_in_few_of_the_runs_is_ignored(hertz):
+    assert common_line(spectra_with_oscillations(hertz)) is None
 
 
-def test_a_line_that_drives_is_none():
-    assert common_line(shaken([7.3] * 4, driven=7.3)) is None
+def test_a_line_of_the_drive_is_ignored():
+    assert common_line(spectra_with_oscillations([7.3] * 4, drive_hertz=7.3)) is None
 
 
-def test_a_line_that_a_controller_answers_to_is_one():
-    """It stands out of the voltage, too, but far less. Two runs are enough if one of them shows it far more clearly."""
-    free, answered = shaken([7.3] * 2, size=6.0)
-    answered = answered._replace(driving=np.maximum(answered.driving, answered.residual / 20))
-    line = common_line([free, answered])
+def test_a_line_to_which_a_controller_reacts_is_found():
+    """It is in the voltage, too, but far weaker. Two runs are enough if it is far clearer in one of them."""
+    free, controlled = spectra_with_oscillations([7.3] * 2, size=6.0)
+    controlled = controlled._replace(
+        driving=np.maximum(controlled.driving, controlled.residual / 20)
+    )
+    line = common_line([free, controlled])
     assert line.low < 7.3 < line.high
-    driven = answered._replace(driving=answered.residual)
+    driven = controlled._replace(driving=controlled.residual)
     assert common_line([free, driven]) is None
 
 
-def test_harmonics_of_a_drive_that_repeats_itself_are_none():
-    """A wrong friction has lines at harmonics that the drive itself may lack."""
+def test_harmonics_of_a_periodic_drive_are_ignored():
+    """A wrong friction model causes lines at harmonics that the drive itself may lack."""
     rng, time = np.random.default_rng(0), np.arange(8000) * 1e-3
     wave = np.sin(2 * np.pi * 1.3 * time)
     residuals = 3 * np.sin(2 * np.pi * 3 * 1.3 * time)[:, None] + rng.normal(size=(8000, 2))
@@ -541,7 +552,7 @@ def test_coloured_noise_has_no_line(seed):
     assert common_line([spectrum(x, rng.normal(size=(5000, 1)), 1e-3) for x in runs]) is None
 
 
-# ------------------------------------------------------------------------------- the responses
+# ------------------------------------------------------------------------- first-order responses
 
 
 def runs() -> list[Recording]:
@@ -556,28 +567,28 @@ def runs() -> list[Recording]:
     return found
 
 
-# one effect that acts through a parameter, one with a state of its own, one of a sensor, one of the angle, where runs
-# begin anywhere in the turn
+# effects that act through a parameter, with a state of their own, of a sensor, and over the angle, at which runs may
+# begin anywhere
 SMOOTH = {
     "torque_constant_saturation": {"per_A2": 1e-9, "emf_share": 0.0},
     "resistance_heating": {"rise_per_W": 1e-8, "time_constant_s": 0.2},
     "speed_sensor_delay": {"delay_s": 2.5e-3},
     "cogging_torque": {"amplitude_Nm": 1e-6, "phase_rad": 0.3, "periods": 3.0},
 }
-BEGUN = jnp.array([0.4, 2.0])  # rad
+INITIAL_ANGLES = jnp.array([0.4, 2.0])  # rad
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SMOOTH)
-def test_response_is_the_change_of_the_simulation(x64, name):
-    """First-order columns against two full simulations, one with a very small effect."""
+def test_the_first_order_response_matches_the_change_of_the_simulation(x64, name):
+    """The change is that between two full simulations, one with a very small effect."""
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs()))
     bare = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()})
     effect = EFFECTS[name](**{f: jnp.asarray(x) for f, x in SMOOTH[name].items()})
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
-    own = RunUnknowns.as_recorded(tape)._replace(angle=BEGUN)
+    own = RunUnknowns.as_recorded(tape)._replace(angle=INITIAL_ANGLES)
     without, with_it = (free_run(m, tape, own) for m in (bare, motor))
-    path = path_of(without, tape, BEGUN, False)
+    path = path_of(without, tape, INITIAL_ANGLES, False)
     if EFFECTS[name].equation == "sensor":
         found = sensor_changes(motor, bare, tape, path)
     else:
@@ -590,13 +601,13 @@ def test_response_is_the_change_of_the_simulation(x64, name):
         assert error <= 0.02 * scale + 1e-12, (name, c, error, scale)
 
 
-@pytest.mark.parametrize("most", [1, 4, 5, 32])
-def test_columns_are_the_same_however_many_stand_side_by_side(most):
+@pytest.mark.parametrize("group_size", [1, 4, 5, 32])
+def test_columns_are_the_same_in_groups_of_any_size(group_size):
     rng = np.random.default_rng(3)
     kicks, seen = rng.standard_normal((2, 10, 2, 3, 13))
     changes = [Change(kicks[..., a:b], seen[..., a:b]) for a, b in ((0, 5), (5, 6), (6, 13))]
-    parts = list(_batches(changes, most))
-    assert all(part.kicks.shape[-1] == most for part, _ in parts)
+    parts = list(_batches(changes, group_size))
+    assert all(part.kicks.shape[-1] == group_size for part, _ in parts)
     for field, whole in (("kicks", kicks), ("seen", seen)):
         together = [getattr(part, field)[..., :width] for part, width in parts]
         np.testing.assert_array_equal(np.concatenate(together, -1), whole)
@@ -610,9 +621,10 @@ def test_columns_are_the_same_however_many_stand_side_by_side(most):
     [
         ("brush_voltage_drop", "input_dead_zone", True),
         ("coulomb_friction", "quadratic_drag", True),
-        ("coulomb_friction", "stribeck_friction", False),  # the one contains the other
-        ("coulomb_friction constant_load", "asymmetric_friction", False),  # one torque in motion
-        ("coulomb_friction", "coulomb_friction quadratic_drag", False),  # a part
+        ("coulomb_friction", "stribeck_friction", False),  # one contains the other
+        # the same torque in motion
+        ("coulomb_friction constant_load", "asymmetric_friction", False),
+        ("coulomb_friction", "coulomb_friction quadratic_drag", False),  # a subset
         ("coulomb_friction quadratic_drag", "stribeck_friction quadratic_drag", False),
         ("coulomb_friction quadratic_drag", "coulomb_friction cogging_torque", True),
         ("speed_sensor_lag", "speed_sensor_delay", True),
@@ -631,35 +643,35 @@ def test_a_simpler_form_is_within_a_richer_one():
 
 
 @pytest.mark.parametrize("periods", [4.0, 9.0, 14.0])
-def test_a_second_torque_over_the_angle_leaves_the_first_in_place(periods):
-    """Runs begin where a cogging of six periods put them, each off by some of its periods; the second torque has one
-    phase in all of them once these are undone."""
+def test_a_second_torque_over_the_angle_keeps_the_phase_of_the_first(periods):
+    """Cogging of six periods leaves the initial angle of each run open by some of its periods; once these offsets are
+    corrected, the second torque has the same phase in all runs."""
     rng = np.random.default_rng(5)
     whole = 2 * np.pi * np.arange(6) / 6
-    off = np.append(0.0, rng.choice(whole, 7))
-    phases = 0.8 + periods * off + 0.05 * rng.normal(size=8)
+    offsets = np.append(0.0, rng.choice(whole, 7))
+    phases = 0.8 + periods * offsets + 0.05 * rng.normal(size=8)
     sizes = rng.uniform(0.5, 2.0, 8)
     both = sizes[:, None] * np.stack([np.cos(phases), np.sin(phases)], 1)
-    phase, turned = common_phase(both, [np.zeros(1), *[whole] * 7], periods)
+    phase, corrections = common_phase(both, [np.zeros(1), *[whole] * 7], periods)
     assert phase == pytest.approx(0.8, abs=0.1)
-    np.testing.assert_allclose(np.cos(periods * (turned - off)), 1.0, atol=1e-6)
-    assert all(np.min(np.abs(whole - angle)) == 0 for angle in turned)
+    np.testing.assert_allclose(np.cos(periods * (corrections - offsets)), 1.0, atol=1e-6)
+    assert all(np.min(np.abs(whole - angle)) == 0 for angle in corrections)
 
 
-def test_runs_that_may_begin_turned_by_any_angle_are_turned_to_the_first():
+def test_runs_of_unknown_initial_angle_are_aligned_with_the_first():
     phases = np.array([0.3, 2.0, -3.0, 1.0])
     both = np.stack([np.cos(phases), np.sin(phases)], 1)
-    phase, turned = common_phase(both, [np.zeros(1), None, None, None], 7.0)
-    assert phase == pytest.approx(0.3, abs=0.03)  # as finely as it is looked for
-    np.testing.assert_allclose(np.cos(phases - phase - 7.0 * turned), 1.0, atol=1e-3)
+    phase, corrections = common_phase(both, [np.zeros(1), None, None, None], 7.0)
+    assert phase == pytest.approx(0.3, abs=0.03)  # the resolution of the search
+    np.testing.assert_allclose(np.cos(phases - phase - 7.0 * corrections), 1.0, atol=1e-3)
 
 
-def test_sizes_in_amperes_are_not_tried_where_no_current_was_measured(x64):
-    """Voltage and speed alone say nothing of what a current does."""
+def test_effects_that_need_a_current_are_not_tried_without_one(x64):
+    """Voltage and speed alone do not determine the scale of the current."""
     rng = np.random.default_rng(7)
     columns = vb.record(vb.BenchMotor(**PAPER), vb.prbs(rng, 2.0), rng, vb.Noise())
-    time, voltage, speed = (columns[q] for q in ("time_s", "voltage_V", "speed_rad_s"))
-    given = prepare([Recording("silent", time, voltage, speed=speed)], [], unloaded=True)
+    run = evolve(recording("no current", columns), current=None, load=None)
+    given = prepare([run], [], unloaded=True)
     coordinates = jnp.log(jnp.asarray([PAPER[n] for n in PARAMETERS]))
     start = Unknowns(coordinates, RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1))))
     base = model_of((), given, polish(given.problem, Optimum(start, np.inf, (), False), steps=0))

@@ -1,4 +1,4 @@
-"""The words, tables, JSON and page of a diagnosis, on made-up ones with plausible numbers."""
+"""Sentences, tables, JSON and page of diagnoses that are made up, with plausible numbers."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ GAP = Gap(4.9, 1.02, 1.0)
 
 
 def named(**changes) -> Diagnosis:
-    """Stribeck friction found; `changes` replace fields."""
+    """A diagnosis of Stribeck friction; `changes` replace fields."""
     base = fake_identification(400)
     friction = evolve(base.parameters["f"], value=0.4 * base.parameters["f"].value)
-    beside = {f"stribeck_friction.{field}": one for field, one in STRIBECK.items()}
-    parameters = {**base.parameters, "f": friction, **beside}
+    of_effect = {f"stribeck_friction.{field}": one for field, one in STRIBECK.items()}
+    parameters = {**base.parameters, "f": friction, **of_effect}
     fields = {
         "verdict": "named",
         "effects": (EffectFound("stribeck_friction", "mechanical", STRIBECK, 1e-9),),
@@ -116,8 +116,8 @@ def words(diagnosis: Diagnosis) -> str:
     return " ".join(verdict_sentences(diagnosis)).replace(notation.NARROW_SPACE, " ")
 
 
-def test_more_than_noise_is_said_to_be_left():
-    """By itself a named effect promises that its formula is nature's."""
+def test_a_wrong_formula_is_considered_if_residuals_exceed_the_noise():
+    """Otherwise a named effect implies that its formula is that of the motor."""
     assert not any("another formula" in s for s in verdict_sentences(named()))
     assert any("another formula" in s for s in verdict_sentences(named(leaves_noise=False)))
     angle, ripple = np.linspace(0, 2 * np.pi / 14, 9), 0.01 * np.sin(np.linspace(0, 2 * np.pi, 9))
@@ -127,37 +127,37 @@ def test_more_than_noise_is_said_to_be_left():
     assert not any("another formula" in s for s in sentences)
 
 
-def test_a_named_effect_in_words():
-    told = words(named())
-    where = "disagree in the mechanical equation, below 20.0 rad/s, in both directions."
+def test_sentences_for_a_named_effect():
+    text = words(named())
+    location = "disagree in the mechanical equation, below 20.0 rad/s, in both directions."
     found = (
         "Stribeck friction (coulomb 61.20 mN·m, static 148.00 mN·m, speed 11.00 rad/s; p < 0.001)"
     )
-    assert where in told
-    assert f"Missing: {found}. Added to the model." in told
-    assert "Hold-out error from 4.90 to 1.02 times the noise: 99.80 % of the gap is closed." in told
-    assert "f by −60.0 %" in told
-    assert "constant load above 4.00 mN·m would have been detected" in told
-    assert "static_Nm" not in told
+    assert location in text
+    assert f"Missing: {found}. Added to the model." in text
+    assert "Hold-out error from 4.90 to 1.02 times the noise: 99.80 % of the gap is closed." in text
+    assert "f by −60.0 %" in text
+    assert "constant load above 4.00 mN·m would have been detected" in text
+    assert "static_Nm" not in text
 
 
-def test_it_is_told_where_the_equation_is_off_that_lacked_something():
-    """However far parameters that make up for it have brought the other one out of balance."""
-    louder = Region("electrical", "current", (0.0, 4.0), 90.0)
-    told = words(named(where=(louder, *named().where)))
-    assert "disagree in the mechanical equation, below 20.0 rad/s" in told
+def test_the_misfit_is_located_in_the_equation_that_lacks_the_effect():
+    """Even if parameters that compensate for it cause a larger misfit of the other equation."""
+    larger = Region("electrical", "current", (0.0, 4.0), 90.0)
+    text = words(named(where=(larger, *named().where)))
+    assert "disagree in the mechanical equation, below 20.0 rad/s" in text
 
 
-def test_nothing_found_says_what_would_have_been_seen():
-    told = words(none_detected())
-    assert "No missing effect was detected" in told
-    assert "p = 0.37" in told
-    assert "Constant load above 4.00 mN·m would have been detected" in told
-    assert "gap" not in told
-    assert "--tie Kt=Kb" in told  # what identification warns of is not lost
+def test_none_detected_states_which_effects_would_have_been_detected():
+    text = words(none_detected())
+    assert "No missing effect was detected" in text
+    assert "p = 0.37" in text
+    assert "Constant load above 4.00 mN·m would have been detected" in text
+    assert "gap" not in text
+    assert "--tie Kt=Kb" in text  # the messages of the identification are repeated
 
 
-def test_what_no_torque_can_leave_in_words():
+def test_sentences_for_a_misfit_of_the_electrical_equation():
     left = "41.0 times what the sensor noise explains, which no torque can cause"
     assert left in words(evolve(not_in_library(), electrical_misfit=41.0))
     assert "times what the sensor noise" not in words(not_in_library())
@@ -169,55 +169,56 @@ def test_what_no_torque_can_leave_in_words():
     ("before", "after", "breaks"),
     [
         (1.0, 1.0, False),
-        (1.4, 1.4, False),  # a trace
-        (12.0, 2.6, False),  # a formula that is not quite nature's
-        (2.9, 2.6, True),  # what was added explains little of it
+        (1.4, 1.4, False),  # a small misfit
+        (12.0, 2.6, False),  # an approximate formula
+        (2.9, 2.6, True),  # the added effect explains little of it
         (40.0, 3.5, True),
     ],
 )
-def test_what_is_left_in_the_electrical_equation_is_a_trace_or_explained(before, after, breaks):
+def test_only_a_large_unexplained_misfit_breaks_the_electrical_equation(before, after, breaks):
     assert breaks_electrical_equation(before, after) is breaks
 
 
-def test_a_run_that_alone_is_missed_is_told():
+def test_a_single_run_with_a_far_larger_error_is_mentioned():
     runs = fake_identification(400).fit
     first, *_ = (name for name, fit in runs.items() if fit.role == "train")
     gaps = {name: Gap(4.9, 30.0 if name == first else 1.0, 1.0) for name in runs}
-    told = " ".join(verdict_sentences(named(gap_of_run=gaps, verdict="not_in_library")))
-    assert f"The error is largest in the run {first}, 30.0 times that of any other" in told
-    for changes in ({"gap_of_run": gaps}, {"verdict": "not_in_library"}):  # noise; all alike
+    text = " ".join(verdict_sentences(named(gap_of_run=gaps, verdict="not_in_library")))
+    assert f"The error is largest in the run {first}, 30.0 times that of any other" in text
+    # only noise; the same error in all runs
+    for changes in ({"gap_of_run": gaps}, {"verdict": "not_in_library"}):
         assert "The error is largest in" not in " ".join(verdict_sentences(named(**changes)))
 
 
-def test_what_is_left_beyond_white_noise_is_told():
-    shaken = evolve(named().final, missed={"current": 22.4, "speed": 19.6})
-    told = words(named(final=shaken))
-    assert "22.4 times the white noise of the current and 19.6 times the white noise of the" in told
+def test_residuals_beyond_white_noise_are_mentioned():
+    with_torque_noise = evolve(named().final, missed={"current": 22.4, "speed": 19.6})
+    text = words(named(final=with_torque_noise))
+    assert "22.4 times the white noise of the current and 19.6 times the white noise of the" in text
     assert "treated as noise" not in words(named())
 
 
-def test_rivals_and_the_run_that_decides_in_words():
-    told = words(ambiguous())
+def test_sentences_for_rivals_and_the_next_experiment():
+    text = words(ambiguous())
     rivals = (
         "Coulomb friction or brush voltage drop or"
         " friction that differs with direction and constant load would explain them equally well"
     )
-    assert rivals in told
-    assert "Coulomb friction of 50.0 mN·m (p = 0.0020)" in told
-    assert "record this: creep through zero, 6 s within 12 V." in told
-    assert "93.00 %" in told
+    assert rivals in text
+    assert "Coulomb friction of 50.0 mN·m (p = 0.0020)" in text
+    assert "record this: creep through zero, 6 s within 12 V." in text
+    assert "93.00 %" in text
     assert "No experiment within" in words(evolve(ambiguous(), next_experiment=None))
 
 
-def test_what_is_not_in_the_library_in_words():
-    told = words(not_in_library())
-    assert "no effect of the library explains" in told
-    assert "over speed, most significant with −30.0 mN·m at 40.0 rad/s" in told
-    part = words(evolve(not_in_library(), effects=named().effects))
-    assert "Stribeck friction (" in part
+def test_sentences_for_an_effect_that_is_not_in_the_library():
+    text = words(not_in_library())
+    assert "no effect of the library explains" in text
+    assert "over speed, most significant with −30.0 mN·m at 40.0 rad/s" in text
+    partial = words(evolve(not_in_library(), effects=named().effects))
+    assert "Stribeck friction (" in partial
     assert (
         "explains part of this and was added to the model; no effect of the library explains the rest."
-        in part
+        in partial
     )
     gap = {"train": Gap(4.0, 1.0, 1.0), "holdout": Gap(5.0, 3.0, 1.0)}
     held_out = words(evolve(not_in_library(), effects=named().effects, gap=gap))
@@ -225,22 +226,22 @@ def test_what_is_not_in_the_library_in_words():
     assert "The error of the held-out runs is 3.00 times that of the training runs" in held_out
 
 
-def test_an_effect_that_makes_hold_outs_worse_is_said_to():
+def test_an_effect_that_increases_the_hold_out_error_is_mentioned():
     gap = {"train": Gap(1.2, 1.0, 1.0), "holdout": Gap(1.3, 1.6, 1.0)}
-    told = words(evolve(not_in_library(), effects=named().effects, gap=gap))
-    assert "The addition increases the error of the held-out runs" in told
-    assert "explains the rest" not in told
+    text = words(evolve(not_in_library(), effects=named().effects, gap=gap))
+    assert "The addition increases the error of the held-out runs" in text
+    assert "explains the rest" not in text
 
 
 @pytest.mark.parametrize(("after", "beyond"), [(2.4, None), (2.6, 2.6)])
-def test_hold_outs_tell_what_fitted_runs_do_not(after, beyond):
+def test_a_hold_out_error_beyond_that_of_the_training_runs_is_reported(after, beyond):
     gap = {"train": Gap(4.0, 1.0, 1.0), "holdout": Gap(5.0, after, 1.0)}
     assert named(gap=gap).beyond_fitted == beyond
     assert named(gap={"train": gap["train"]}).beyond_fitted is None
 
 
 @pytest.mark.parametrize(
-    ("variable", "intervals", "reach", "told"),
+    ("variable", "intervals", "reach", "text"),
     [
         ("speed", [(-20.0, 0.0), (0.0, 18.0)], 100.0, "below 20.0 rad/s, in both directions"),
         ("speed", [(-99.0, 99.0)], 100.0, "at every speed, in both directions"),
@@ -261,24 +262,24 @@ def test_hold_outs_tell_what_fitted_runs_do_not(after, beyond):
         ("time", [(0.25, 0.5)], None, "from 25.0 % to 50.0 % of the run"),
     ],
 )
-def test_stretches_in_words(variable, intervals, reach, told):
+def test_intervals_in_words(variable, intervals, reach, text):
     assert (
-        intervals_in_words(variable, intervals, reach).replace(notation.NARROW_SPACE, " ") == told
+        intervals_in_words(variable, intervals, reach).replace(notation.NARROW_SPACE, " ") == text
     )
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
-def test_every_effect_has_words_without_units(effect):
+def test_words_for_parameters_contain_no_units(effect):
     for field, about in EFFECTS[effect].ranges.items():
-        told = notation.parameter_words(effect, field)
-        assert "_" not in told
-        assert not re.search(r"\d|Nm\b|\bper\b|\brad\b|\bs$|\bV$|\bA$", told), told
+        text = notation.parameter_words(effect, field)
+        assert "_" not in text
+        assert not re.search(r"\d|Nm\b|\bper\b|\brad\b|\bs$|\bV$|\bA$", text), text
         assert notation.value_with_unit(0.00123, about.unit)
         assert "m1" not in notation.value_with_unit(0.00123, about.unit)
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_json_follows_the_contract(case):
+def test_json_has_the_documented_keys(case):
     diagnosis = CASES[case]()
     found = diagnosis_json(diagnosis)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
@@ -301,7 +302,7 @@ def test_json_follows_the_contract(case):
         assert set(region) == {"equation", "variable", "region", "z"}
 
 
-def test_json_holds_the_numbers():
+def test_json_contains_the_values():
     found = diagnosis_json(named())
     assert found["gap"]["holdout"] == {"before": 4.9, "after": 1.02, "floor": 1.0}
     assert found["where"][0]["region"] == [-20.0, 0.0]
@@ -313,28 +314,28 @@ def test_json_holds_the_numbers():
     assert diagnosis_json(not_in_library())["curves"][0]["value"] == [0.0, 0.001, -0.03, 0.0]
 
 
-def test_json_has_null_for_what_is_unknown():
+def test_json_has_null_for_unknown_values():
     region = Region("mechanical", "speed", (0.0, 1.0), float("inf"))
     assert diagnosis_json(named(where=(region,)))["where"][0]["z"] is None
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_tables_show_everything(case):
+def test_tables_show_runs_effects_and_changes(case):
     diagnosis = CASES[case]()
     console = Console(width=140, record=True, file=io.StringIO())
     console.print(diagnosis_tables(diagnosis))
-    told = console.export_text()
-    assert "nan" not in told.lower()
+    text = console.export_text()
+    assert "nan" not in text.lower()
     for run in diagnosis.base.fit:
-        assert run in told
+        assert run in text
     for effect in diagnosis.effects:
-        assert EFFECTS[effect.name].label in told
-    assert ("Change" in told) == bool(diagnosis.effects)
-    assert ("Detectable with" in told) == (case == "none_detected")
+        assert EFFECTS[effect.name].label in text
+    assert ("Change" in text) == bool(diagnosis.effects)
+    assert ("Detectable with" in text) == (case == "none_detected")
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_page_is_whole_and_loads_nothing(case, tmp_path):
+def test_the_page_is_complete_and_self_contained(case, tmp_path):
     diagnosis = CASES[case]()
     write_diagnosis(diagnosis, tmp_path / "d.html")
     html = (tmp_path / "d.html").read_text(encoding="utf-8")
@@ -347,39 +348,39 @@ def test_the_page_is_whole_and_loads_nothing(case, tmp_path):
         assert sentence in page.text
     for effect in diagnosis.effects:
         assert EFFECTS[effect.name].formula in page.text
-    drawn = 1 + len(diagnosis.curves) + (diagnosis.next_experiment is not None)
-    drawn += len(diagnosis.base.fit) * (2 if diagnosis.effects else 1)
-    drawn += bool(diagnosis.where)  # where
-    drawn += 1  # against the variable
-    drawn += 2 if len(diagnosis.final.search.best) else 0
-    assert len(page.figures) == drawn
+    expected_figures = 1 + len(diagnosis.curves) + (diagnosis.next_experiment is not None)
+    expected_figures += len(diagnosis.base.fit) * (2 if diagnosis.effects else 1)
+    expected_figures += bool(diagnosis.where)
+    expected_figures += 1  # the mean residual over a variable
+    expected_figures += 2 if len(diagnosis.final.search.best) else 0
+    assert len(page.figures) == expected_figures
 
 
-def test_what_is_kept_of_a_residual_over_a_variable():
+def test_averages_recover_a_residual_that_is_a_function_of_speed():
     """A residual that is a function of speed comes out as that function."""
     fit = fake_identification(3000).fit["triangle"]
-    made = evolve(fit, speed=fit.speed_simulated + 0.1 * np.sign(fit.speed_simulated))
-    x, mean = averages({"one": made}, "speed", "speed")
+    with_offset = evolve(fit, speed=fit.speed_simulated + 0.1 * np.sign(fit.speed_simulated))
+    x, mean = averages({"one": with_offset}, "speed", "speed")
     clear = np.abs(x) > 5
     np.testing.assert_allclose(mean[clear], 0.1 * np.sign(x[clear]), rtol=1e-9)
 
 
-def test_drift_is_of_the_parameters_that_both_motors_have():
+def test_drifts_are_of_the_parameters_that_both_motors_have():
     found = {one.name: one.percent for one in drifts(named())}
     assert set(found) == {"R", "L", "Kb", "Kt", "J", "f"}
     assert found["f"] == pytest.approx(-60)
     assert found["R"] == 0
 
 
-def test_a_limit_of_the_search_is_nothing_to_move_from():
+def test_no_change_is_stated_for_a_parameter_that_was_at_a_bound():
     base = named().base
-    limit = evolve(base.parameters["f"], status="at_bound", stderr=None, ci95=None)
-    told = words(named(base=evolve(base, parameters={**base.parameters, "f": limit})))
+    at_bound = evolve(base.parameters["f"], status="at_bound", stderr=None, ci95=None)
+    text = words(named(base=evolve(base, parameters={**base.parameters, "f": at_bound})))
     assert "changed f by" in words(named())
-    assert "changed f by" not in told
+    assert "changed f by" not in text
 
 
-def test_the_next_experiment_can_be_played(tmp_path):
+def test_the_next_experiment_is_written_as_csv(tmp_path):
     path = tmp_path / "next.csv"
     assert write_experiment(ambiguous(), path)
     header, *rows = path.read_text().splitlines()

@@ -1,4 +1,4 @@
-"""Measured records: what the experiments on them found must stay found."""
+"""Regression tests of the experiments on measured records."""
 
 from functools import cache
 
@@ -13,15 +13,15 @@ needs_emps = pytest.mark.skipif(
 needs_undcmotor = pytest.mark.skipif(
     not available("undcmotor"), reason="the UNDCMotor records are absent (see experiments/data.py)"
 )
-# The input is force fed back from position: free-run output error is biased by what the model lacks.
+# The force is fed back from position, so unmodelled effects bias an output-error fit.
 free_run = pytest.mark.xfail(
     reason="free-run error of speed is minimised, not the error of force",
     raises=AssertionError,
     strict=True,
 )
 
-LINEAR, COULOMB = "viscous only", "Coulomb + offset"
-# of plain least squares, %, on the estimation and the validation record: the data's README
+VISCOUS_ONLY, COULOMB_AND_OFFSET = "viscous only", "Coulomb + offset"
+# Force errors of plain least squares, %, on the estimation and the validation record, from the README of the data
 FORCE_ERRORS = {
     "viscous only": (17.9, 17.8),
     "viscous + offset": (17.0, 16.9),
@@ -47,36 +47,36 @@ def force_errors(estimate):
 
 @needs_emps
 @pytest.mark.parametrize("fit", emps.FITS, ids=lambda fit: fit.name)
-def test_our_force_error_is_the_published_one(fit):
-    plain = emps.least_squares(emps.record(emps.ESTIMATION), fit.terms)
-    assert force_errors(plain) == pytest.approx(FORCE_ERRORS[fit.name], abs=0.06)
+def test_force_error_of_least_squares_matches_the_published_one(fit):
+    estimate = emps.least_squares(emps.record(emps.ESTIMATION), fit.terms)
+    assert force_errors(estimate) == pytest.approx(FORCE_ERRORS[fit.name], abs=0.06)
 
 
 @pytest.mark.slow
 @needs_emps
 @free_run
 def test_linear_force_error_is_within_one_point_of_least_squares():
-    errors = force_errors(emps.estimate_of(emps_of(LINEAR)))
-    assert errors == pytest.approx(FORCE_ERRORS[LINEAR], abs=1.0)
+    errors = force_errors(emps.estimate_of(emps_of(VISCOUS_ONLY)))
+    assert errors == pytest.approx(FORCE_ERRORS[VISCOUS_ONLY], abs=1.0)
 
 
 @pytest.mark.slow
 @needs_emps
-def test_mass_with_coulomb_friction_is_the_published_one():
-    assert emps.estimate_of(emps_of(COULOMB))["M"] == pytest.approx(95.109, rel=0.03)
+def test_mass_with_coulomb_friction_matches_the_published_one():
+    assert emps.estimate_of(emps_of(COULOMB_AND_OFFSET))["M"] == pytest.approx(95.109, rel=0.03)
 
 
 @pytest.mark.slow
 @needs_emps
 @free_run
-def test_viscous_friction_with_coulomb_friction_is_the_published_one():
-    assert emps.estimate_of(emps_of(COULOMB))["Fv"] == pytest.approx(203.5, rel=0.03)
+def test_viscous_friction_with_coulomb_friction_matches_the_published_one():
+    assert emps.estimate_of(emps_of(COULOMB_AND_OFFSET))["Fv"] == pytest.approx(203.5, rel=0.03)
 
 
 @pytest.mark.slow
 @needs_emps
-def test_coulomb_intervals_hold_the_published_values():
-    found = emps_of(COULOMB).parameters
+def test_intervals_with_coulomb_friction_contain_the_published_values():
+    found = emps_of(COULOMB_AND_OFFSET).parameters
     for term, name in {"M": "J", "Fv": "f", "Fc": emps.COULOMB}.items():
         low, high = found[name].ci95
         assert low <= emps.PUBLISHED[term] <= high
@@ -84,8 +84,8 @@ def test_coulomb_intervals_hold_the_published_values():
 
 @pytest.mark.slow
 @needs_emps
-def test_axis_says_nothing_of_the_winding():
-    found = emps_of(COULOMB).parameters
+def test_an_axis_driven_by_force_does_not_identify_the_winding():
+    found = emps_of(COULOMB_AND_OFFSET).parameters
     unseen = {name for name, estimate in found.items() if estimate.status == "not_identifiable"}
     assert unseen == {"R", "L", "Kb", "Kt"}
 

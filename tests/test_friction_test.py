@@ -1,4 +1,4 @@
-"""A fit without dry friction says so where there is some, and only there."""
+"""The test for dry friction in a fit without it: reported if the motor has some, and only then."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 from scipy.signal import lsim
 
 from benchmarks import virtual_bench as vb
+from experiments.bench import recording
 from pmdc_jax import Motor, identify
 from pmdc_jax.identify.friction_test import (
     MissingFriction,
@@ -22,28 +23,27 @@ from pmdc_jax.recording import Recording
 from pmdc_jax.simulate import Tape
 
 PAPER = vb.paper_motor()
-SHAKEN = {"torque_Nm": 0.01, "torque_correlation_s": 0.05}
+TORQUE_NOISE = {"torque_Nm": 0.01, "torque_correlation_s": 0.05}
 
 
-def recorded(coulomb_Nm: float, seed: int, **torque: float) -> list[Recording]:
+def recorded(coulomb_Nm: float, seed: int, **torque_noise: float) -> list[Recording]:
     motor = replace(PAPER, coulomb_Nm=coulomb_Nm)
     rng = np.random.default_rng(seed)
-    noise = vb.Noise(current_A=0.5, speed_rad_s=3.0, **torque)
+    noise = vb.Noise(current_A=0.5, speed_rad_s=3.0, **torque_noise)
     runs = {"stairs": vb.staircase(2.0), "loaded": vb.loaded(rng, 2.0, 1e-3, hold=0.125)}
     found = []
     for name, driven in runs.items():
         columns = vb.record(motor, driven, rng, noise)
-        signals = (columns[q] for q in ("time_s", "voltage_V", "current_A", "speed_rad_s"))
-        found.append(Recording(name, *signals, load=columns["load_torque_Nm"]))
+        found.append(recording(name, columns))
     return found
 
 
-def said(messages: tuple[str, ...]) -> list[str]:
+def friction_messages_of(messages: tuple[str, ...]) -> list[str]:
     return [m for m in messages if "dry friction" in m]
 
 
-def test_friction_that_hides_in_the_viscous_one_is_told():
-    """Hidden in noise so large that nothing else says a word, and f more than half too large."""
+def test_dry_friction_that_biases_viscous_friction_is_reported():
+    """In noise so large that there is no other message, and with f too large by more than half."""
     runs = recorded(0.04, seed=31)
     found = identify(runs)
     assert found.parameters["f"].value > 1.5 * PAPER.f
@@ -51,37 +51,37 @@ def test_friction_that_hides_in_the_viscous_one_is_told():
     assert "f is biased" in message
     friction = float(message.split("about ")[1].split()[0])
     assert friction == pytest.approx(0.04, rel=0.2)
-    assert not said(identify(runs, effects=["coulomb_friction"]).messages)
+    assert not friction_messages_of(identify(runs, effects=["coulomb_friction"]).messages)
 
 
-@pytest.mark.parametrize("torque", [{}, SHAKEN], ids=["white", "coloured"])
+@pytest.mark.parametrize("torque_noise", [{}, TORQUE_NOISE], ids=["white", "coloured"])
 @pytest.mark.parametrize("seed", range(3))
-def test_none_is_told_where_there_is_none(seed, torque):
-    assert not said(identify(recorded(0.0, seed, **torque)).messages)
+def test_no_message_without_dry_friction(seed, torque_noise):
+    assert not friction_messages_of(identify(recorded(0.0, seed, **torque_noise)).messages)
 
 
 @pytest.mark.parametrize(
-    ("error", "missed", "told"),
+    ("error", "residual_over_noise", "expected_text"),
     [
         (0.1, {}, ", and without it f is biased by more than its standard error"),
         (1.0, {"current": 4.6}, ": add"),
         (1.0, {}, ""),
     ],
 )
-def test_friction_is_told_where_a_parameter_makes_up_for_it_or_far_more_than_noise_is_left(
-    error, missed, told
+def test_dry_friction_is_reported_if_it_biases_a_parameter_or_the_residual_exceeds_noise(
+    error, residual_over_noise, expected_text
 ):
-    """An error of a fit that leaves far more than noise may be as large as what the friction moves."""
+    """If residuals exceed the noise by far, so do standard errors, and a bias below them is reported all the same."""
     found = Mock(spec=Identification)
     found.covariance, found.covariance_names = np.diag([1.0, error**2]), ("J", "f")
-    found.missed = missed
+    found.missed = residual_over_noise
     messages = list(friction_messages(MissingFriction(0.01, 27.0, np.array([0.01, -0.6])), found))
-    assert len(messages) == bool(told)
-    assert all(f"(27 standard errors){told}" in message for message in messages)
+    assert len(messages) == bool(expected_text)
+    assert all(f"(27 standard errors){expected_text}" in message for message in messages)
 
 
-def test_the_response_to_a_load_is_that_of_the_linear_motor(x64):
-    """Against scipy, with a load that is held from sample to sample."""
+def test_the_response_to_a_load_matches_scipy(x64):
+    """With a load that is held from sample to sample."""
     (run, _) = recorded(0.0, seed=1)
     motor = Motor(*(getattr(PAPER, name) for name in vb.SIX))
     load = np.sign(np.sin(7 * run.time))

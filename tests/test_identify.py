@@ -1,4 +1,4 @@
-"""Identification on data of the independent bench: right, sure of itself as far as it may be, or silent.
+"""Identification on data of the independent virtual bench: accurate, with intervals as wide as the errors, or none.
 
 Almost every case has two runs of 1,000 samples, so that few shapes are compiled.
 """
@@ -19,6 +19,7 @@ from scipy.signal import lfilter, lsim
 
 from benchmarks import virtual_bench as vb
 from benchmarks.naming.plant import Plant, simulate
+from experiments.bench import recording
 from pmdc_jax import InputError, identify
 from pmdc_jax.control.spread import drawn_motors
 from pmdc_jax.effects import EFFECTS
@@ -51,11 +52,6 @@ NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
 SAMPLES = 1000
 
 
-def recording(name: str, columns: vb.Columns) -> Recording:
-    quantities = ("time_s", "voltage_V", "current_A", "speed_rad_s")
-    return Recording(name, *(columns[q] for q in quantities), load=columns.get("load_torque_Nm"))
-
-
 def light_and_loaded(seed: int, motor=PAPER, step=1e-3, noise=NOISE, **known) -> list[Recording]:
     """A run with a two-level voltage and no load, and one with steps of both voltage and load."""
     rng = np.random.default_rng(seed)
@@ -69,7 +65,7 @@ def light_and_loaded(seed: int, motor=PAPER, step=1e-3, noise=NOISE, **known) ->
 
 
 def unloaded(seed: int, motor=PAPER) -> list[Recording]:
-    """Two light runs in whose records no load is mentioned."""
+    """Two runs without load, whose recordings have no load column."""
     rng = np.random.default_rng(seed)
     excitations = {"first": vb.prbs(rng, 1.0), "second": vb.prbs(rng, 1.0, offset=-4.0)}
     return [
@@ -78,10 +74,10 @@ def unloaded(seed: int, motor=PAPER) -> list[Recording]:
     ]
 
 
-def assert_right(
+def assert_accurate(
     found: Identification, truth, names: Sequence[str] = tuple(PARAMETERS), percent: float = 1.0
 ) -> None:
-    """Within 3.5 standard errors and some per cent of the truth, and claimed to be known."""
+    """The parameters are identified, within 3.5 standard errors and some per cent of the truth."""
     for name in names:
         estimate, true = found.parameters[name], getattr(truth, name)
         assert estimate.status in ("identified", "tied"), (name, estimate)
@@ -111,9 +107,9 @@ def found(runs) -> Identification:
 
 
 @pytest.mark.parametrize("motor", MOTORS.values(), ids=MOTORS.keys())
-def test_recovers_the_motor(motor):
+def test_the_motor_is_identified(motor):
     result = identify(light_and_loaded(3, motor))
-    assert_right(result, motor)
+    assert_accurate(result, motor)
     assert result.converged
     assert result.unidentified_directions == ()
     assert result.messages == ()
@@ -128,13 +124,13 @@ def test_recovers_the_motor(motor):
 def test_runs_may_begin_in_motion():
     motor, start = PAPER, (20.0, 150.0, 0.0)
     result = identify(light_and_loaded(4, motor, start=start))
-    assert_right(result, motor)
+    assert_accurate(result, motor)
     for fit in result.fit.values():
         assert fit.current_simulated[0] == pytest.approx(start[0], abs=5 * NOISE.current_A)
         assert fit.speed_simulated[0] == pytest.approx(start[1], abs=2 * NOISE.speed_rad_s)
 
 
-def test_the_same_seed_gives_the_same_answer_bit_for_bit(runs, found):
+def test_the_same_seed_gives_identical_results(runs, found):
     again = identify(runs)
     assert again.parameters == found.parameters
     np.testing.assert_array_equal(again.covariance, found.covariance)
@@ -148,30 +144,30 @@ def test_another_seed_gives_the_same_motor(runs, found):
         assert abs(other.parameters[name].value - estimate.value) < 0.1 * estimate.stderr
 
 
-def test_leaves_jax_as_it_was(found):
+def test_settings_of_jax_stay_as_they_were(found):
     assert found.motor.R.dtype == np.float64
     assert not jax.config.jax_enable_x64
     assert jnp.zeros(1).dtype == jnp.float32
 
 
-def test_hold_outs_do_not_touch_the_fit(runs):
-    """Whatever they hold; and their own fit is judged with the motor of the others."""
+def test_hold_outs_do_not_affect_the_fit(runs):
+    """Whatever they contain; and their errors are those of the motor fitted to the others."""
     light, loaded = runs
-    spoiled = attrs.evolve(light, speed=light.speed * 1.2 + 5.0)
-    fair, unfair = (identify([loaded], holdout=[held]) for held in (light, spoiled))
-    assert_right(fair, PAPER, percent=4.0)
-    for name, estimate in fair.parameters.items():
-        assert unfair.parameters[name].value == pytest.approx(estimate.value, rel=1e-9)
-    assert [f.role for f in fair.fit.values()] == ["train", "holdout"]
-    assert fair.fit["light"].speed_rmse == pytest.approx(NOISE.speed_rad_s, rel=0.1)
-    assert unfair.fit["light"].speed_rmse > 10 * NOISE.speed_rad_s
+    faulty = attrs.evolve(light, speed=light.speed * 1.2 + 5.0)
+    with_valid, with_faulty = (identify([loaded], holdout=[held]) for held in (light, faulty))
+    assert_accurate(with_valid, PAPER, percent=4.0)
+    for name, estimate in with_valid.parameters.items():
+        assert with_faulty.parameters[name].value == pytest.approx(estimate.value, rel=1e-9)
+    assert [f.role for f in with_valid.fit.values()] == ["train", "holdout"]
+    assert with_valid.fit["light"].speed_rmse == pytest.approx(NOISE.speed_rad_s, rel=0.1)
+    assert with_faulty.fit["light"].speed_rmse > 10 * NOISE.speed_rad_s
 
 
-# -------------------------------------------------------------- what the recordings cannot tell
+# -------------------------------------------------------------- parameters that are not identifiable
 
 
-def test_a_bound_along_an_unseen_direction_is_none(x64):
-    """A search ends anywhere along it, and so where Kt meets its bound: J and f are no surer for that."""
+def test_a_bound_along_an_unidentifiable_direction_is_not_reported(x64):
+    """A search may end anywhere along it, even where Kt is at its bound, but J and f are not identified thereby."""
     given, solved = solve(prepare(unloaded(5), [], unloaded=True), "cma_es", seed=0)
     names, best = given.problem.parameters.names, solved.fit.optimum
     at = np.array(best.unknowns.coordinates)
@@ -187,9 +183,9 @@ def test_a_bound_along_an_unseen_direction_is_none(x64):
 
 
 @pytest.mark.parametrize("declared", [True, False], ids=["declared", "unknown constant load"])
-def test_without_a_known_load_only_ratios_are_claimed(declared):
+def test_without_a_known_load_only_ratios_are_identified(declared):
     result = identify(unloaded(5), unloaded=declared)
-    assert_right(result, PAPER, ("R", "L", "Kb"))
+    assert_accurate(result, PAPER, ("R", "L", "Kb"))
     for name in ("Kt", "J", "f"):
         estimate = result.parameters[name]
         assert estimate.status == "not_identifiable"
@@ -198,19 +194,19 @@ def test_without_a_known_load_only_ratios_are_claimed(declared):
     assert set(direction.parameters) == {"Kt", "J", "f"}
     assert "load" in direction.why
     assert "tie" in direction.mend
-    # the ratios are right all the same, and Kt is what it is in SI
+    # the ratios are accurate all the same, and Kt is set to its theoretical value, Kb
     motor = result.motor
     assert float(motor.Kt / motor.J) == pytest.approx(PAPER.Kt / PAPER.J, rel=0.01)
     assert float(motor.f / motor.J) == pytest.approx(PAPER.f / PAPER.J, rel=0.03)
     assert float(motor.Kt) == pytest.approx(float(motor.Kb), rel=1e-6)
 
 
-def test_the_tie_makes_an_unloaded_motor_whole():
+def test_a_tie_makes_an_unloaded_motor_identifiable():
     truth = replace(PAPER, Kt=PAPER.Kb)
     result = identify(unloaded(6, truth), tie=(("Kt", "Kb"),), unloaded=True)
-    assert_right(result, truth, percent=3.0)
+    assert_accurate(result, truth, percent=3.0)
     assert result.parameters["Kt"].status == "tied"
-    # motors as they might be have the tie, too
+    # motors drawn from the covariance keep the tie
     names, matrix = result.covariance_names, result.covariance
     Kt, Kb = names.index("Kt"), names.index("Kb")
     np.testing.assert_array_equal(matrix[Kt], matrix[Kb])
@@ -221,40 +217,40 @@ def test_the_tie_makes_an_unloaded_motor_whole():
     assert result.unidentified_directions == ()
 
 
-def test_a_known_constant_makes_an_unloaded_motor_whole():
+def test_a_known_constant_makes_an_unloaded_motor_identifiable():
     result = identify(unloaded(7), known={"Kt": PAPER.Kt}, unloaded=True)
-    assert_right(result, PAPER, ("R", "L", "Kb", "J", "f"), percent=3.0)
+    assert_accurate(result, PAPER, ("R", "L", "Kb", "J", "f"), percent=3.0)
     known = result.parameters["Kt"]
     assert (known.value, known.stderr, known.status) == (PAPER.Kt, 0.0, "known")
 
 
 def test_one_run_may_lack_the_current(runs):
     light, loaded = runs
-    assert_right(identify([attrs.evolve(light, current=None), loaded]), PAPER, percent=2.0)
+    assert_accurate(identify([attrs.evolve(light, current=None), loaded]), PAPER, percent=2.0)
     result = identify([light, attrs.evolve(loaded, current=None)])
-    assert_right(result, PAPER, percent=2.0)
+    assert_accurate(result, PAPER, percent=2.0)
     assert result.fit["loaded"].current_rmse is None
 
 
-def test_without_any_current_the_constants_are_not_claimed(runs):
-    """(Kt/R) (v - Kb w) - f w - T = J dw/dt: Kt/R, J and a sum of Kb and f show, and hardly more."""
+def test_without_any_current_the_constants_are_not_identifiable(runs):
+    """(Kt/R) (v - Kb w) - f w - T = J dw/dt: identifiable are Kt/R, J and a sum of Kb and f, and hardly more."""
     result = identify([attrs.evolve(run, current=None) for run in runs])
     assert result.fit["loaded"].speed_rmse == pytest.approx(NOISE.speed_rad_s, rel=0.1)
     for name in ("R", "L", "Kt"):
         assert result.parameters[name].status == "not_identifiable"
     assert any("current" in d.why for d in result.unidentified_directions)
-    assert_right(result, PAPER, ("J",), percent=3.0)
+    assert_accurate(result, PAPER, ("J",), percent=3.0)
     for name in ("Kb", "f"):
         if result.parameters[name].status != "not_identifiable":
-            assert_right(result, PAPER, (name,), percent=50.0)
+            assert_accurate(result, PAPER, (name,), percent=50.0)
     m = result.motor
     assert float(m.Kt / m.R) == pytest.approx(PAPER.Kt / PAPER.R, rel=0.01)
     braking = PAPER.Kt * PAPER.Kb / PAPER.R + PAPER.f
     assert float(m.Kt * m.Kb / m.R + m.f) == pytest.approx(braking, rel=0.01)
 
 
-def test_voltage_and_speed_alone_do_not_tell_back_emf_from_friction():
-    """Unloaded, any share of the volts may be friction's, and the fit is the same; with next to none it is Kb alone."""
+def test_voltage_and_speed_alone_do_not_separate_back_emf_from_friction():
+    """Without load, any share of the voltage may be due to friction; with little friction Kb is identified."""
     motor = replace(PAPER, f=20 * PAPER.f)
     runs = [attrs.evolve(run, current=None) for run in unloaded(3, motor)]
     result = identify(runs, unloaded=True)
@@ -262,24 +258,24 @@ def test_voltage_and_speed_alone_do_not_tell_back_emf_from_friction():
     assert any({"Kb", "f"} <= set(d.parameters) for d in result.unidentified_directions)
 
 
-def test_voltage_and_current_alone_tell_the_armature_and_ratios(runs):
+def test_voltage_and_current_alone_identify_the_armature_and_ratios(runs):
     """Speeds of twice the size, with half of Kb, J and f, make the same current."""
     result = identify([attrs.evolve(run, speed=None) for run in runs])
     assert result.fit["loaded"].current_rmse == pytest.approx(NOISE.current_A, rel=0.1)
-    assert_right(result, PAPER, ("R", "L", "Kt"), percent=2.0)
+    assert_accurate(result, PAPER, ("R", "L", "Kt"), percent=2.0)
     for name in ("Kb", "J", "f"):
         assert result.parameters[name].status == "not_identifiable"
     assert any("speed" in d.why for d in result.unidentified_directions)
     m = result.motor
     assert float(m.J / m.Kb) == pytest.approx(PAPER.J / PAPER.Kb, rel=0.02)
-    # and with Kb tied to Kt, which the known load shows, everything is there
+    # with Kb tied to Kt, which the known load determines, all parameters are identified
     tied = identify([attrs.evolve(run, speed=None) for run in runs], tie=[("Kb", "Kt")])
     assert {p.status for p in tied.parameters.values()} <= {"identified", "tied"}
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_simulation_without_noise_is_met_exactly(seed):
-    """And the fit says so: what is left are rounding errors, of which no gradient vanishes."""
+def test_a_noise_free_simulation_is_identified_exactly(seed):
+    """And the fit converges, although the residuals are rounding errors, whose gradient does not vanish."""
     exact = identify(light_and_loaded(seed, noise=vb.Noise(0.0, 0.0)))
     assert exact.converged
     for name in PARAMETERS:
@@ -287,8 +283,8 @@ def test_a_simulation_without_noise_is_met_exactly(seed):
 
 
 @pytest.mark.slow
-def test_a_short_circuit_from_full_speed_tells_ratios_alone():
-    """Nothing but the decay: of R, L and Kb, as of J, f and Kt, only how one is to the others."""
+def test_a_short_circuit_from_full_speed_identifies_ratios_only():
+    """Only the decay is recorded, which determines ratios of R, L and Kb, and of J, f and Kt."""
     rng, time = np.random.default_rng(4), 1e-3 * np.arange(SAMPLES)
     A = [[-PAPER.R / PAPER.L, -PAPER.Kb / PAPER.L], [PAPER.Kt / PAPER.J, -PAPER.f / PAPER.J]]
     zero = np.zeros(SAMPLES)
@@ -302,18 +298,18 @@ def test_a_short_circuit_from_full_speed_tells_ratios_alone():
 
 
 @pytest.mark.slow
-def test_without_voltage_a_tie_tells_nothing():
-    """Kb has nothing to do with such runs, so that Kt = Kb leaves Kt as open as it was."""
+def test_without_voltage_a_tie_identifies_nothing():
+    """Kb has no influence on such runs, so Kt = Kb does not determine Kt."""
     light = [attrs.evolve(run, voltage=None) for run in unloaded(3)]
     result = identify(light, tie=[("Kt", "Kb")])
     assert {p.status for p in result.parameters.values()} == {"not_identifiable"}
     assert any("voltage" in d.why for d in result.unidentified_directions)
 
 
-def test_current_and_speed_tell_the_mechanical_half():
+def test_current_and_speed_identify_the_mechanical_half():
     """Without voltage: sampled fast enough for the current to be a straight line between samples.
 
-    Its rise at switching on is cut off; and its noise, being that of an input here, is kept small.
+    Its rise after switching on is cut off, and its noise, which is noise of the input here, is small.
     """
     rng, cut, runs = np.random.default_rng(8), 100, []
     for name, load in (("a", 0.6), ("b", 0.9)):
@@ -322,23 +318,23 @@ def test_current_and_speed_tell_the_mechanical_half():
         smooth = recording(name, {q: values[cut:] for q, values in columns.items()})
         runs.append(attrs.evolve(smooth, voltage=None))
     result = identify(runs)
-    assert_right(result, PAPER, ("Kt", "J"), percent=1.0)
-    assert_right(result, PAPER, ("f",), percent=30.0)
+    assert_accurate(result, PAPER, ("Kt", "J"), percent=1.0)
+    assert_accurate(result, PAPER, ("f",), percent=30.0)
     for name in ("R", "L", "Kb"):
         estimate = result.parameters[name]
         assert (estimate.value, estimate.status) == (None, "not_identifiable")
     assert result.fit["a"].current_rmse is None
 
 
-def held_rotor(seed: int, **columns) -> Recording:
-    """A locked-rotor test: twenty voltages."""
+def locked_rotor(seed: int, **columns) -> Recording:
+    """A locked-rotor test with twenty voltages."""
     rng = np.random.default_rng(seed)
     voltage = np.repeat(rng.uniform(-3, 3, 20), SAMPLES // 20)
-    return of_coil(voltage, 5e-4, NOISE.current_A * rng.standard_normal(SAMPLES), **columns)
+    return run_of_coil(voltage, 5e-4, NOISE.current_A * rng.standard_normal(SAMPLES), **columns)
 
 
-def of_coil(voltage: np.ndarray, step: float, noise: np.ndarray, **columns) -> Recording:
-    """By the closed form of a coil whose voltage holds between samples."""
+def run_of_coil(voltage: np.ndarray, step: float, noise: np.ndarray, **columns) -> Recording:
+    """A run by the closed form of a coil whose voltage is held between samples."""
     decay = np.exp(-PAPER.R / PAPER.L * step)
     current = lfilter([0, (1 - decay) / PAPER.R], [1, -decay], voltage)
     return Recording("held", step * np.arange(len(voltage)), voltage, current + noise, **columns)
@@ -347,8 +343,8 @@ def of_coil(voltage: np.ndarray, step: float, noise: np.ndarray, **columns) -> R
 @pytest.mark.parametrize(
     "columns", [{"speed": np.zeros(SAMPLES)}, {"angle": np.full(SAMPLES, 0.3)}, {"held": True}]
 )
-def test_a_held_rotor_tells_the_electrical_half(columns):
-    found = identify([held_rotor(3, **columns)])
+def test_a_locked_rotor_identifies_the_electrical_half(columns):
+    found = identify([locked_rotor(3, **columns)])
     for name, true in (("R", PAPER.R), ("L", PAPER.L)):
         estimate = found.parameters[name]
         assert abs(estimate.value - true) < 3 * estimate.stderr < 0.01 * true
@@ -357,11 +353,11 @@ def test_a_held_rotor_tells_the_electrical_half(columns):
 
 
 @pytest.mark.parametrize(("step", "samples"), [(2e-4, 150), (5e-6, 2000)])
-def test_a_single_rise_of_the_current_tells_the_electrical_half(step, samples):
-    """As a scope catches it: a few time constants long, which is far longer than a sample."""
+def test_a_single_rise_of_the_current_identifies_the_electrical_half(step, samples):
+    """As recorded by an oscilloscope: a few time constants long, which are far longer than a sample."""
     voltage = np.where(np.arange(samples) < samples // 6, 0.0, 3.0)
     noise = 0.05 * np.random.default_rng(9).standard_normal(samples)
-    found = identify([of_coil(voltage, step, noise, held=True)])
+    found = identify([run_of_coil(voltage, step, noise, held=True)])
     for name, true in (("R", PAPER.R), ("L", PAPER.L)):
         estimate = found.parameters[name]
         assert estimate.status == "identified"
@@ -369,17 +365,17 @@ def test_a_single_rise_of_the_current_tells_the_electrical_half(step, samples):
     assert not any("times its white noise" in message for message in found.messages)
 
 
-def test_a_held_rotor_goes_with_free_ones(runs, found):
-    """It tells more of R and L, and nothing else is worse for it."""
-    more = identify([*runs, held_rotor(4, speed=np.zeros(SAMPLES))])
-    assert_right(more, PAPER)
+def test_a_locked_rotor_may_be_fitted_with_other_runs(runs, found):
+    """It reduces the standard errors of R and L, and impairs no other parameter."""
+    more = identify([*runs, locked_rotor(4, speed=np.zeros(SAMPLES))])
+    assert_accurate(more, PAPER)
     for name in ("R", "L"):
         assert more.parameters[name].stderr < found.parameters[name].stderr
     assert any("locked-rotor run" in finding.what for finding in more.findings)
 
 
 def driven_by_torque(name: str, rng: np.random.Generator) -> Recording:
-    """Known torque and an encoder: angle by the closed form of J dw/dt = torque - f w."""
+    """A run with known torque and an encoder, by the closed form of J dw/dt = torque - f w."""
     step = 1e-3
     torque = np.repeat(rng.uniform(-0.5, 0.5, SAMPLES // 20), 20)
     rate, decay = PAPER.f / PAPER.J, np.exp(-PAPER.f / PAPER.J * step)
@@ -394,25 +390,25 @@ def driven_by_torque(name: str, rng: np.random.Generator) -> Recording:
     )
 
 
-def test_torque_and_angle_tell_inertia_and_friction():
+def test_torque_and_angle_identify_inertia_and_friction():
     rng = np.random.default_rng(9)
     result = identify([driven_by_torque("a", rng), driven_by_torque("b", rng)])
-    assert_right(result, PAPER, ("J",), percent=1.0)
-    assert_right(result, PAPER, ("f",), percent=5.0)
+    assert_accurate(result, PAPER, ("J",), percent=1.0)
+    assert_accurate(result, PAPER, ("f",), percent=5.0)
     for name in ("R", "L", "Kb", "Kt"):
         assert result.parameters[name].status == "not_identifiable"
 
 
-def test_slow_sampling():
-    """Ten electrical time constants a sample, two thirds of the mechanical one."""
-    assert_right(identify(light_and_loaded(10, step=20e-3)), PAPER, percent=2.0)
+def test_a_slowly_sampled_motor_is_identified():
+    """Ten electrical time constants per sample, and two thirds of the mechanical one."""
+    assert_accurate(identify(light_and_loaded(10, step=20e-3)), PAPER, percent=2.0)
 
 
-def test_an_inductance_too_fast_to_see_is_no_confident_number():
-    """25 electrical time constants a sample; the rest of the motor is there all the same."""
+def test_an_inductance_too_small_for_the_sampling_has_no_overconfident_interval():
+    """25 electrical time constants per sample; the other parameters are identified all the same."""
     truth = replace(PAPER, L=PAPER.L / 50)
     result = identify(light_and_loaded(10, truth))
-    assert_right(result, truth, ("R", "Kb", "Kt", "J", "f"), percent=2.0)
+    assert_accurate(result, truth, ("R", "Kb", "Kt", "J", "f"), percent=2.0)
     L = result.parameters["L"]
     assert L.status in ("identified", "not_identifiable", "at_bound")
     if L.status == "identified":
@@ -422,15 +418,15 @@ def test_an_inductance_too_fast_to_see_is_no_confident_number():
 # ------------------------------------------------------------------------- noise and whitening
 
 
-def test_the_noise_of_a_quantised_sensor_is_that_of_rounding():
-    """A speed that hardly changes shows its quantum only now and then."""
+def test_the_noise_of_a_quantised_sensor_is_its_rounding_error():
+    """Even if the speed changes so slowly that it steps only now and then."""
     speed = 0.5 * np.round(np.sin(np.linspace(0, 7, 5000)) * 30 / 0.5)
     assert white_noise([speed]) == pytest.approx(0.5 / np.sqrt(12), rel=1e-6)
     assert quantum(np.diff(speed)) == 0.5
     assert is_coarse(speed)
     rng = np.random.default_rng(0)
     assert not is_coarse(speed + rng.normal(size=5000))
-    # three quanta of noise blur them, though all values are still multiples
+    # noise of three quanta acts as dither, although all values are still multiples
     assert not is_coarse(0.5 * np.round((speed + 1.5 * rng.normal(size=5000)) / 0.5))
 
 
@@ -452,13 +448,13 @@ def test_a_smooth_or_a_noisy_signal_has_no_quantum():
         ([0.0, 0.0], 0.0),
     ],
 )
-def test_a_converter_resolves_what_all_values_are_multiples_of(values, step):
+def test_the_resolution_of_a_converter_divides_all_values(values, step):
     assert common_divisor(np.array(values)) == pytest.approx(step, rel=1e-6)
 
 
-def test_whitening_is_its_formula_sample_by_sample():
-    """Two runs in three blocks, the second without current and with a sample missing; of the first one, the speed is
-    known from the second sample on."""
+def test_whitening_matches_its_formula_sample_by_sample():
+    """Two runs in three blocks, the second without current and with a missing sample; the first speed of the
+    first one is unknown."""
     rng = np.random.default_rng(1)
     run, samples = np.array([0, 0, 1]), 128
     weight = np.ones((3, 2, samples))
@@ -471,47 +467,48 @@ def test_whitening_is_its_formula_sample_by_sample():
     signal = rng.normal(size=(3, 2, samples, 2)) * weight[..., None]
     white = np.asarray(Whitening.of(filters, scales, weight, run)(jnp.asarray(signal), run))
     for index, (A, S) in enumerate(zip(filters, scales, strict=True)):
-        mine = np.moveaxis(signal[run == index], 1, 2).reshape(-1, 2, 2)
+        unfiltered = np.moveaxis(signal[run == index], 1, 2).reshape(-1, 2, 2)
         found = np.moveaxis(white[run == index], 1, 2).reshape(-1, 2, 2)
-        for t in range(len(mine)):
-            past = sum(A[k - 1] @ mine[t - k] for k in range(1, min(len(A), t) + 1))
-            lost = index == 1 and 50 <= t <= 52
-            expected = 0.0 * mine[t] if lost else S @ (mine[t] - past)
+        for t in range(len(unfiltered)):
+            past = sum(A[k - 1] @ unfiltered[t - k] for k in range(1, min(len(A), t) + 1))
+            omitted = index == 1 and 50 <= t <= 52
+            expected = 0.0 * unfiltered[t] if omitted else S @ (unfiltered[t] - past)
             np.testing.assert_allclose(found[t], expected, atol=1e-6, err_msg=f"{index} {t}")
 
 
-def _last_fit(given, plainly):
-    return last_fit(given, plainly, plainly, whitener(residuals_of(given, plainly)))
+def _last_fit(given, plain_fit):
+    return last_fit(given, plain_fit, plain_fit, whitener(residuals_of(given, plain_fit)))
 
 
-def test_torque_noise_is_filtered_out():
-    """The last fit is to white residuals: for R it is several times as good as plain least squares."""
+def test_whitening_of_torque_noise_reduces_standard_errors():
+    """The last fit, to whitened residuals, is several times as accurate for R as plain least squares."""
     noise = replace(NOISE, torque_Nm=0.05, torque_correlation_s=0.02)
     runs = light_and_loaded(3, noise=noise)
     with jax.enable_x64(True):
         given, solved = solve(prepare(runs, []), "cma_es", 0)
-        sharper, last = _last_fit(given, solved.fit)
-        plain = results_of(given, solved).parameters
-        sharp = results_of(sharper, solved._replace(fit=last)).parameters
+        whitened, last = _last_fit(given, solved.fit)
+        plain_estimates = results_of(given, solved).parameters
+        whitened_estimates = results_of(whitened, solved._replace(fit=last)).parameters
     assert last.optimum.converged
-    assert sharp["R"].stderr < 0.5 * plain["R"].stderr
+    assert whitened_estimates["R"].stderr < 0.5 * plain_estimates["R"].stderr
     for name in PARAMETERS:
-        assert sharp[name].stderr < 1.2 * plain[name].stderr, name
-        assert abs(sharp[name].value - getattr(PAPER, name)) < 4 * sharp[name].stderr, name
-    # and no state that a run begins with has run away
+        assert whitened_estimates[name].stderr < 1.2 * plain_estimates[name].stderr, name
+        error = abs(whitened_estimates[name].value - getattr(PAPER, name))
+        assert error < 4 * whitened_estimates[name].stderr, name
+    # the fitted initial states are close to the measured ones
     initial = np.column_stack([last.unknowns.runs.current, last.unknowns.runs.speed])
     measured = [(run.current[0], run.speed[0]) for run in runs]
     np.testing.assert_allclose(initial, measured, atol=5 * NOISE.speed_rad_s)
 
 
-def test_white_noise_asks_for_no_filter(runs):
+def test_white_residuals_need_no_filter(runs):
     with jax.enable_x64(True):
         given, solved = solve(prepare(runs, []), "cma_es", 0)
         assert _last_fit(given, solved.fit)[1] is solved.fit
 
 
-def test_one_start_has_a_middling_inductance():
-    """A search may end where L is too small to matter; nothing leads back from there."""
+def test_one_start_of_the_refinement_has_a_medium_inductance():
+    """A search may end where L is too small to matter, from where no gradient leads back."""
     parameters = Parameters.of(dict.fromkeys(PARAMETERS, (1e-08, 100000000.0)))
     stuck = np.log([[0.2, 1e-7, 0.05, 0.05, 5e-4, 2e-4], [0.3, 2e-7, 0.05, 0.05, 5e-4, 2e-4]])
     nothing = np.zeros(2)
@@ -537,13 +534,13 @@ def problem_of(runs: list[Recording], bounds=None) -> Problem:
 
 
 def start_at(problem: Problem, factor: float = 1.0) -> Unknowns:
-    """The paper's motor, or some factor off, and each run as it begins in its record."""
+    """The paper's motor with all parameters times `factor`, and each run's recorded initial state."""
     coordinates = np.log([factor * getattr(PAPER, n) for n in PARAMETERS])
     return Unknowns(jnp.asarray(coordinates), RunUnknowns.as_recorded(problem.tape))
 
 
-def test_a_bound_in_the_way_is_reported(x64, runs):
-    """R may not reach its true value from below, J not from above; both end where they are stopped."""
+def test_a_bound_that_limits_the_fit_is_reported(x64, runs):
+    """R may not reach its true value from below, nor J from above; both end at their bounds."""
     limits = {"R": (0.01, 0.14), "J": (6e-4, 1e-2)}
     problem = problem_of(runs, limits)
     start = start_at(problem)
@@ -555,7 +552,7 @@ def test_a_bound_in_the_way_is_reported(x64, runs):
     assert end.fitness > 4  # a perfect model has 2
 
 
-def test_a_bound_that_only_was_in_the_way_lets_go(x64, runs):
+def test_a_bound_that_only_the_start_was_at_is_not_reported(x64, runs):
     """A coordinate that starts at its bound, the optimum being inside, is not reported."""
     problem = problem_of(runs, {"R": (0.1, 1.0)})
     start = start_at(problem)
@@ -571,8 +568,8 @@ def squares(problem: Problem, unknowns: Unknowns) -> float:
     return float(jnp.sum(evaluate(problem, unknowns).residuals ** 2))
 
 
-def test_converged_means_that_nothing_near_is_better(x64, runs):
-    """By trial: a twentieth of a standard error along any parameter, either way, gains nothing."""
+def test_a_converged_fit_is_a_local_optimum(x64, runs):
+    """A step of a twentieth of a standard error along any parameter, either way, does not improve it."""
     problem = problem_of(runs)
     polished = polish(problem, refine(problem, start_at(problem, 1.5)))
     best, evaluation = polished.optimum, polished.evaluation
@@ -588,8 +585,8 @@ def test_converged_means_that_nothing_near_is_better(x64, runs):
             assert squares(problem, best.unknowns._replace(coordinates=moved)) > lowest
 
 
-def test_known_loads_stay_known(x64, runs):
-    """No residual depends on the offset of a known load: not even rounding errors may move it."""
+def test_known_loads_get_no_offset(x64, runs):
+    """No residual depends on the offset of a known load, and not even rounding errors may change it."""
     problem = problem_of(runs)
     end = refine(problem, start_at(problem, 1.5))
     polished = polish(problem, end).optimum
@@ -597,18 +594,18 @@ def test_known_loads_stay_known(x64, runs):
         np.testing.assert_array_equal(np.asarray(unknowns.runs[2:]), 0.0)
 
 
-def test_friction_that_had_all_but_vanished_is_found_again(x64, runs):
-    """Its logarithm would have to fall by a thousandfold of what a straight line says, and then rise."""
+def test_friction_is_recovered_from_a_value_near_zero(x64, runs):
+    """A linear step of its logarithm is far too long there."""
     problem = problem_of(runs)
-    there = polish(problem, refine(problem, start_at(problem))).optimum
+    optimum = polish(problem, refine(problem, start_at(problem))).optimum
     start = start_at(problem)
-    lost = start._replace(coordinates=start.coordinates.at[5].add(np.log(0.011)))
-    again = polish(problem, there._replace(unknowns=lost)).optimum
+    reduced = start._replace(coordinates=start.coordinates.at[5].add(np.log(0.011)))
+    again = polish(problem, optimum._replace(unknowns=reduced)).optimum
     assert again.converged
-    assert again.fitness == pytest.approx(there.fitness, rel=1e-6)
+    assert again.fitness == pytest.approx(optimum.fitness, rel=1e-6)
 
 
-LATE = {  # s
+SLOW_SENSORS = {  # s
     "speed_sensor_lag": ("time_constant_s", 2e-2),
     "speed_sensor_delay": ("delay_s", 2e-2),
 }
@@ -616,23 +613,23 @@ LATE = {  # s
 
 @pytest.mark.slow
 @pytest.mark.parametrize("inertia", [1.0, 1.3])
-@pytest.mark.parametrize("sensor", LATE)
-def test_the_rotor_turns_by_its_own_speed_and_not_by_that_of_a_slow_sensor(x64, sensor, inertia):
-    """The sensor by scipy, the angle by Simpson's rule over the speed itself; with a wrong inertia, too."""
-    rng, (field, late) = np.random.default_rng(4), LATE[sensor]
+@pytest.mark.parametrize("sensor", SLOW_SENSORS)
+def test_the_rotor_angle_is_that_of_the_true_speed_not_of_a_slow_sensor(x64, sensor, inertia):
+    """The sensor is simulated by scipy, the angle by Simpson's rule over the true speed; also with a wrong inertia."""
+    rng, (field, delay) = np.random.default_rng(4), SLOW_SENSORS[sensor]
     truth = vb.record(PAPER, vb.staircase(2.0), rng, vb.Noise(0.0, 0.0), load_known=True)
     time, speed = truth["time_s"], truth["speed_rad_s"]
     if sensor == "speed_sensor_lag":
-        reported = lsim(([1.0], [late, 1.0]), speed - speed[0], time)[1] + speed[0]
+        reported = lsim(([1.0], [delay, 1.0]), speed - speed[0], time)[1] + speed[0]
     else:
-        reported = np.interp(time - late, time, speed)
+        reported = np.interp(time - delay, time, speed)
     run = attrs.evolve(recording("slow", truth), speed=reported)
     kinds = [EFFECTS[sensor], EFFECTS["cogging_torque"]]
     given = prepare([run], []).with_effects(kinds)
     parameters = given.problem.parameters
     values = {n: getattr(PAPER, n) for n in PARAMETERS} | {
         "J": PAPER.J * inertia,
-        f"{sensor}.{field}": late,
+        f"{sensor}.{field}": delay,
         "cogging_torque.amplitude_Nm": 1e-9,
         "cogging_torque.phase_rad": 0.0,
         "cogging_torque.periods": 5.0,
@@ -644,23 +641,23 @@ def test_the_rotor_turns_by_its_own_speed_and_not_by_that_of_a_slow_sensor(x64, 
     fit = polish(given.problem, Optimum(unknowns, np.inf, (), False), steps=0)
     turn = np.asarray(with_rotor_angle(given.problem, fit).tape.turn).reshape(-1)
     angle = cumulative_simpson(speed, x=time, initial=0.0)
-    by = np.concatenate([[0.0], np.cumsum(turn)])[: len(angle)]
-    # of the last 20 ms of its misfit a late sensor tells nothing
-    assert np.max(np.abs(by - angle)) < 0.02
-    # ... where the sensor's own speed would be off by as much as this
-    assert late * np.ptp(speed) > 0.5
+    angle_found = np.concatenate([[0.0], np.cumsum(turn)])[: len(angle)]
+    # a slow sensor does not yet show the misfit of the last 20 ms
+    assert np.max(np.abs(angle_found - angle)) < 0.02
+    # with the speed of the sensor the error would be as large as this
+    assert delay * np.ptp(speed) > 0.5
 
 
-def test_a_refinement_that_is_cut_short_does_not_claim_convergence(x64, runs):
+def test_a_refinement_with_too_few_steps_has_not_converged(x64, runs):
     problem = problem_of(runs)
-    there = refine(problem, start_at(problem))
-    far = there._replace(unknowns=start_at(problem, 1.3))
+    optimum = refine(problem, start_at(problem))
+    far = optimum._replace(unknowns=start_at(problem, 1.3))
     assert not polish(problem, far, steps=1).optimum.converged
-    assert polish(problem, there, steps=12).optimum.converged
+    assert polish(problem, optimum, steps=12).optimum.converged
 
 
 def test_a_failed_simulation_is_no_optimum(x64, runs):
-    """Where the model overflows, refinement must not stop and call it good."""
+    """If the model overflows, a refinement must not end as converged."""
     problem = problem_of(runs, {"f": (1e-9, 1e300)})
     start = start_at(problem)
     wild = start._replace(coordinates=start.coordinates.at[5].set(np.log(1e299)))
@@ -669,8 +666,8 @@ def test_a_failed_simulation_is_no_optimum(x64, runs):
     assert not polished.converged or polished.fitness < 3
 
 
-def test_a_simulation_that_rounding_would_move_has_failed(x64, runs, monkeypatch):
-    """Where a rotor chatters derivatives may reach 1e95: standard errors of nothing, were they believed."""
+def test_a_simulation_with_huge_derivatives_counts_as_failed(x64, runs, monkeypatch):
+    """If a rotor chatters, derivatives may reach 1e95, with which standard errors would vanish."""
     problem = problem_of(runs)
     start = start_at(problem)
 
@@ -692,8 +689,8 @@ COVERAGE = {
 
 
 @pytest.mark.parametrize("noise", COVERAGE.values(), ids=COVERAGE.keys())
-def test_standard_errors_are_the_size_of_the_errors(x64, noise):
-    """Twelve repeats of six parameters: errors over standard errors have a spread of about one."""
+def test_standard_errors_match_the_spread_of_the_errors(x64, noise):
+    """In twelve repeats, the errors of six parameters over their standard errors have a spread of about one."""
     scores = []
     for seed in range(12):
         problem = problem_of(light_and_loaded(100 + seed, noise=noise))
@@ -714,14 +711,14 @@ def test_standard_errors_are_the_size_of_the_errors(x64, noise):
 
 @pytest.fixture(scope="module")
 def problem(runs) -> tuple[Parameters, Tape, np.ndarray]:
-    """What a search needs, by the paper's motor a factor of ten either way."""
+    """The arguments of a search from a tenth to ten times the parameters of the paper's motor."""
     bounds = {n: (getattr(PAPER, n) / 10, getattr(PAPER, n) * 10) for n in PARAMETERS}
     noise = np.array([NOISE.current_A, NOISE.speed_rad_s])
     return Parameters.of(bounds), Tape.from_recordings(runs), noise
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_searches(x64, problem, method):
+def test_every_search_method_improves_within_the_bounds(x64, problem, method):
     parameters = problem[0]
     generations = 12
     result = search(*problem, method, seed=1, population=32, generations=generations)
@@ -740,16 +737,16 @@ def test_an_unknown_method_is_refused(problem):
         search(*problem, "annealing")
 
 
-def test_the_paper_ga_finds_more_than_scattering_does(x64, problem):
-    """As many candidates drawn blindly are the control."""
-    blind = search(*problem, "paper_ga", seed=2, population=32 * 12, generations=1)
-    bred = search(*problem, "paper_ga", seed=2, population=32, generations=12)
-    assert blind.evaluations == bred.evaluations
-    assert bred.best[-1] < blind.best[-1]
+def test_the_paper_ga_finds_more_than_random_sampling(x64, problem):
+    """With the same number of evaluations."""
+    random = search(*problem, "paper_ga", seed=2, population=32 * 12, generations=1)
+    evolved = search(*problem, "paper_ga", seed=2, population=32, generations=12)
+    assert random.evaluations == evolved.evaluations
+    assert evolved.best[-1] < random.best[-1]
 
 
 def test_the_binary_code_round_trips():
-    """Any chromosome is the code of what it decodes to; any number is coded to half a level."""
+    """Chromosomes are decoded and encoded exactly, and numbers are encoded to half a level."""
     algorithm = BinaryGA(8, jnp.zeros(6))
     rng = np.random.default_rng(3)
     chromosomes = jnp.asarray(rng.integers(0, 2, (8, 60)) > 0)
@@ -776,31 +773,31 @@ def test_the_best_of_a_generation_survives():
     assert len(np.unique(np.asarray(children), axis=0)) > 10
 
 
-def test_an_interrupted_search_still_answers(runs):
+def test_an_interrupted_search_still_gives_a_result(runs):
     def progress(what, fitness=None, share=None):
         if share and share > 0.3:
             raise KeyboardInterrupt
 
     result = identify(runs, progress=progress)
-    assert_right(result, PAPER)
+    assert_accurate(result, PAPER)
     assert any("interrupted" in message for message in result.messages)
 
 
-def test_progress_is_told(runs):
-    told = []
+def test_progress_is_reported(runs):
+    reports = []
     identify(
-        runs, progress=lambda what, fitness=None, share=None: told.append((what, fitness, share))
+        runs, progress=lambda what, fitness=None, share=None: reports.append((what, fitness, share))
     )
-    shares = [share for _, _, share in told if share is not None]
-    fitness = [f for _, f, share in told if share is not None]
+    shares = [share for _, _, share in reports if share is not None]
+    fitness = [f for _, f, share in reports if share is not None]
     assert shares == sorted(shares)
     assert 0 < shares[0] < shares[-1] <= 1
     assert fitness == sorted(fitness, reverse=True)
-    assert any("refining" in what for what, _, _ in told)
+    assert any("refining" in what for what, _, _ in reports)
 
 
-def test_a_search_looks_for_effects_where_they_would_show(runs):
-    """Far narrower than the table's ranges, and wide enough for what a bench of this size can hide."""
+def test_bounds_of_effects_are_scaled_to_the_recordings(runs):
+    """Within the ranges of the effects, and wide enough for what a motor of this size may have."""
     effects = [EFFECTS[n] for n in ("stribeck_friction", "constant_load", "resistance_heating")]
     bounds = effect_bounds(effects, runs)
     torque = PAPER.Kt * max(float(np.abs(r.current).max()) for r in runs)
@@ -812,8 +809,8 @@ def test_a_search_looks_for_effects_where_they_would_show(runs):
             assert given.lower <= low < high <= given.upper, (effect.name, field)
 
 
-def test_a_search_for_what_was_not_recorded_keeps_the_range_of_its_table(runs):
-    """Runs that a torque drives show no voltage."""
+def test_bounds_are_the_ranges_of_an_effect_if_its_quantity_was_not_recorded(runs):
+    """Runs that are driven by torque have no voltage."""
     driven = [
         Recording(r.name, r.time, None, None, r.speed, torque=PAPER.Kt * r.current) for r in runs
     ]
@@ -822,12 +819,12 @@ def test_a_search_for_what_was_not_recorded_keeps_the_range_of_its_table(runs):
     assert bounds["brush_voltage_drop.voltage_V"] == (given.lower, given.upper)
 
 
-# ----------------------------------------------------------- information of few moments
+# ----------------------------------------------------------- intervals
 
 
-def test_few_moments_that_decide_widen_the_interval():
-    """One parameter, seen in four stretches of one run only, in noise that is a constant of each."""
-    rng, covered, plain = np.random.default_rng(7), [], []
+def test_an_interval_is_wider_if_few_moments_determine_the_parameter():
+    """One parameter, which has an influence in four stretches of one run only, in noise that is constant in each."""
+    rng, covered, naive = np.random.default_rng(7), [], []
     blocks, samples = 20, 128
     for _ in range(400):
         jacobian = np.zeros((blocks, 2, samples, 1 + UNKNOWNS_PER_RUN))
@@ -842,12 +839,12 @@ def test_few_moments_that_decide_widen_the_interval():
         info = information(residuals, jacobian, run, np.ones(1, bool), 1)
         error, spread = abs(estimate), np.sqrt(info.covariance[0, 0])
         covered.append(error < info.interval_factor[0] * spread)
-        plain.append(error < 1.96 / np.sqrt((jacobian[..., 0] ** 2).sum()))
-    assert np.mean(plain) < 0.3 and np.mean(covered) > 0.85, (np.mean(plain), np.mean(covered))
+        naive.append(error < 1.96 / np.sqrt((jacobian[..., 0] ** 2).sum()))
+    assert np.mean(naive) < 0.3 and np.mean(covered) > 0.85, (np.mean(naive), np.mean(covered))
 
 
-def test_white_noise_leaves_intervals_as_they_are():
-    rng, reaches, inflations, covered = np.random.default_rng(8), [], [], []
+def test_white_noise_does_not_widen_intervals():
+    rng, factors, inflations, covered = np.random.default_rng(8), [], [], []
     for _ in range(300):
         jacobian = np.zeros((20, 2, 128, 2 + UNKNOWNS_PER_RUN))
         jacobian[..., :2] = rng.standard_normal((20, 2, 128, 2))
@@ -861,10 +858,10 @@ def test_white_noise_leaves_intervals_as_they_are():
             np.ones(2, bool),
             2,
         )
-        reaches.append(info.interval_factor)
+        factors.append(info.interval_factor)
         inflations.append(info.inflation)
         covered.append(np.abs(estimate) < info.interval_factor * np.sqrt(np.diag(info.covariance)))
-    assert np.mean(np.array(reaches) > 2) < 0.1
+    assert np.mean(np.array(factors) > 2) < 0.1
     assert 1.0 <= np.median(inflations) < 1.1
     assert 0.93 < np.mean(covered) < 0.98
 
@@ -873,26 +870,26 @@ def test_white_noise_leaves_intervals_as_they_are():
 
 
 @pytest.mark.parametrize(
-    ("memory", "samples"),
+    ("coefficient", "samples"),
     [(-0.5, 4000), (0.0, 4000), (0.5, 4000), (0.9, 20_000), (0.97, 20_000)],
 )
-def test_long_run_variance_of_an_autoregression(memory, samples):
+def test_long_run_variance_of_an_autoregression(coefficient, samples):
     """The sum of n terms of x_k = a x_(k-1) + e_k has variance n / (1 - a)^2."""
     rng, ratios = np.random.default_rng(4), []
     for _ in range(40):
-        terms = lfilter([1.0], [1.0, -memory], rng.standard_normal((samples + 500, 3)), axis=0)
+        terms = lfilter([1.0], [1.0, -coefficient], rng.standard_normal((samples + 500, 3)), axis=0)
         variance = np.diag(long_run_variance(terms[500:]))
-        ratios.append(variance * (1 - memory) ** 2 / samples)
+        ratios.append(variance * (1 - coefficient) ** 2 / samples)
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize("memory", [0.9, 0.97])
-def test_few_and_slow_terms_make_it_cautious(memory):
+@pytest.mark.parametrize("coefficient", [0.9, 0.97])
+def test_long_run_variance_of_few_slow_terms_is_cautious(coefficient):
     """A hundred correlation times or less: too large rather than too small, but not by much."""
     rng, ratios = np.random.default_rng(4), []
     for _ in range(40):
-        terms = lfilter([1.0], [1.0, -memory], rng.standard_normal((4500, 3)), axis=0)[500:]
-        ratios.append(np.diag(long_run_variance(terms)) * (1 - memory) ** 2 / 4000)
+        terms = lfilter([1.0], [1.0, -coefficient], rng.standard_normal((4500, 3)), axis=0)[500:]
+        ratios.append(np.diag(long_run_variance(terms)) * (1 - coefficient) ** 2 / 4000)
     assert 0.95 < np.mean(ratios) < 1.6
 
 
@@ -911,7 +908,7 @@ def test_long_run_covariance_between_terms():
 
 # ------------------------------------------------------------------------------ bad arguments
 
-BAD = {
+INVALID = {
     "no run": (lambda r: identify([]), "no recording"),
     "twice the same name": (lambda r: identify([r[0], r[0]]), "two runs have this name"),
     "in training and hold-out": (lambda r: identify(r, holdout=[r[0]]), "two runs"),
@@ -933,14 +930,14 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(("call", "says"), BAD.values(), ids=BAD.keys())
-def test_bad_arguments_are_refused(runs, call, says):
-    with pytest.raises(InputError, match=says):
+@pytest.mark.parametrize(("call", "expected"), INVALID.values(), ids=INVALID.keys())
+def test_bad_arguments_are_refused(runs, call, expected):
+    with pytest.raises(InputError, match=expected):
         call(runs)
 
 
 def behind_a_gear(gap: float, load: float, twist: float = 0.0) -> tuple[Problem, Unknowns]:
-    """The problem of a run of a motor behind a gear with play, and the true coordinates; not what is the run's own."""
+    """The problem of one run with gear backlash, and the true coordinates, with all unknowns of the run at zero."""
     gear = {"stiffness": 500.0, "damping": 0.1, "load_share": 0.4, "gap_rad": gap}
     driven = vb.prbs(np.random.default_rng(0), 1.0)
     motor = {name: getattr(PAPER, name) for name in PARAMETERS}
@@ -960,15 +957,15 @@ def behind_a_gear(gap: float, load: float, twist: float = 0.0) -> tuple[Problem,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gap", [0.05, 0.3])
-def test_what_belongs_to_a_run_is_never_fitted_for_the_worse(gap):
-    """Nobody knows the load of a run behind a gear with play, where straight lines lead anywhere."""
+def test_fitting_the_unknowns_of_a_run_never_increases_its_error(gap):
+    """With backlash and an unknown load, linear steps may lead anywhere."""
     with jax.enable_x64(True):
-        problem, begun = behind_a_gear(gap, load=0.1)
+        problem, start = behind_a_gear(gap, load=0.1)
         squares = [
             float(jnp.square(evaluation.residuals).sum())
             for evaluation in (
-                evaluate(problem, begun),
-                *(fit_run_unknowns(problem, begun, passes)[1] for passes in (1, 4)),
+                evaluate(problem, start),
+                *(fit_run_unknowns(problem, start, passes)[1] for passes in (1, 4)),
             )
         ]
     assert squares == sorted(squares, reverse=True)
@@ -976,43 +973,43 @@ def test_what_belongs_to_a_run_is_never_fitted_for_the_worse(gap):
 
 
 @pytest.mark.parametrize("twist", [-0.12, 0.05, 0.14])
-def test_a_run_may_begin_anywhere_in_the_play(twist):
+def test_a_run_may_begin_anywhere_in_the_backlash(twist):
     with jax.enable_x64(True):
-        problem, begun = behind_a_gear(gap=0.3, load=0.0, twist=twist)
-        truth = begun._replace(runs=begun.runs._replace(twist=jnp.array([twist])))
-        fitted, right = (
+        problem, start = behind_a_gear(gap=0.3, load=0.0, twist=twist)
+        truth = start._replace(runs=start.runs._replace(twist=jnp.array([twist])))
+        fitted, least = (
             float(jnp.square(evaluate(problem, own).residuals).sum())
-            for own in (fit_run_unknowns(problem, begun, 8)[0], truth)
+            for own in (fit_run_unknowns(problem, start, 8)[0], truth)
         )
-    assert fitted < 1.01 * right
+    assert fitted < 1.01 * least
 
 
-def test_populations_find_a_gear_where_a_slope_ends_elsewhere():
+def test_a_population_finds_backlash_that_a_gradient_misses():
     factors = {"gap_rad": 10.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2}
-    off = {"gap_rad": 0.3, "stiffness_Nm_rad": 0.2, "damping_Nms_rad": 3.0, "load_share": 1.5}
+    error = {"gap_rad": 0.3, "stiffness_Nm_rad": 0.2, "damping_Nms_rad": 3.0, "load_share": 1.5}
     with jax.enable_x64(True):
         problem, truth = behind_a_gear(gap=0.3, load=0.0)
-        names = [f"gear_backlash.{field}" for field in off]
+        names = [f"gear_backlash.{field}" for field in error]
         columns = jnp.array([problem.parameters.names.index(name) for name in names])
-        moved = truth.coordinates.at[columns].add(jnp.log(jnp.array([*off.values()])))
-        begun = Optimum(truth._replace(coordinates=moved), np.inf, (), False)
-        start = polish(problem, begun, steps=0)
-        sought = dict(zip(names, factors.values(), strict=True))
-        slope = polish(problem, begun)
-        found = polish(problem, best_nearby(problem, start, sought, seed=0))
+        moved = truth.coordinates.at[columns].add(jnp.log(jnp.array([*error.values()])))
+        poor = Optimum(truth._replace(coordinates=moved), np.inf, (), False)
+        start = polish(problem, poor, steps=0)
+        search_factors = dict(zip(names, factors.values(), strict=True))
+        by_gradient = polish(problem, poor)
+        found = polish(problem, best_nearby(problem, start, search_factors, seed=0))
         gap, *_, share = np.exp(np.asarray(found.coordinates - truth.coordinates)[columns])
-    assert found.fitness < 0.5 * slope.fitness
+    assert found.fitness < 0.5 * by_gradient.fitness
     assert gap == pytest.approx(1, abs=0.03)
     assert share == pytest.approx(1, abs=0.03)
 
 
-@pytest.mark.parametrize("turned_by", [0.0, 0.2, 0.45, -0.3])
-def test_a_hold_out_may_begin_at_any_angle(turned_by):
-    """By a share of the period of its cogging: a slope leads there from nearby alone."""
+@pytest.mark.parametrize("share_of_period", [0.0, 0.2, 0.45, -0.3])
+def test_a_hold_out_may_begin_at_any_angle(share_of_period):
+    """Given as a share of the period of its cogging: a gradient finds the angle only from nearby."""
     motor, periods = {name: getattr(PAPER, name) for name in PARAMETERS}, 7.0
     wave = {"amplitude_Nm": 0.03, "phase_rad": 0.0, "periods": periods}
     plant = Plant(**motor, cogging_Nm=wave["amplitude_Nm"], cogging_periods=periods)
-    driven, angle = vb.staircase(3.0), 2 * np.pi / periods * turned_by
+    driven, angle = vb.staircase(3.0), 2 * np.pi / periods * share_of_period
     runs = []
     for name, begins in (("first", 0.0), ("second", angle)):
         seen = simulate(plant, driven.time, driven.voltage, driven.load, angle=begins)
@@ -1023,11 +1020,11 @@ def test_a_hold_out_may_begin_at_any_angle(turned_by):
         truth = motor | {f"cogging_torque.{field}": x for field, x in wave.items()}
         named = zip(problem.parameters.names, problem.parameters.logarithmic, strict=True)
         coordinates = [np.log(truth[name]) if log else truth[name] for name, log in named]
-        begun = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 2))))
-        right = begun._replace(runs=begun.runs._replace(angle=jnp.array([0.0, angle])))
-        ended = fit_run_unknowns(problem, begun)[1]
+        start = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 2))))
+        exact = start._replace(runs=start.runs._replace(angle=jnp.array([0.0, angle])))
+        end = fit_run_unknowns(problem, start)[1]
         fitted, least = (
             float(jnp.square(evaluation.residuals).sum())
-            for evaluation in (ended, evaluate(problem, right))
+            for evaluation in (end, evaluate(problem, exact))
         )
     assert fitted < 1.01 * least

@@ -1,4 +1,4 @@
-"""Noise in the record of what drives a motor, taken out where the motor did not feel it, and only there."""
+"""Noise of a recorded voltage, removed where it did not act on the motor, and only there."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from scipy.signal import cont2discrete
 
 from benchmarks import virtual_bench as vb
+from experiments.bench import recording
 from pmdc_jax import identify
 from pmdc_jax.identify.corrections.input_noise import denoised
 from pmdc_jax.recording import Recording
 
 NOISE = 0.1  # V
-SIX = ("R", "L", "Kb", "Kt", "J", "f")
 
 
 def steps(samples: int = 2000) -> np.ndarray:
@@ -25,36 +25,36 @@ def wave(samples: int = 2000) -> np.ndarray:
     return 10.0 * np.sin(2 * np.pi * np.arange(samples) / 200)
 
 
-# of steps a quarter was left of the noise before `CONFIDENCE_HALF_WIDTH` was made smaller, for bends came out rounded
+# with a larger `CONFIDENCE_HALF_WIDTH` only a quarter of the noise remained on steps, but bends were rounded
 @pytest.mark.parametrize(
-    ("signal", "left"), [(steps(), 0.27), (wave(), 0.6)], ids=["steps", "sine"]
+    ("signal", "remaining"), [(steps(), 0.27), (wave(), 0.6)], ids=["steps", "sine"]
 )
-def test_noise_goes_and_steps_stay(signal, left):
+def test_denoising_removes_noise_and_keeps_steps(signal, remaining):
     seen = signal + NOISE * np.random.default_rng(3).standard_normal(len(signal))
     error = denoised(seen) - signal
-    assert np.std(error) < left * NOISE
+    assert np.std(error) < remaining * NOISE
     assert np.max(np.abs(error)) < 4.5 * NOISE  # nowhere near a step's height
 
 
 @given(st.lists(st.floats(-48, 48), min_size=1, max_size=12), st.integers(9, 60), st.integers(0, 8))
-def test_what_has_no_noise_stays_as_it_is(levels, hold, rest):
-    """A voltage of steps without noise, of any length, is not touched."""
-    signal = np.repeat(levels, hold)[rest:]
+def test_denoising_leaves_noise_free_steps_unchanged(levels, hold, cut):
+    """Steps of any height, and any number of samples."""
+    signal = np.repeat(levels, hold)[cut:]
     np.testing.assert_array_equal(denoised(signal), signal)
 
 
-def recorded(felt: float, unfelt: float) -> list[Recording]:
-    """Runs whose voltage has noise that the motor felt, and noise of the sensor alone, V."""
+def recorded(applied_noise: float, sensor_noise: float) -> list[Recording]:
+    """Runs with noise of the applied voltage and noise of the voltage sensor alone, V."""
     rng = np.random.default_rng(11)
     runs = {"prbs": vb.prbs(rng, 3.0), "loaded": vb.loaded(rng, 3.0), "stairs": vb.staircase(3.0)}
     found = []
     for name, excitation in runs.items():
-        driven = excitation._replace(voltage=excitation.voltage + felt * noise(rng, excitation))
+        driven = excitation._replace(
+            voltage=excitation.voltage + applied_noise * noise(rng, excitation)
+        )
         columns = vb.record(vb.paper_motor(), driven, rng, vb.Noise(0.1, 0.5))
-        seen = columns["voltage_V"] + unfelt * noise(rng, excitation)
-        names = ("time_s", "current_A", "speed_rad_s")
-        time, current, speed = (columns[n] for n in names)
-        found.append(Recording(name, time, seen, current, speed, load=columns["load_torque_Nm"]))
+        columns["voltage_V"] = columns["voltage_V"] + sensor_noise * noise(rng, excitation)
+        found.append(recording(name, columns))
     return found
 
 
@@ -63,23 +63,26 @@ def noise(rng, excitation) -> np.ndarray:
 
 
 def errors(found) -> np.ndarray:
-    """Of the six parameters, in standard errors."""
+    """Errors of the six parameters in standard errors."""
     truth = vb.paper_motor()
     return np.array(
-        [(found.parameters[n].value - getattr(truth, n)) / found.parameters[n].stderr for n in SIX]
+        [
+            (found.parameters[n].value - getattr(truth, n)) / found.parameters[n].stderr
+            for n in vb.SIX
+        ]
     )
 
 
-def test_noise_of_the_voltage_sensor_does_not_bend_the_parameters():
-    found = identify(recorded(felt=0.0, unfelt=0.3))
+def test_noise_of_the_voltage_sensor_does_not_bias_the_parameters():
+    found = identify(recorded(applied_noise=0.0, sensor_noise=0.3))
     assert [m.split(":")[0] for m in found.messages if "did not reach the motor" in m] == [
         *("prbs", "loaded", "stairs")
     ]
     assert np.max(np.abs(errors(found))) < 3.5
 
 
-def controlled(samples: int = 3000, step: float = 1e-3) -> Recording:
-    """A run whose voltage answers to the noise of the measured speed, exact from sample to sample."""
+def controlled_run(samples: int = 3000, step: float = 1e-3) -> Recording:
+    """A run of a PI loop, whose voltage reacts to the noise of the measured speed; exact from sample to sample."""
     m, rng = vb.paper_motor(), np.random.default_rng(12)
     A = np.array([[-m.R / m.L, -m.Kb / m.L], [m.Kt / m.J, -m.f / m.J]])
     B = np.array([[1 / m.L], [0.0]])
@@ -95,39 +98,42 @@ def controlled(samples: int = 3000, step: float = 1e-3) -> Recording:
     return Recording("controlled", step * np.arange(samples), *np.transpose(rows))
 
 
-def test_a_held_out_voltage_that_answers_to_a_noisy_speed_is_left_alone():
-    found = identify(recorded(felt=0.0, unfelt=0.0), [controlled()])
+def test_a_held_out_voltage_of_a_control_loop_is_not_denoised():
+    found = identify(recorded(applied_noise=0.0, sensor_noise=0.0), [controlled_run()])
     assert not [m for m in found.messages if "did not reach the motor" in m]
     assert found.fit["controlled"].current_rmse == pytest.approx(0.1, rel=0.05)
 
 
-def test_a_rough_voltage_that_the_motor_felt_is_left_alone():
-    found = identify(recorded(felt=0.3, unfelt=0.0))
+def test_noise_that_acted_on_the_motor_is_kept():
+    found = identify(recorded(applied_noise=0.3, sensor_noise=0.0))
     assert not [m for m in found.messages if "did not reach the motor" in m]
     assert np.max(np.abs(errors(found))) < 3.5
 
 
-def in_a_speed_loop() -> Recording:
-    """A motor held at one speed after another against loads that nobody measured, by a PI loop whose voltage answers
-    to the noise of the speed."""
-    motor, rng, dt, parts = vb.paper_motor(), np.random.default_rng(21), 1e-3, 20
+def run_in_a_speed_loop() -> Recording:
+    """A motor held at one speed after another against unmeasured loads by a PI loop, whose voltage reacts to the noise
+    of the measured speed."""
+    motor, rng, dt, substeps = vb.paper_motor(), np.random.default_rng(21), 1e-3, 20
     wanted = np.repeat(rng.uniform(-200.0, 200.0, 8), 750)
     load = np.repeat(rng.uniform(-0.2, 0.2, 16), 375)
-    current = speed = errors = 0.0
+    current = speed = integral = 0.0
     voltage, seen = np.empty(len(wanted)), np.empty((len(wanted), 2))
     for k in range(len(wanted)):
         seen[k] = current + 0.05 * rng.standard_normal(), speed + 0.3 * rng.standard_normal()
         error = wanted[k] - seen[k, 1]
-        voltage[k] = np.clip(0.2 * error + 1.5 * errors, -24.0, 24.0)
-        errors += error * dt * (abs(voltage[k]) < 24.0)
-        for _ in range(parts):
-            pushed = (voltage[k] - motor.R * current - motor.Kb * speed) / motor.L
-            turned = (motor.Kt * current - motor.f * speed - load[k]) / motor.J
-            current, speed = current + pushed * dt / parts, speed + turned * dt / parts
+        voltage[k] = np.clip(0.2 * error + 1.5 * integral, -24.0, 24.0)
+        integral += error * dt * (abs(voltage[k]) < 24.0)
+        for _ in range(substeps):
+            current_rate = (voltage[k] - motor.R * current - motor.Kb * speed) / motor.L
+            acceleration = (motor.Kt * current - motor.f * speed - load[k]) / motor.J
+            current, speed = (
+                current + current_rate * dt / substeps,
+                speed + acceleration * dt / substeps,
+            )
     return Recording("loop", dt * np.arange(len(wanted)), voltage, *seen.T)
 
 
 @pytest.mark.slow
-def test_an_unknown_load_does_not_pass_for_a_voltage_that_the_motor_did_not_feel():
-    found = identify([in_a_speed_loop()])
+def test_an_unknown_load_in_a_control_loop_is_not_taken_for_voltage_noise():
+    found = identify([run_in_a_speed_loop()])
     assert not [m for m in found.messages if "did not reach the motor" in m]

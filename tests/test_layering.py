@@ -1,4 +1,4 @@
-"""Imports run downwards only, as the folder listing suggests."""
+"""The layers of the package: modules import only from the layers below."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "pmdc_jax"
 
-# what a part may import at run time, beside what lies in itself; parts not named may import anything
-BELOW = {
+# the other parts that a part may import at run time; parts that are not listed may import anything
+ALLOWED_IMPORTS = {
     "errors": set(),
     "compilation_cache": set(),
     "files": {"errors"},
@@ -109,46 +109,51 @@ BELOW = {
         "wheelchair",
     },
 }
-# where results are computed, and what of it holds results alone; those of a tuning lie beside their computation
-COMPUTING = {"diagnose", "identify", "simulate"}
-RESULTS = {"diagnose/diagnosis.py", "diagnose/effect_relations.py", "identify/identification.py"}
+# the parts that compute results, and their modules that only define results; a tuning is defined where it is computed
+COMPUTING_PARTS = {"diagnose", "identify", "simulate"}
+RESULT_MODULES = {
+    "diagnose/diagnosis.py",
+    "diagnose/effect_relations.py",
+    "identify/identification.py",
+}
 
 
 def part_of(path: Path) -> str:
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
-def imported_parts(path: Path) -> set[str]:
-    """Parts of the package that a module imports when it runs, not for its annotations alone."""
+def run_time_nodes(path: Path) -> list[ast.AST]:
+    """The syntax tree of a module without imports that are for annotations alone, as a list of nodes."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             node.body = []
+    return list(ast.walk(tree))
+
+
+def imported_parts(path: Path) -> set[str]:
+    """Parts of the package that a module imports at run time."""
     depth = len(path.relative_to(PACKAGE).parts)
     parts = set()
-    for node in ast.walk(tree):
+    for node in run_time_nodes(path):
         if isinstance(node, ast.ImportFrom) and node.level == depth:
             names = [node.module] if node.module else [alias.name for alias in node.names]
             parts |= {name.split(".")[0] for name in names}
     return parts
 
 
-@pytest.mark.parametrize("part", BELOW)
-def test_imports_run_downwards(part):
+@pytest.mark.parametrize("part", ALLOWED_IMPORTS)
+def test_a_part_imports_only_parts_below_it(part):
     modules = [path for path in PACKAGE.rglob("*.py") if part_of(path) == part]
-    assert modules, f"{part} is gone: mend the table"
+    assert modules, f"{part} no longer exists: update the table"
     for module in modules:
-        assert imported_parts(module) <= BELOW[part] | {part}, module.name
+        assert imported_parts(module) <= ALLOWED_IMPORTS[part] | {part}, module.name
 
 
 def modules_imported(path: Path) -> set[Path]:
-    """Modules of the package that this one imports, at the top or inside a function."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            node.body = []
+    """Modules of the package that this one imports at run time, at the top or inside a function."""
     found = set()
-    for node in ast.walk(tree):
+    for node in run_time_nodes(path):
         assert not (isinstance(node, ast.Import) and "pmdc_jax" in ast.unparse(node)), path
         if isinstance(node, ast.ImportFrom) and node.level:
             base = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
@@ -157,10 +162,11 @@ def modules_imported(path: Path) -> set[Path]:
     return {file for file in files if file.exists()} - {path}
 
 
-def test_reports_read_results_and_compute_nothing():
+def test_reports_import_results_only():
     for module in (PACKAGE / "report").rglob("*.py"):
-        computing = {path for path in modules_imported(module) if part_of(path) in COMPUTING}
-        assert {path.relative_to(PACKAGE).as_posix() for path in computing} <= RESULTS, module.name
+        computing = {path for path in modules_imported(module) if part_of(path) in COMPUTING_PARTS}
+        names = {path.relative_to(PACKAGE).as_posix() for path in computing}
+        assert names <= RESULT_MODULES, module.name
         assert not re.search(
             r"^\s*(from|import) jax\b", module.read_text(encoding="utf-8"), re.MULTILINE
         )
@@ -169,7 +175,7 @@ def test_reports_read_results_and_compute_nothing():
 def test_there_are_no_import_cycles():
     """A package's own `__init__` counts as the parts it gathers, not as a part that they import."""
     graph = {path: modules_imported(path) for path in PACKAGE.rglob("*.py")}
-    assert sum(map(len, graph.values())) > 50, "the imports are no longer found"
+    assert sum(map(len, graph.values())) > 50, "imports are no longer recognised"
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
@@ -177,7 +183,7 @@ def test_there_are_no_import_cycles():
         pytest.fail("cycle: " + " < ".join(names))
 
 
-def test_there_is_no_drawer_for_odds_and_ends():
+def test_there_is_no_catch_all_module():
     names = {path.stem for path in PACKAGE.rglob("*.py")}
     assert not names & {"utils", "helpers", "manager", "common", "misc"}
 

@@ -7,24 +7,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from linear_motor import PAPER
 
-from benchmarks import virtual_bench as vb
 from pmdc_jax.motor import PARAMETERS, Drive, Motor
-
-PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 
 
 def motor(**changes) -> Motor:
     return Motor(**{n: np.asarray(x, float) for n, x in (PAPER | changes).items()})
 
 
-def drawn(count: int) -> list[dict[str, float]]:
+def random_motors(count: int) -> list[dict[str, float]]:
     """Motors over four decades about the paper's."""
     rng = np.random.default_rng(1)
     return [{n: x * 10 ** rng.uniform(-2, 2) for n, x in PAPER.items()} for _ in range(count)]
 
 
-MOTORS = {"paper": PAPER} | {f"drawn {k}": m for k, m in enumerate(drawn(5))}
+MOTORS = {"paper": PAPER} | {f"drawn {k}": m for k, m in enumerate(random_motors(5))}
 each_motor = pytest.mark.parametrize("m", MOTORS.values(), ids=MOTORS.keys())
 
 
@@ -53,7 +51,7 @@ OMEGA = np.logspace(-3, 6, 50)
 
 
 @each_motor
-def test_state_space_is_that_of_the_block_diagram(x64, m):
+def test_state_space_matches_the_block_diagram(x64, m):
     A, B = motor(**m).state_space()
     ours = control.ss(A, B, np.eye(2), np.zeros((2, 2)))
     ours, reference = (
@@ -64,7 +62,7 @@ def test_state_space_is_that_of_the_block_diagram(x64, m):
 
 
 @each_motor
-def test_transfer_functions_are_those_of_the_block_diagram(x64, m):
+def test_transfer_functions_match_the_block_diagram(x64, m):
     numerators, denominator = motor(**m).transfer_function()
     reference = plant(m).frequency_response(OMEGA)
     for name, numerator in numerators.items():
@@ -75,8 +73,8 @@ def test_transfer_functions_are_those_of_the_block_diagram(x64, m):
         np.testing.assert_allclose(ours(1j * OMEGA), expected, rtol=1e-9)
 
 
-def test_table_1_settles_at_480_radians_a_second(x64):
-    """24 V without load: w = Kt v / (R f + Kt Kb), which the paper's set point of 481 exceeds."""
+def test_the_motor_of_table_1_settles_at_480_rad_per_s(x64):
+    """At 24 V without load, w = Kt v / (R f + Kt Kb), less than the paper's set point of 481."""
     A, B = (np.asarray(x) for x in motor().state_space())
     current, speed = np.linalg.solve(A, -B @ [24.0, 0.0])
     assert speed == pytest.approx(480.0, abs=0.05)
@@ -90,7 +88,7 @@ def test_table_1_settles_at_480_radians_a_second(x64):
 
 
 @each_motor
-def test_eigenvalues_are_the_poles(x64, m):
+def test_eigenvalues_match_the_poles(x64, m):
     """Their sum and product by hand, and the roots of the denominator."""
     A, _ = motor(**m).state_space()
     poles = np.linalg.eigvals(A)
@@ -102,8 +100,8 @@ def test_eigenvalues_are_the_poles(x64, m):
     np.testing.assert_allclose(np.sort(np.roots(denominator)), np.sort(poles), rtol=1e-6)
 
 
-def test_equation_8_as_corrected(x64):
-    """The paper prints +R/L, with which the motor would run away, and load times voltage."""
+def test_state_space_matches_equation_8_with_its_signs_corrected(x64):
+    """The paper prints +R/L, with which the motor would be unstable, and the load multiplied by the voltage."""
     A, B = motor().state_space()
     m = PAPER
     expected = [[-m["R"] / m["L"], -m["Kb"] / m["L"]], [m["Kt"] / m["J"], -m["f"] / m["J"]]]
@@ -114,7 +112,7 @@ def test_equation_8_as_corrected(x64):
 
 
 @each_motor
-def test_the_derivative_is_the_state_space(x64, m):
+def test_the_derivative_matches_the_state_space(x64, m):
     rng = np.random.default_rng(2)
     A, B = (np.asarray(x) for x in motor(**m).state_space())
     for x, u in rng.standard_normal((5, 2, 2)):
@@ -128,8 +126,8 @@ DRIVES = {"current": Drive(0.0, 1.0, 0.0), "torque": Drive(0.0, 0.0, 1.0)}
 
 
 @pytest.mark.parametrize("kind", DRIVES)
-def test_the_mechanical_half_alone(x64, kind):
-    """Driven by current or torque, the electrical equation stands still, whatever R, L and Kb are."""
+def test_a_current_or_torque_drives_the_mechanical_half_alone(x64, kind):
+    """The electrical equation is switched off, whatever R, L and Kb are."""
     drive, gain = DRIVES[kind], {"current": PAPER["Kt"], "torque": 1.0}[kind]
     half = motor(R=7.0, L=3.0, Kb=11.0)
     A, B = half.state_space(drive)
@@ -142,9 +140,9 @@ def test_the_mechanical_half_alone(x64, kind):
     assert rate.speed == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_population_is_its_members(x64):
-    """Fields of one shape make matrices with that shape behind."""
-    members = drawn(7)
+def test_a_population_matches_its_members(x64):
+    """Fields of a common shape give matrices with that shape as their last axes."""
+    members = random_motors(7)
     together = Motor(**{n: np.array([m[n] for m in members]) for n in PARAMETERS})
     A, B = together.state_space()
     numerators, denominator = together.transfer_function()
@@ -158,7 +156,7 @@ def test_a_population_is_its_members(x64):
             np.testing.assert_array_equal(numerators[name][:, k], numerator)
 
 
-def test_plain_numbers_make_a_motor():
+def test_a_motor_may_have_plain_numbers():
     plain = Motor(**PAPER)
     np.testing.assert_allclose(plain.state_space()[0], motor().state_space()[0], rtol=1e-6)
     assert plain.states == ()
@@ -166,7 +164,7 @@ def test_plain_numbers_make_a_motor():
     assert float(numerators["voltage -> speed"][0]) == pytest.approx(PAPER["Kt"])
 
 
-def test_a_motor_is_a_pytree_of_its_six_constants():
+def test_a_motor_is_a_pytree_of_its_six_parameters():
     assert len(jax.tree.leaves(motor())) == 6
     doubled = jax.tree.map(lambda x: 2 * x, motor())
     assert float(doubled.J) == 2 * PAPER["J"]

@@ -1,4 +1,4 @@
-"""Motors as JSON: what is written is read again, and every bad file is refused in one message."""
+"""Motors as JSON files: they round-trip, and every invalid file is refused with one message."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ import json
 
 import numpy as np
 import pytest
+from linear_motor import PAPER
 
-from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, load_motor, save_motor
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.motor_file import load_uncertainty
 
-PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
-GOOD = {
+VALID = {
     "parameters": PAPER,
     "effects": [{"name": "coulomb_friction", "parameters": {"torque_Nm": 0.1}}],
 }
@@ -24,7 +23,7 @@ def fields(motor: Motor) -> dict[str, float]:
     return {name: float(getattr(motor, name)) for name in PARAMETERS}
 
 
-def test_a_motor_with_every_effect_round_trips_to_the_last_digit(tmp_path):
+def test_a_motor_with_every_effect_round_trips_exactly(tmp_path):
     rng = np.random.default_rng(1)
     effects = tuple(
         effect(
@@ -35,13 +34,13 @@ def test_a_motor_with_every_effect_round_trips_to_the_last_digit(tmp_path):
     constants = {name: np.asarray(x * rng.uniform(1, 2)) for name, x in PAPER.items()}
     motor, path = Motor(**constants, effects=effects), tmp_path / "motor.json"
     save_motor(path, motor)
-    again = load_motor(path)
-    assert fields(again) == fields(motor)
-    assert [type(e) for e in again.effects] == [type(e) for e in effects]
-    for before, after in zip(effects, again.effects, strict=True):
+    loaded = load_motor(path)
+    assert fields(loaded) == fields(motor)
+    assert [type(e) for e in loaded.effects] == [type(e) for e in effects]
+    for before, after in zip(effects, loaded.effects, strict=True):
         for field in before.ranges:
             assert float(getattr(after, field)) == float(getattr(before, field))
-    assert [p.name for p in tmp_path.iterdir()] == ["motor.json"], "no draft is left behind"
+    assert [p.name for p in tmp_path.iterdir()] == ["motor.json"], "a temporary file is left behind"
 
 
 def test_plain_numbers_can_be_saved(tmp_path):
@@ -49,7 +48,7 @@ def test_plain_numbers_can_be_saved(tmp_path):
     assert fields(load_motor(tmp_path / "motor.json")) == PAPER
 
 
-def test_a_file_by_hand_needs_the_six_numbers_only(tmp_path):
+def test_a_hand_written_file_needs_the_six_parameters_only(tmp_path):
     path = tmp_path / "motor.json"
     path.write_text(json.dumps({"parameters": PAPER | {"f": 0}}))
     motor = load_motor(path)
@@ -57,81 +56,86 @@ def test_a_file_by_hand_needs_the_six_numbers_only(tmp_path):
     assert motor.effects == ()
 
 
-def test_units_are_written_beside_the_values(tmp_path):
+def test_a_file_states_the_units_of_its_values(tmp_path):
     save_motor(tmp_path / "motor.json", Motor(**PAPER))
     content = json.loads((tmp_path / "motor.json").read_text())
     assert content["units"] == PARAMETERS
     assert content["parameters"] == PAPER
 
 
-def changed(*path, to):
-    """The good file with one thing in it replaced."""
-    content = json.loads(json.dumps(GOOD))
+def with_value(content: dict, *path, to) -> dict:
+    """A copy of the content of a JSON file with one value replaced."""
+    content = json.loads(json.dumps(content))
     inner = content
     for step in path[:-1]:
         inner = inner[step]
     inner[path[-1]] = to
-    return json.dumps(content)
+    return content
 
 
-def lacking(name: str) -> str:
+def file_with(*path, to) -> str:
+    """The valid file with one value replaced."""
+    return json.dumps(with_value(VALID, *path, to=to))
+
+
+def file_without(name: str) -> str:
     return json.dumps({"parameters": {n: x for n, x in PAPER.items() if n != name}})
 
 
-BAD = {
+INVALID = {
     "empty": ("", "JSON"),
     "not JSON": ("{'parameters': 1}", "JSON"),
-    "cut off": (json.dumps(GOOD)[:50], "JSON"),
+    "cut off": (json.dumps(VALID)[:50], "JSON"),
     "not text": (b"\xff\xfe\x00\x80", "JSON"),
     "a list": ("[1, 2]", "object"),
     "a number": ("3", "object"),
     "null": ("null", "object"),
     "no parameters": ("{}", "parameters"),
-    "parameters in a list": (changed("parameters", to=[1, 2, 3]), "parameters"),
-    **{f"lacks {name}": (lacking(name), name) for name in PARAMETERS},
-    "a text": (changed("parameters", "R", to="0.1"), "R"),
-    "true": (changed("parameters", "R", to=True), "R"),
-    "null value": (changed("parameters", "L", to=None), "L"),
-    "a list for a number": (changed("parameters", "L", to=[1.0]), "L"),
-    "zero": (changed("parameters", "J", to=0.0), "J"),
-    "negative": (changed("parameters", "Kt", to=-0.05), "Kt"),
-    "negative friction": (changed("parameters", "f", to=-1e-9), "f"),
-    "not a number": (changed("parameters", "R", to=float("nan")), "R"),
-    "infinite": (changed("parameters", "R", to=float("inf")), "R"),
-    "infinite by digits": (changed("parameters", "R", to=7).replace("7", "1e999", 1), "R"),
-    "three hundred digits": (changed("parameters", "R", to=10**400), "R"),
-    "unknown effect": (changed("effects", 0, "name", to="magic"), "magic"),
-    "effect without a name": (changed("effects", 0, to={"parameters": {}}), "effect"),
-    "effect named by a list": (changed("effects", 0, "name", to=["coulomb_friction"]), "effect"),
-    "effect as a text": (changed("effects", 0, to="coulomb_friction"), "coulomb_friction"),
-    "effect as a number": (changed("effects", 0, to=3), "effect"),
+    "parameters in a list": (file_with("parameters", to=[1, 2, 3]), "parameters"),
+    **{f"lacks {name}": (file_without(name), name) for name in PARAMETERS},
+    "a text": (file_with("parameters", "R", to="0.1"), "R"),
+    "true": (file_with("parameters", "R", to=True), "R"),
+    "null value": (file_with("parameters", "L", to=None), "L"),
+    "a list for a number": (file_with("parameters", "L", to=[1.0]), "L"),
+    "zero": (file_with("parameters", "J", to=0.0), "J"),
+    "negative": (file_with("parameters", "Kt", to=-0.05), "Kt"),
+    "negative friction": (file_with("parameters", "f", to=-1e-9), "f"),
+    "not a number": (file_with("parameters", "R", to=float("nan")), "R"),
+    "infinite": (file_with("parameters", "R", to=float("inf")), "R"),
+    "infinite by digits": (file_with("parameters", "R", to=7).replace("7", "1e999", 1), "R"),
+    "three hundred digits": (file_with("parameters", "R", to=10**400), "R"),
+    "unknown effect": (file_with("effects", 0, "name", to="magic"), "magic"),
+    "effect without a name": (file_with("effects", 0, to={"parameters": {}}), "effect"),
+    "effect named by a list": (file_with("effects", 0, "name", to=["coulomb_friction"]), "effect"),
+    "effect as a text": (file_with("effects", 0, to="coulomb_friction"), "coulomb_friction"),
+    "effect as a number": (file_with("effects", 0, to=3), "effect"),
     "effect without parameters": (
-        changed("effects", 0, to={"name": "coulomb_friction"}),
+        file_with("effects", 0, to={"name": "coulomb_friction"}),
         "torque_Nm",
     ),
-    "effect's parameters in a list": (changed("effects", 0, "parameters", to=[0.1]), "coulomb"),
+    "effect's parameters in a list": (file_with("effects", 0, "parameters", to=[0.1]), "coulomb"),
     "effect's parameter a text": (
-        changed("effects", 0, "parameters", "torque_Nm", to="x"),
+        file_with("effects", 0, "parameters", "torque_Nm", to="x"),
         "torque_Nm",
     ),
     "effect of negative size": (
-        changed("effects", 0, "parameters", "torque_Nm", to=-1.0),
+        file_with("effects", 0, "parameters", "torque_Nm", to=-1.0),
         "torque_Nm",
     ),
-    "twice the same effect": (changed("effects", to=2 * GOOD["effects"]), "coulomb_friction"),
-    "effects not in a list": (changed("effects", to={"coulomb_friction": 0.1}), "effect"),
-    "effects null": (changed("effects", to=None), "effects"),
-    "effects a number": (changed("effects", to=5), "effects"),
-    "of a later version": (json.dumps(GOOD | {"format": "pmdc motor 2"}), "format"),
-    "status a text": (json.dumps(GOOD | {"status": "identified"}), "status"),
+    "twice the same effect": (file_with("effects", to=2 * VALID["effects"]), "coulomb_friction"),
+    "effects not in a list": (file_with("effects", to={"coulomb_friction": 0.1}), "effect"),
+    "effects null": (file_with("effects", to=None), "effects"),
+    "effects a number": (file_with("effects", to=5), "effects"),
+    "of a later version": (json.dumps(VALID | {"format": "pmdc motor 2"}), "format"),
+    "status a text": (json.dumps(VALID | {"status": "identified"}), "status"),
 }
 
 
-@pytest.mark.parametrize(("content", "says"), BAD.values(), ids=BAD.keys())
-def test_a_bad_file_is_refused(tmp_path, content, says):
+@pytest.mark.parametrize(("content", "expected"), INVALID.values(), ids=INVALID.keys())
+def test_an_invalid_file_is_refused(tmp_path, content, expected):
     path = tmp_path / "bad.json"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(InputError, match=says) as refusal:
+    with pytest.raises(InputError, match=expected) as refusal:
         load_motor(path)
     assert str(path) in str(refusal.value)
     assert refusal.value.mend
@@ -143,34 +147,36 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
             load_motor(path)
 
 
-ONE = {"names": ["R", "Kb"], "matrix": [[1e-4, 0.0], [0.0, 1e-4]]}
-NO_COVARIANCE = {
+COVARIANCE = {"names": ["R", "Kb"], "matrix": [[1e-4, 0.0], [0.0, 1e-4]]}
+INVALID_COVARIANCES = {
     "a text": "small",
-    "no names": {"matrix": ONE["matrix"]},
-    "names of lists": ONE | {"names": [["R"], ["Kb"]]},
-    "twice the same name": ONE | {"names": ["R", "R"]},
-    "unknown name": ONE | {"names": ["R", "magic"]},
-    "another size": ONE | {"matrix": [[1e-4]]},
-    "a text within": ONE | {"matrix": [[1e-4, 0.0], [0.0, "x"]]},
-    "not a number": ONE | {"matrix": [[1e-4, 0.0], [0.0, float("nan")]]},
-    "beyond a double": ONE | {"matrix": [[1e-4, 0.0], [0.0, 10**400]]},
-    "negative variance": ONE | {"matrix": [[1e-4, 0.0], [0.0, -1e-4]]},
-    "not symmetric": ONE | {"matrix": [[1e-4, 1e-5], [0.0, 1e-4]]},
+    "no names": {"matrix": COVARIANCE["matrix"]},
+    "names of lists": COVARIANCE | {"names": [["R"], ["Kb"]]},
+    "twice the same name": COVARIANCE | {"names": ["R", "R"]},
+    "unknown name": COVARIANCE | {"names": ["R", "magic"]},
+    "another size": COVARIANCE | {"matrix": [[1e-4]]},
+    "a text within": COVARIANCE | {"matrix": [[1e-4, 0.0], [0.0, "x"]]},
+    "not a number": COVARIANCE | {"matrix": [[1e-4, 0.0], [0.0, float("nan")]]},
+    "beyond a double": COVARIANCE | {"matrix": [[1e-4, 0.0], [0.0, 10**400]]},
+    "negative variance": COVARIANCE | {"matrix": [[1e-4, 0.0], [0.0, -1e-4]]},
+    "not symmetric": COVARIANCE | {"matrix": [[1e-4, 1e-5], [0.0, 1e-4]]},
 }
 
 
 def test_a_covariance_is_read(tmp_path):
     path = tmp_path / "motor.json"
-    path.write_text(json.dumps(GOOD | {"covariance": ONE, "status": {"L": "not_identifiable"}}))
+    path.write_text(
+        json.dumps(VALID | {"covariance": COVARIANCE, "status": {"L": "not_identifiable"}})
+    )
     found = load_uncertainty(path)
     assert (found.names, found.undetermined) == (("R", "Kb"), ("L",))
-    assert found.covariance.tolist() == ONE["matrix"]
+    assert found.covariance.tolist() == COVARIANCE["matrix"]
 
 
-@pytest.mark.parametrize("given", NO_COVARIANCE.values(), ids=NO_COVARIANCE.keys())
-def test_a_bad_covariance_is_refused(tmp_path, given):
+@pytest.mark.parametrize("covariance", INVALID_COVARIANCES.values(), ids=INVALID_COVARIANCES.keys())
+def test_an_invalid_covariance_is_refused(tmp_path, covariance):
     path = tmp_path / "motor.json"
-    path.write_text(json.dumps(GOOD | {"covariance": given}))
+    path.write_text(json.dumps(VALID | {"covariance": covariance}))
     with pytest.raises(InputError, match="covariance") as refusal:
         load_uncertainty(path)
     assert str(path) in str(refusal.value)

@@ -1,4 +1,4 @@
-"""The naming benchmark: its motors against an adaptive solver and closed forms, seeds, scores."""
+"""The naming benchmark: its motors against an adaptive solver and closed forms; seeds; scores; baselines."""
 
 import json
 
@@ -23,7 +23,7 @@ HIDDEN = {**LIBRARY, **FORMULAS, **STRANGERS}
 
 
 def reference_slope(t, x, v, load, p):
-    """Everything at once, written down once more; dry elements only slip."""
+    """The equations with all effects, written independently; dry elements always slip."""
     i, w, angle, w_load, twist, heat, slow, bristle, _, sag = x
     saturation = {
         0.0: lambda c: 1 / (1 + c * i**2),
@@ -49,13 +49,13 @@ def reference_slope(t, x, v, load, p):
         dry = stiffness * bristle + p.bristle_damping * bristle_rate
     bump = p.bump_Nm * np.exp(-(((abs(w) - p.bump_speed_rad_s) / p.bump_width_rad_s) ** 2))
     drag = p.drag * abs(w) ** p.drag_exponent
-    teeth = np.sin(p.cogging_periods * angle + p.cogging_phase)
-    teeth += p.cogging_second * np.sin(2 * p.cogging_periods * angle + p.cogging_second_phase)
-    opposing = p.f * w + dry + np.sign(w) * (bump + drag) + p.cogging_Nm * teeth
+    cogging = np.sin(p.cogging_periods * angle + p.cogging_phase)
+    cogging += p.cogging_second * np.sin(2 * p.cogging_periods * angle + p.cogging_second_phase)
+    opposing = p.f * w + dry + np.sign(w) * (bump + drag) + p.cogging_Nm * cogging
 
-    outside = load + p.load_Nm
-    outside += p.shake_Nm * np.sin(2 * np.pi * p.shake_Hz * t + p.shake_phase)
-    outside += p.eccentric_Nm * np.sin(angle / p.eccentric_gear + p.eccentric_phase)
+    load_torque = load + p.load_Nm
+    load_torque += p.shake_Nm * np.sin(2 * np.pi * p.shake_Hz * t + p.shake_phase)
+    load_torque += p.eccentric_Nm * np.sin(angle / p.eccentric_gear + p.eccentric_phase)
     shaft = p.stiffness * twist + p.damping * (w - w_load)
     if p.gap_rad:
         over = twist - np.clip(twist, -p.gap_rad / 2, p.gap_rad / 2)
@@ -63,13 +63,13 @@ def reference_slope(t, x, v, load, p):
             0, np.sign(over) * (p.stiffness * over + p.damping * (w - w_load))
         )
     if p.stiffness:
-        rotor, accelerated = p.J * (1 - p.load_share), (shaft - outside) / (p.J * p.load_share)
-        taken, slip = shaft, w - w_load
+        rotor, accelerated = p.J * (1 - p.load_share), (shaft - load_torque) / (p.J * p.load_share)
+        coupling_torque, slip = shaft, w - w_load
     else:
-        rotor, accelerated, taken, slip = p.J, 0.0, outside, 0.0
+        rotor, accelerated, coupling_torque, slip = p.J, 0.0, load_torque, 0.0
     return [
         (u - R * i - Kb * w - brush) / L,
-        (Kt * ripple * i - opposing - taken) / rotor,
+        (Kt * ripple * i - opposing - coupling_torque) / rotor,
         w,
         accelerated,
         slip,
@@ -97,7 +97,7 @@ def reference(p, excitation, start, max_step=np.inf):
 
 @pytest.mark.parametrize("name", HIDDEN)
 def test_every_effect_agrees_with_the_adaptive_reference(name):
-    """Forty samples forward with positive current: dry elements slip, all else is at work."""
+    """Over forty samples of forward motion with positive current: dry elements slip, all others act."""
     rng = np.random.default_rng(3)
     hidden = HIDDEN[name]
     p = hidden.put_into(PAPER, hidden.draw(rng, PAPER))._replace(delay_s=0.0)
@@ -106,19 +106,19 @@ def test_every_effect_agrees_with_the_adaptive_reference(name):
     voltage = np.repeat([9.0, 14.0, 10.0, 16.0], 10)
     excitation = vb.Excitation(time, voltage, np.full(40, 0.3))
     start = [60.0, 50.0, 0.4, 50.0, 0.4 * p.gap_rad, 0.0, 0.0, 0.0, 50.0, 0.0]
-    sharp = 1e-5 if p.gap_rad or p.seizing_Nm else np.inf  # corners the step control may step over
-    expected, speed = reference(p, excitation, start, sharp)
+    max_step = 1e-5 if p.gap_rad or p.seizing_Nm else np.inf  # the step control might miss corners
+    expected, speed = reference(p, excitation, start, max_step)
     assert expected[:, 0].min() > 0 and speed.min() > 0
-    begin = {"current": 60.0, "speed": 50.0, "angle": 0.4, "twist": 0.4 * p.gap_rad}
-    found = simulate(p, *excitation, **begin, least=100 if p.gap_rad else 20)
+    initial = {"current": 60.0, "speed": 50.0, "angle": 0.4, "twist": 0.4 * p.gap_rad}
+    found = simulate(p, *excitation, **initial, least=100 if p.gap_rad else 20)
     error = np.abs(found - expected).max(0)
     assert np.all(error < (1e-4 if p.gap_rad else 1e-6) * np.abs(expected).max(0))
     if name not in ("speed_sensor_delay",):
-        bare = simulate(PAPER, *excitation, **begin)
-        assert np.abs(found - bare)[:, :2].max() > 1e-3  # it does something
+        bare = simulate(PAPER, *excitation, **initial)
+        assert np.abs(found - bare)[:, :2].max() > 1e-3  # the effect is significant
 
 
-def test_the_delay_is_a_shift():
+def test_a_sensor_delay_shifts_the_speed():
     excitation = vb.staircase(duration=0.5)
     now = simulate(PAPER, *excitation)
     for whole in (1, 4):
@@ -131,12 +131,12 @@ def test_the_delay_is_a_shift():
     np.testing.assert_allclose(half, simulate(PAPER, *finer)[1:-1:2, 1], atol=1e-6)
 
 
-# ----------------------------------------------------------------------------- events
+# ----------------------------------------------------------------------------- closed forms and switching
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_coasts_as_the_closed_form_says_and_sticks(side):
-    """Brushes that never conduct open the circuit: only friction acts, each way with its level."""
+def test_coasting_matches_the_closed_form_and_ends_in_standstill(side):
+    """Brushes that never conduct open the circuit, so only friction acts, with its level for each direction."""
     p = PAPER._replace(brush_V=6.0, friction_forward_Nm=0.05, friction_backward_Nm=0.08)
     time = np.arange(800) * 1e-3
     current, speed, _ = simulate(p, time, 0 * time, 0 * time, speed=50.0 * side).T
@@ -150,17 +150,17 @@ def test_coasts_as_the_closed_form_says_and_sticks(side):
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_breaks_away_at_the_static_torque_and_not_before(side):
+def test_breaks_away_exactly_at_the_static_torque(side):
     p = PAPER._replace(friction_forward_Nm=0.05, friction_backward_Nm=0.05, friction_excess_Nm=0.1)
     time = np.arange(1000) * 1e-3
     current, speed, _ = side * simulate(p, time, side * 0.7 * time, 0 * time).T
     first = np.flatnonzero(speed)[0]
     assert p.Kt * current[first - 1] <= 0.15 < p.Kt * current[first]
-    # once it slips, friction falls: it jumps instead of creeping
+    # friction falls when slip begins, so the rotor accelerates at once
     assert speed[first + 20] > 10 * p.Kt * 1e-3
 
 
-def test_brushes_hold_the_current_until_the_voltage_overcomes_them():
+def test_brushes_block_the_current_below_their_voltage_drop():
     p = PAPER._replace(brush_V=0.7)
     time = np.arange(1000) * 1e-3
     current = simulate(p, time, time, 0 * time)[:, 0]
@@ -168,8 +168,8 @@ def test_brushes_hold_the_current_until_the_voltage_overcomes_them():
     assert np.all(current[time > 0.7005] > 0)
 
 
-def test_play_lets_the_load_stand_until_it_is_taken_up():
-    """In the gap the rotor is alone: the bare motor with the rotor's inertia."""
+def test_backlash_decouples_the_load_until_the_teeth_touch():
+    """Within the gap the motor has the inertia of the rotor alone."""
     p = LIBRARY["gear_backlash"]
     drawn = p.draw(np.random.default_rng(0), PAPER) | {"gap_rad": 0.1}
     loose = p.put_into(PAPER, drawn)
@@ -184,7 +184,7 @@ def test_play_lets_the_load_stand_until_it_is_taken_up():
     assert found[-1, 1] < free[-1, 1] - 0.1
 
 
-def test_a_dead_zone_takes_its_width_from_either_sign():
+def test_a_dead_zone_reduces_voltages_of_either_sign_by_its_width():
     p, time = PAPER._replace(dead_zone_V=0.4), np.arange(200) * 1e-3
     for v in (0.39, 5.0, -5.0):
         expected = np.sign(v) * max(0.0, abs(v) - 0.4)
@@ -194,7 +194,7 @@ def test_a_dead_zone_takes_its_width_from_either_sign():
         )
 
 
-def test_pulses_have_the_mean_of_the_command_and_ripple_between():
+def test_pulses_have_the_mean_of_the_command_and_cause_ripple():
     p, excitation = PAPER._replace(pwm_Hz=4000.0), vb.staircase(duration=0.5, amplitude=18.0)
     assert substeps(p, 1e-3) % 4 == 0
     difference = np.abs(simulate(p, *excitation) - simulate(PAPER, *excitation)).max(0)
@@ -209,7 +209,7 @@ def gauge_of(excitations, noise=(0.1, 0.5)):
     return Gauge(PAPER, excitations, noise)
 
 
-def test_the_strength_ignores_what_a_refit_absorbs():
+def test_the_strength_excludes_what_a_refit_absorbs():
     runs = {"a": vb.staircase(duration=2.0), "b": vb.loaded(np.random.default_rng(0), 2.0)}
     gauge = gauge_of(runs)
     before = [linear(PAPER, e) for e in runs.values()]
@@ -226,20 +226,20 @@ def test_the_strength_ignores_what_a_refit_absorbs():
 
 
 @pytest.mark.parametrize("power", [0.7, 1.0, 2.0])
-def test_the_wanted_amplitude_is_found(power):
+def test_the_amplitude_of_a_given_strength_is_found(power):
     for wanted in (0.01, 1.0, 50.0):
         factor = amplitude_for(wanted, lambda a: 3.0 * a**power, (1e-6, 1e6), tries=30)
         assert 3.0 * factor**power == pytest.approx(wanted, rel=0.25)
     assert amplitude_for(1e9, lambda a: a, (0.1, 10.0)) == pytest.approx(10.0, rel=0.5)
 
 
-def test_the_linear_motor_is_the_plant_without_effects():
+def test_the_linear_motor_matches_the_plant_without_effects():
     excitation = vb.loaded(np.random.default_rng(1), duration=1.0)
     expected = simulate(PAPER, *excitation)[:, :2]
     np.testing.assert_allclose(linear(PAPER, excitation), expected, atol=1e-5)
 
 
-def test_a_case_is_its_seed():
+def test_a_case_is_reproducible_from_its_seed():
     first, again = case("outside", 0), case("outside", 0)
     other, report = case("outside", 5), case("outside", 0, "report")
     assert first.stranger == again.stranger and first.motor == again.motor
@@ -252,7 +252,7 @@ def test_a_case_is_its_seed():
     assert first.response is not None and first.response.residual > 1.3
 
 
-def test_every_suite_plans_what_it_promises():
+def test_suites_cover_their_effects_and_noises():
     plans = {
         s: [plan(k, np.random.default_rng(k)) for k in range(60)] for s, plan in SUITES.items()
     }
@@ -267,8 +267,8 @@ def test_every_suite_plans_what_it_promises():
     assert all(p.rough for p in plans["rough"])
 
 
-def test_foreign_sensors_do_what_they_say():
-    """Of the first motors one has each kind of sensors."""
+def test_foreign_sensors_quantise_or_add_noise_as_specified():
+    """Each of the first five motors has another kind of sensors."""
     made = {c.noise: c for c in (case("foreign", k) for k in range(5))}
     assert list(made) == list(foreign.SENSORS)
     runs = {kind: next(iter(c.runs.values())) for kind, c in made.items()}
@@ -281,12 +281,12 @@ def test_foreign_sensors_do_what_they_say():
     np.testing.assert_allclose(steps / line, np.round(steps / line), atol=1e-6)
     lines = np.pi / line / runs["encoder"]["time_s"][1]
     assert lines == pytest.approx(round(lines), abs=1e-6)
-    # noise sits on every sample of the voltage, a converter leaves few values
+    # the voltage has noise in every sample, and a converter has few levels
     assert len(np.unique(runs["noisy_voltage"]["voltage_V"])) > 1000
     assert len(np.unique(runs["converter"]["current_A"])) < 513
 
 
-def test_an_uneven_clock_still_runs_forward():
+def test_jittered_time_stamps_still_increase():
     even = vb.staircase()
     uneven = jittered(even, np.random.default_rng(0), 0.2)
     assert np.all(np.diff(uneven.time) > 0)
@@ -294,7 +294,7 @@ def test_an_uneven_clock_still_runs_forward():
     assert jittered(even, np.random.default_rng(0), 0.0) is even
 
 
-def test_quantised_speed_and_files(tmp_path):
+def test_speeds_are_quantised_and_cases_are_written_as_files(tmp_path):
     made = case("nulls", 3)
     assert made.noise == "quantised"
     speed = made.runs["triangle"]["speed_rad_s"]
@@ -307,12 +307,12 @@ def test_quantised_speed_and_files(tmp_path):
 # ----------------------------------------------------------------------------- scores
 
 
-def said(verdict, *names, also=()):
+def answer_of(verdict, *names, also=()):
     effects = [{"name": n, "parameters": {}, "also_possible": list(also)} for n in names]
     return {"verdict": verdict, "effects": effects}
 
 
-def test_sets_that_are_one():
+def test_equivalent_sets_of_effects_have_one_canonical_form():
     both = {"coulomb_friction", "constant_load"}
     assert canonical({"asymmetric_friction"}) == canonical(both) == both
     assert canonical({"stribeck_friction", "coulomb_friction"}) == {"stribeck_friction"}
@@ -323,32 +323,32 @@ def test_sets_that_are_one():
 @pytest.mark.parametrize(
     ("expected", "truth", "answer", "result", "is_right"),
     [
-        ("named", ["a"], said("named", "a"), "exact", True),
-        ("named", ["a"], said("named", "b"), "wrong", False),
-        ("named", ["a"], said("named", "a", "b"), "wrong", False),
-        ("named", ["a", "b"], said("named", "a"), "incomplete", False),
-        ("named", ["a"], said("ambiguous", "b", also=["a"]), "rivals", False),
-        ("named", ["a", "b"], said("ambiguous", "c", also=["a + b"]), "rivals", False),
-        ("named", ["a"], said("ambiguous", "b", also=["c"]), "elsewhere", False),
-        ("named", ["a"], said("none_detected"), "missed", False),
+        ("named", ["a"], answer_of("named", "a"), "exact", True),
+        ("named", ["a"], answer_of("named", "b"), "wrong", False),
+        ("named", ["a"], answer_of("named", "a", "b"), "wrong", False),
+        ("named", ["a", "b"], answer_of("named", "a"), "incomplete", False),
+        ("named", ["a"], answer_of("ambiguous", "b", also=["a"]), "rivals", False),
+        ("named", ["a", "b"], answer_of("ambiguous", "c", also=["a + b"]), "rivals", False),
+        ("named", ["a"], answer_of("ambiguous", "b", also=["c"]), "elsewhere", False),
+        ("named", ["a"], answer_of("none_detected"), "missed", False),
         ("named", ["a"], {"verdict": "error"}, "error", False),
-        ("none_detected", [], said("none_detected"), "exact", True),
-        ("none_detected", [], said("not_in_library"), "wrong", False),
-        ("outside", [], said("named", "a"), "wrong", False),
-        ("outside", [], said("not_in_library"), "unlisted", True),
-        ("outside", [], said("ambiguous", "a"), "elsewhere", True),
-        ("outside", [], said("none_detected"), "missed", False),
-        ("blind", ["a", "b"], said("named", "a"), "wrong", False),
-        ("blind", ["a"], said("none_detected"), "missed", True),
+        ("none_detected", [], answer_of("none_detected"), "exact", True),
+        ("none_detected", [], answer_of("not_in_library"), "wrong", False),
+        ("outside", [], answer_of("named", "a"), "wrong", False),
+        ("outside", [], answer_of("not_in_library"), "unlisted", True),
+        ("outside", [], answer_of("ambiguous", "a"), "elsewhere", True),
+        ("outside", [], answer_of("none_detected"), "missed", False),
+        ("blind", ["a", "b"], answer_of("named", "a"), "wrong", False),
+        ("blind", ["a"], answer_of("none_detected"), "missed", True),
     ],
 )
-def test_outcomes(expected, truth, answer, result, is_right):
+def test_the_outcome_of_each_kind_of_answer(expected, truth, answer, result, is_right):
     assert outcome(expected, truth, answer) == result
     assert right(expected, result) == is_right
 
 
-def test_intervals_and_gap():
-    answer = said("named", "a")
+def test_coverage_of_intervals_and_closed_gap():
+    answer = answer_of("named", "a")
     answer["effects"][0]["parameters"] = {
         "torque_Nm": {"value": 1.0, "ci95": [0.9, 1.1]},
         "width_V": {"value": 1.0, "ci95": [None, 1.1]},
@@ -358,7 +358,7 @@ def test_intervals_and_gap():
     assert [(i.parameter, i.covers) for i in found] == [("torque_Nm", False), ("width_V", True)]
     answer["gap"] = {"holdout": {"before": 3.0, "after": 1.0, "floor": 1.0}}
     assert gap_closed(json.loads(json.dumps(answer))) == 1.0
-    assert gap_closed(said("named", "a")) is None
+    assert gap_closed(answer_of("named", "a")) is None
 
 
 # ----------------------------------------------------------------------------- baselines
@@ -398,7 +398,7 @@ def test_stepwise_refits_motor_and_effect_in_simulation():
     assert np.mean(found.residual**2) < 1.3
 
 
-def test_the_integrated_equations_hold():
+def test_the_terms_of_the_weak_form_satisfy_the_equations():
     """Weak-form terms of the true equations explain the change of current and speed."""
     excitation = vb.loaded(np.random.default_rng(0), duration=1.0, dt=1e-4)
     p = PAPER._replace(friction_forward_Nm=0.1, friction_backward_Nm=0.1, brush_V=0.5)
@@ -410,14 +410,14 @@ def test_the_integrated_equations_hold():
     )
     e, m = sparse.terms(columns)
 
-    def left(difference, signal):
-        """The largest error where the element never sticks within the window."""
+    def largest_misfit(difference, signal):
+        """The largest misfit of the windows in which the dry element never sticks."""
         held = np.convolve(signal == 0, np.ones(sparse.WINDOW + 1), "valid") > 0
         assert held.sum() < 200
         return np.abs(difference[~held]).max()
 
     volts = e["v"] - p.R * e["i"] - p.Kb * e["w"] - 0.5 * e["brush_voltage_drop"]
-    assert left(p.L * e["change"] - volts, read[:, 0]) < 3e-3 * np.abs(e["v"]).max()
+    assert largest_misfit(p.L * e["change"] - volts, read[:, 0]) < 3e-3 * np.abs(e["v"]).max()
     torque = p.Kt * m["i"] - p.f * m["w"] - m["load"] - 0.1 * m["coulomb_friction"]
     change = p.J * m["change"]
-    assert left(change - torque, read[:, 1]) < 3e-3 * np.abs(change).max()
+    assert largest_misfit(change - torque, read[:, 1]) < 3e-3 * np.abs(change).max()

@@ -1,4 +1,4 @@
-"""The wheelchair paper done again: what the printed gains give, and what is written."""
+"""The reproduction of the wheelchair paper: the response with the printed gains, and the written report."""
 
 import json
 
@@ -11,7 +11,7 @@ from pmdc_jax.wheelchair import FILTER_RATIO, SETPOINT, TABLE_1, TABLE_2, simula
 
 
 @pytest.mark.parametrize("kind", ["pi", "pid"])
-def test_printed_gains_do_what_python_control_says(kind):
+def test_response_with_printed_gains_matches_python_control(kind):
     R, L, Kb, Kt, J, f = TABLE_1.values()
     proportional, integral, derivative = TABLE_2[kind].gains
     s, lag = control.tf("s"), FILTER_RATIO * derivative / proportional
@@ -27,7 +27,7 @@ def test_printed_gains_do_what_python_control_says(kind):
 
 
 @pytest.mark.slow
-def test_the_paper_is_written_with_its_impossibilities(tmp_path):
+def test_report_compares_printed_results_with_the_physical_limits(tmp_path):
     result = paper(tmp_path)
     written = json.loads((tmp_path / "paper.json").read_text())
     assert max(map(abs, written["table_1"]["ours"]["error_percent"].values())) < 1.0

@@ -1,4 +1,4 @@
-"""The benchmark's peers compute the same costs, and the hand-written script finds the motor."""
+"""The peers in the benchmarks compute the same costs, and the hand-written script identifies the motor."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ SIX = np.array([getattr(vb.paper_motor(), n) for n in vb.SIX])
 def case():
     """37 candidates (not a multiple of any tile) and 300 samples that begin in motion.
 
-    At 0.05 ms a sample even one explicit step a sample is accurate to the tolerance asked here.
+    At a sample time of 0.05 ms even one explicit step per sample is accurate to the tolerances used here.
     """
     rng = np.random.default_rng(0)
     excitation = vb.loaded(rng, duration=0.015, dt=5e-5, hold=0.002)
@@ -39,11 +39,11 @@ def _few(errors):
     return errors[:, :3]
 
 
-def test_roofline(case, expected):
+def test_roofline_matches_the_exact_step(case, expected):
     np.testing.assert_allclose(roofline.squared_errors(*case), expected, rtol=1e-9)
 
 
-def test_roofline_copes_with_oscillating_and_stiff_motors(case):
+def test_roofline_handles_oscillating_and_stiff_motors(case):
     _, run = case
     candidates = np.array([SIX, SIX, SIX])
     candidates[0, 1] *= 30  # oscillates
@@ -52,20 +52,20 @@ def test_roofline_copes_with_oscillating_and_stiff_motors(case):
     np.testing.assert_allclose(roofline.squared_errors(candidates, run), expected, rtol=1e-8)
 
 
-def test_lfilter(case, expected):
+def test_lfilter_matches_the_exact_step(case, expected):
     np.testing.assert_allclose(scipy_lfilter.squared_errors(*case), expected, rtol=1e-9)
 
 
-def test_solve_ivp(case, expected):
+def test_solve_ivp_matches_the_exact_step(case, expected):
     candidates, run = case
     errors = scipy_solve_ivp.squared_errors(candidates[:3], run)
     np.testing.assert_allclose(errors, _few(expected), rtol=1e-3)
 
 
-@pytest.mark.parametrize("way", ["squared_errors", "squared_errors_adaptive"])
-def test_diffrax(case, expected, way):
+@pytest.mark.parametrize("function", ["squared_errors", "squared_errors_adaptive"])
+def test_diffrax_matches_the_exact_step(case, expected, function):
     candidates, run = case
-    errors = getattr(diffrax_vmap, way)(candidates[:3], run)
+    errors = getattr(diffrax_vmap, function)(candidates[:3], run)
     np.testing.assert_allclose(errors, _few(expected), rtol=1e-6)
 
 
@@ -76,7 +76,7 @@ def test_roofline_without_effects_is_the_linear_motor(case, expected):
     np.testing.assert_allclose(errors, expected, rtol=1e-6)
 
 
-def test_roofline_with_effects(case):
+def test_roofline_with_effects_matches_numpy(case):
     """Against plain numpy RK4 with numpy's own tanh."""
     candidates, run = case
     R, L, Kb, Kt, J, f = candidates.T
@@ -105,7 +105,7 @@ def test_roofline_with_effects(case):
 @pytest.mark.parametrize(
     "identify", [scipy_identify.identify, scipy_identify.identify_by_least_squares]
 )
-def test_the_script_finds_the_motor(identify):
+def test_the_scipy_script_identifies_the_motor(identify):
     rng = np.random.default_rng(1)
     motor = vb.drawn_motor(rng)
     drives = (vb.staircase(duration=1.0), vb.prbs(rng, 1.0), vb.loaded(rng, 1.0, hold=0.1))
@@ -115,7 +115,7 @@ def test_the_script_finds_the_motor(identify):
 
 
 @pytest.mark.parametrize("inductance", [1.0, 5.0], ids=["real poles", "complex poles"])
-def test_the_script_differentiates_correctly(inductance):
+def test_the_gradient_of_the_scipy_script_matches_finite_differences(inductance):
     """Products of derivatives and residual against finite differences of the squared error."""
     rng = np.random.default_rng(2)
     runs = [Run.of(vb.record(vb.paper_motor(), vb.prbs(rng, 0.2), rng))]

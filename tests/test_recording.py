@@ -54,16 +54,16 @@ def recordings(draw):
 
 @given(recordings(), st.sampled_from([".csv", ".parquet"]))
 @settings(max_examples=40, deadline=None)
-def test_what_is_written_is_read_again_to_the_last_bit(recording, suffix):
+def test_written_recordings_are_read_back_exactly(recording, suffix):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"run{suffix}"
         write_recording(recording, path)
-        again = read_recording(path)
+        read_back = read_recording(path)
         assert [file.name for file in Path(folder).iterdir()] == [path.name]
-    assert again.name == "run" and not again.notes and not again.ignored
-    assert set(again.columns()) == set(recording.columns())
+    assert read_back.name == "run" and not read_back.notes and not read_back.ignored
+    assert set(read_back.columns()) == set(recording.columns())
     for quantity, values in recording.columns().items():
-        np.testing.assert_array_equal(again.columns()[quantity], values)
+        np.testing.assert_array_equal(read_back.columns()[quantity], values)
 
 
 RPM, DEGREE = np.pi / 30, np.pi / 180
@@ -107,7 +107,7 @@ UNDERSTOOD = [
 
 
 @pytest.mark.parametrize(("header", "quantity", "scale"), UNDERSTOOD)
-def test_headers_that_are_understood(header, quantity, scale):
+def test_headers_are_understood(header, quantity, scale):
     column = understand(header)
     assert column is not None
     assert column.quantity == quantity
@@ -130,11 +130,11 @@ def test_headers_that_are_understood(header, quantity, scale):
         "[V]",
     ],
 )
-def test_headers_that_say_too_little(header):
+def test_ambiguous_headers_are_not_understood(header):
     assert understand(header) is None
 
 
-def test_temperatures_have_an_offset():
+def test_units_of_temperature_have_an_offset():
     column = understand("winding_temperature [°F]")
     assert column is not None
     assert 212 * column.scale + column.offset == pytest.approx(100)
@@ -146,19 +146,19 @@ def test_temperatures_have_an_offset():
     st.sampled_from([("rpm", RPM), ("deg/s", DEGREE), ("rad/s", 1.0), ("krpm", 1e3 * RPM)]),
 )
 @settings(max_examples=60, deadline=None)
-def test_every_way_to_write_a_unit(pattern, name, unit):
+def test_units_are_understood_in_every_notation(pattern, name, unit):
     column = understand(pattern.format(name, unit[0]))
     assert column is not None
     assert (column.quantity, column.scale) == ("speed", pytest.approx(unit[1], rel=1e-14))
 
 
-def test_a_torque_of_unknown_name_is_not_passed_over_in_silence(tmp_path):
+def test_a_torque_column_of_unknown_name_is_noted(tmp_path):
     run = read_text(tmp_path, table("time_s,voltage_V,n_rpm,M_Nm,flag_N", T, T, T, T, T))
     (note,) = run.notes
     assert note.column == "M_Nm" and "looks like load" in note.what
 
 
-def test_a_unit_alone_tells_what_a_column_is(tmp_path):
+def test_columns_are_recognised_by_their_unit_alone(tmp_path):
     run = read_text(tmp_path, table("time_s,U_mot/V,I_mot [mA],n_ist [U/min]", T, T, T, T))
     np.testing.assert_allclose((run.voltage, run.current, run.speed), (T, T / 1e3, T * RPM))
     assert [(n.column, "because of its unit" in n.what) for n in run.notes] == [
@@ -168,25 +168,25 @@ def test_a_unit_alone_tells_what_a_column_is(tmp_path):
     ]
 
 
-def test_symbols_of_the_motor_tell_what_a_column_is(tmp_path):
+def test_columns_are_recognised_by_symbols_of_the_motor(tmp_path):
     run = read_text(tmp_path, table("Time,Vmot,i_motor,RPM", T, T, T, T))
     np.testing.assert_allclose((run.voltage, run.current, run.speed), (T, T, T * RPM))
-    # `i` counts lines as often as it is a current
+    # `i` may be a line number as well as a current
     assert read_text(tmp_path, table("i,time_s,u_mot,omega_mot", T, T, T, T)).current is None
 
 
-def test_a_unit_that_several_columns_have_tells_nothing(tmp_path):
+def test_columns_with_the_same_unit_are_not_recognised_by_it(tmp_path):
     text = table("time_s,voltage_V,n1 [rpm],n2 [rpm],current_A", T, T, T, T, T)
     run = read_text(tmp_path, text)
     assert run.speed is None and run.ignored == ("n1 [rpm]", "n2 [rpm]")
 
 
-def test_what_was_asked_for_is_not_what_was_measured(tmp_path):
+def test_a_reference_is_not_taken_for_the_measured_speed(tmp_path):
     text = table("time_s,voltage_V,n_soll [rpm],n_ist [rpm],current_A", T, T, T, 2 * T, T)
     np.testing.assert_allclose(read_text(tmp_path, text).speed, 2 * T * RPM)
 
 
-def test_numbers_become_si_and_the_rest_is_remembered(tmp_path):
+def test_columns_are_converted_to_si_and_others_are_listed_as_ignored(tmp_path):
     text = table("time_ms,voltage_V,Speed [rpm],flag", 1000 * T, T, 60 + T, T)
     run = read_text(tmp_path, text)
     np.testing.assert_allclose(run.time, T, atol=1e-15)
@@ -196,7 +196,7 @@ def test_numbers_become_si_and_the_rest_is_remembered(tmp_path):
     assert run.duration == pytest.approx(0.11)
 
 
-def test_names_without_a_unit_are_taken_as_si_and_noted(tmp_path):
+def test_columns_without_a_unit_are_taken_as_si_and_noted(tmp_path):
     run = read_text(tmp_path, table("time_s,voltage_V,speed", T, T, T))
     (note,) = run.notes
     assert (note.column, note.severity) == ("speed", "note")
@@ -216,7 +216,7 @@ def test_a_second_line_may_hold_the_units(tmp_path, units):
 
 
 @pytest.mark.parametrize("form", ["%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f", "parquet"])
-def test_dates_are_seconds_since_the_first(tmp_path, form):
+def test_dates_become_seconds_since_the_first(tmp_path, form):
     stamps = [datetime(2026, 2, 28, 23, 59, 59, 950_000) + timedelta(seconds=t) for t in T]
     if form == "parquet":
         path = tmp_path / "run.parquet"
@@ -228,13 +228,13 @@ def test_dates_are_seconds_since_the_first(tmp_path, form):
     np.testing.assert_allclose(run.time, T, atol=1e-9)
 
 
-def test_an_unused_look_alike_is_noted(tmp_path):
+def test_an_unused_column_that_resembles_a_quantity_is_noted(tmp_path):
     run = read_text(tmp_path, table("time_s,voltage_V,current_A,speed_kg", T, T, T, T))
     (note,) = run.notes
     assert note.column == "speed_kg" and "looks like speed" in note.what
 
 
-def test_shaft_and_axis_together_are_warned_of(tmp_path):
+def test_linear_and_rotary_units_together_give_a_warning(tmp_path):
     run = read_text(tmp_path, table("time_s,voltage_V,speed [m/s],load [N m]", T, T, T, T))
     assert [finding.severity for finding in run.notes] == ["warning"]
 
@@ -249,13 +249,13 @@ def test_shaft_and_axis_together_are_warned_of(tmp_path):
         ({"speed": "enc_rpm"}, RPM),
     ],
 )
-def test_columns_mapped_by_hand(tmp_path, mapping, scale):
+def test_columns_are_mapped_by_hand(tmp_path, mapping, scale):
     text = table("time_s,voltage_V,rpm_meas,w:a [rpm],enc_rpm", T, T, T, T, T)
     run = read_text(tmp_path, text, mapping)
     np.testing.assert_allclose(run.speed, T * scale)
 
 
-def test_what_is_mapped_wins_over_what_is_understood(tmp_path):
+def test_mapped_columns_take_precedence_over_understood_headers(tmp_path):
     text = table("time_s,voltage_V,speed_rad_s,Speed [rpm]", T, T, T, T)
     run = read_text(tmp_path, text, {"speed": "Speed [rpm]", "load_torque": "speed_rad_s:Nm"})
     np.testing.assert_allclose(run.speed, T * RPM)
@@ -264,7 +264,7 @@ def test_what_is_mapped_wins_over_what_is_understood(tmp_path):
 
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_dialects_of_csv(tmp_path, separator, end):
+def test_dialects_of_csv_are_read(tmp_path, separator, end):
     text = "\ufeff# bench 3\n\n" + table(
         separator.join(["time_s", "voltage_V", "speed_rad_s"]), T, T, T, separator=separator
     )
@@ -277,13 +277,13 @@ def test_dialects_of_csv(tmp_path, separator, end):
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
-def test_decimal_commas(tmp_path, separator):
+def test_decimal_commas_are_read(tmp_path, separator):
     text = table(f"time_s{separator}voltage_V{separator}speed_rad_s", T, T, T, separator=separator)
     run = read_text(tmp_path, text.replace(".", ","))
     np.testing.assert_array_equal(run.speed, T)
 
 
-def test_padded_and_quoted_numbers(tmp_path):
+def test_padded_and_quoted_numbers_are_read(tmp_path):
     text = table("time_s, voltage_V ,speed_rad_s", T, T, T).replace(",", " , ")
     np.testing.assert_array_equal(read_text(tmp_path, text).speed, T)
     quoted = "\n".join(
@@ -292,7 +292,7 @@ def test_padded_and_quoted_numbers(tmp_path):
     np.testing.assert_array_equal(read_text(tmp_path, quoted).speed, T)
 
 
-def test_header_in_a_comment_as_numpy_writes_it(tmp_path):
+def test_a_header_in_a_comment_as_by_numpy_is_read(tmp_path):
     path = tmp_path / "run.csv"
     columns = np.stack([T, T, T], axis=1)
     np.savetxt(path, columns, delimiter=",", header="time_s,voltage_V,speed_rad_s")
@@ -326,13 +326,13 @@ def test_an_empty_column_counts_as_absent(tmp_path):
         ("current torque speed", "torque"),
     ],
 )
-def test_what_drives_a_run(quantities, drive):
+def test_the_drive_of_a_run_follows_from_its_columns(quantities, drive):
     assert Recording("run", T, **dict.fromkeys(quantities.split(), T)).drive == drive
 
 
 @pytest.mark.parametrize("shape", [(-1,), (-1, 1), (1, -1)])
 @pytest.mark.parametrize("nested", [False, True])
-def test_matlab_vectors_of_any_orientation(tmp_path, shape, nested):
+def test_matlab_vectors_of_any_orientation_are_read(tmp_path, shape, nested):
     variables = {"t": T, "voltage_V": T, "Speed_rpm": T, "gain": 35.15, "note": "hello"}
     variables = {
         k: v.reshape(shape) if k in "t voltage_V Speed_rpm" else v for k, v in variables.items()
@@ -345,9 +345,9 @@ def test_matlab_vectors_of_any_orientation(tmp_path, shape, nested):
 
 def _structures(*fields: dict) -> np.ndarray:
     """An array of structures as savemat takes it."""
-    made = np.zeros(len(fields), [(name, object) for name in fields[0]])
-    made[:] = [tuple(one.values()) for one in fields]
-    return made
+    structures = np.zeros(len(fields), [(name, object) for name in fields[0]])
+    structures[:] = [tuple(one.values()) for one in fields]
+    return structures
 
 
 def _simulink(*signals: tuple[np.ndarray, str]) -> dict:
@@ -387,7 +387,7 @@ def _simulink(*signals: tuple[np.ndarray, str]) -> dict:
         ),
     ],
 )
-def test_what_simulink_and_controldesk_save(tmp_path, content, columns):
+def test_files_of_simulink_and_controldesk_are_read(tmp_path, content, columns):
     savemat(tmp_path / "run.mat", content)
     run = read_recording(tmp_path / "run.mat", columns)
     np.testing.assert_array_equal(run.time, T)
@@ -395,7 +395,7 @@ def test_what_simulink_and_controldesk_save(tmp_path, content, columns):
     np.testing.assert_allclose(run.speed, T * RPM)
 
 
-def test_integers_in_parquet_and_matlab(tmp_path):
+def test_integers_in_parquet_and_matlab_are_read(tmp_path):
     whole = np.arange(12)
     columns = {"time_s": whole, "voltage_V": whole, "speed_rad_s": whole}
     pl.DataFrame(columns).write_parquet(tmp_path / "run.parquet")
@@ -404,7 +404,7 @@ def test_integers_in_parquet_and_matlab(tmp_path):
         np.testing.assert_array_equal(read_recording(tmp_path / name).speed, whole)
 
 
-def test_a_million_rows_take_about_a_second(tmp_path):
+def test_a_million_rows_are_read_in_seconds(tmp_path):
     rng = np.random.default_rng(0)
     count = 1_000_000
     columns = dict(zip(("voltage", "current", "speed"), rng.normal(size=(3, count)), strict=True))
@@ -414,7 +414,7 @@ def test_a_million_rows_take_about_a_second(tmp_path):
     assert clock.perf_counter() - begin < 5  # on a machine that others use too
 
 
-def test_importing_is_light():
+def test_importing_recordings_and_checks_imports_nothing_heavy():
     code = (
         "import sys, pmdc_jax.recording, pmdc_jax.check;"
         "print(*{'jax', 'pint', 'polars', 'scipy'} & set(sys.modules))"
@@ -423,7 +423,7 @@ def test_importing_is_light():
     assert done.stdout.strip() == ""
 
 
-def test_a_path_stands_for_what_it_holds(tmp_path):
+def test_a_path_stands_for_its_recording(tmp_path):
     run = Recording("step", 0.01 * np.arange(20), np.ones(20), speed=np.arange(20.0))
     path = tmp_path / "step.csv"
     write_recording(run, path)
@@ -447,7 +447,7 @@ ROWS = "".join(f"{0.001 * k:.3f},{12 + k % 3},{0.1 * k:.1f},{k}\n" for k in rang
         "Date 2026-11-24\nSample interval 0.001\n",
     ],
 )
-def test_what_an_instrument_writes_before_its_header_is_skipped(tmp_path, preamble):
+def test_a_preamble_of_an_instrument_is_skipped(tmp_path, preamble):
     file = tmp_path / "scope.csv"
     file.write_text(f"{preamble}time_s,voltage_V,current_A,speed_rad_s\n{ROWS}")
     run = read_recording(file)
@@ -455,7 +455,7 @@ def test_what_an_instrument_writes_before_its_header_is_skipped(tmp_path, preamb
     assert (run.voltage[1], run.current[1], run.speed[1]) == (13.0, 0.1, 1.0)
 
 
-def test_a_header_of_another_width_is_no_preamble(tmp_path):
+def test_a_header_of_another_width_is_not_taken_for_a_preamble(tmp_path):
     file = tmp_path / "run.csv"
     file.write_text(f"time_s,voltage_V,current_A\n{ROWS}")
     with pytest.raises(InputError, match="it has 4 fields where the header"):
@@ -463,7 +463,7 @@ def test_a_header_of_another_width_is_no_preamble(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("separator", "shown", "number"),
+    ("separator", "written", "number"),
     [
         (",", "1,234.5", 1234.5),
         (";", "1.234,5", 1234.5),
@@ -471,16 +471,16 @@ def test_a_header_of_another_width_is_no_preamble(tmp_path):
         (";", "-12,345,678.5", -12345678.5),
     ],
 )
-def test_thousands_may_be_set_apart(tmp_path, separator, shown, number):
+def test_thousands_separators_are_read(tmp_path, separator, written, number):
     lines = table("time_s,voltage_V,current_A,speed_rad_s", T, T, T, T).splitlines()
     rows = [line.split(",") for line in lines]
-    rows[5][3] = f'"{shown}"'
+    rows[5][3] = f'"{written}"'
     run = read_text(tmp_path, "\n".join(map(separator.join, rows)))
     assert run.speed[4] == number
 
 
-def test_a_table_of_quoted_cells_with_remarks_and_empty_lines_at_its_end(tmp_path):
-    """As a spreadsheet exports it."""
+def test_a_spreadsheet_with_quoted_cells_remarks_and_empty_lines_is_read(tmp_path):
+    """As exported by a spreadsheet program."""
     rows = [f'"{line.replace(",", chr(34) + "," + chr(34))}",""' for line in ROWS.splitlines()]
     rows[0] = f'{rows[0][:-3]},"cold, at first"'
     file = tmp_path / "run.csv"

@@ -1,4 +1,4 @@
-"""The report and the JSON of an identification, on a made-up one with plausible numbers."""
+"""The report and the JSON of identifications that are made up, with plausible numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from attrs import evolve as replace
+from attrs import evolve
 
 from pmdc_jax import files
 from pmdc_jax.errors import InputError
@@ -82,7 +82,7 @@ def fake_search(rng: np.random.Generator, generations: int = 80) -> Search:
 
 
 def fake_identification(samples: int = 3000, **changes) -> Identification:
-    """All six found from four runs, one held out; `changes` replace fields."""
+    """All six parameters from four training runs, and a held-out run; `changes` replace fields."""
     rng = np.random.default_rng(0)
     relative = dict(zip(TRUTH, (0.0026, 0.031, 0.0004, 0.006, 0.0061, 0.043), strict=True))
     deviation = np.array(list(relative.values()))
@@ -122,15 +122,15 @@ def fake_identification(samples: int = 3000, **changes) -> Identification:
 
 
 def partial_identification() -> Identification:
-    """Nearly all that can be missing: known loads, columns, hold-outs, convergence, the search."""
-    whole = fake_identification()
+    """With nearly everything missing that can be: known loads, columns, hold-outs, convergence, the search."""
+    complete = fake_identification()
     hidden = Estimate(0.117, None, None, "N m/A", "not_identifiable")
     bound = Estimate(1e-6, None, None, "H", "at_bound")
     no_voltage = {"voltage": None, "current_simulated": None, "current_rmse": None}
     no_current = {"current": None, "current_rmse": None, "current_fit_percent": None}
     return fake_identification(
         parameters={
-            **whole.parameters,
+            **complete.parameters,
             **dict.fromkeys(("Kt", "J", "f"), hidden),
             "L": bound,
         },
@@ -142,10 +142,10 @@ def partial_identification() -> Identification:
             ),
         ),
         fit={
-            "coast <down> & out": replace(
-                whole.fit["prbs"], current_fit_percent=None, **no_voltage
+            "coast <down> & out": evolve(
+                complete.fit["prbs"], current_fit_percent=None, **no_voltage
             ),
-            "speed only": replace(whole.fit["drive"], role="train", **no_current),
+            "speed only": evolve(complete.fit["drive"], role="train", **no_current),
         },
         noise={"current_A": None, "speed_rad_s": 0.6},
         converged=False,
@@ -161,7 +161,7 @@ def partial_identification() -> Identification:
 
 
 class Page(HTMLParser):
-    """What a report holds: its visible text, what it would load, and its figures."""
+    """The contents of a report: its visible text, the addresses that it would load, and its figures."""
 
     def __init__(self, html: str):
         super().__init__()
@@ -202,7 +202,7 @@ def case(request, tmp_path):
     return identification, (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_report_holds_every_parameter_run_and_finding(case):
+def test_report_contains_every_parameter_run_and_finding(case):
     identification, html = case
     page = Page(html)
     assert page.open == []
@@ -240,7 +240,7 @@ def test_report_has_a_figure_for_every_run_the_search_and_the_correlations(case)
     assert len(figures_shown) == len(identification.fit) + extra
 
 
-def test_hold_outs_come_first(tmp_path):
+def test_hold_out_runs_are_shown_first(tmp_path):
     write_report(fake_identification(), tmp_path / "report.html")
     text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
     assert text.index("drive", text.index("Measured and simulated")) < text.index(
@@ -248,7 +248,7 @@ def test_hold_outs_come_first(tmp_path):
     )
 
 
-def test_missing_quantities_are_left_out_of_the_picture():
+def test_missing_quantities_are_left_out_of_the_figure():
     fits = partial_identification().fit
     no_voltage = figures.run_figure(fits["coast <down> & out"], {}, 1000)
     assert [trace.name for trace in no_voltage.data] == [
@@ -264,12 +264,12 @@ def test_missing_quantities_are_left_out_of_the_picture():
 
 
 def test_long_runs_are_thinned_and_the_page_stays_small(tmp_path):
-    long = fake_identification().fit["prbs"]
+    run = fake_identification().fit["prbs"]
     length = 200_000
     columns = ("time", "voltage", "current", "current_simulated", "speed", "speed_simulated")
-    changes = {name: np.resize(getattr(long, name), length) for name in columns}
+    changes = {name: np.resize(getattr(run, name), length) for name in columns}
     changes["time"] = 1e-3 * np.arange(length)
-    runs = {f"run {number}": replace(long, **changes) for number in range(12)}
+    runs = {f"run {number}": evolve(run, **changes) for number in range(12)}
     write_report(fake_identification(fit=runs), tmp_path / "report.html")
     assert (tmp_path / "report.html").stat().st_size < 6_000_000
     assert "plot reduced to" in Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
@@ -292,14 +292,14 @@ def test_envelope_keeps_peaks_order_and_gaps():
     np.testing.assert_allclose(short_time, time[:50], rtol=1e-6)
 
 
-def test_correlations_leave_fixed_parameters_out():
+def test_correlations_omit_fixed_parameters():
     covariance = np.array([[4.0, 0.0, 3.0], [0.0, 0.0, 0.0], [3.0, 0.0, 9.0]])
     matrix, names = figures.correlations(covariance, ("R", "L", "Kb"))
     assert names == ("R", "Kb")
     np.testing.assert_allclose(matrix, [[1, 0.5], [0.5, 1]])
 
 
-def test_summary_says_what_matters():
+def test_summary_states_what_was_identified_and_how_well_it_fits():
     sentences = " ".join(summary(fake_identification()))
     assert "All 6 parameters were identified from 4 training runs" in sentences
     assert "(f)" in sentences
@@ -314,42 +314,42 @@ def test_summary_says_what_matters():
     assert "did not converge" in sentences
 
 
-def test_summary_repeats_which_columns_the_data_check_doubts():
+def test_summary_lists_the_columns_with_warnings_of_the_data_check():
     finding = Finding("loaded", "current", "warning", "as if in mA", "whole run", "Mend it")
-    (told,) = (
+    (message,) = (
         one
-        for one in summary(fake_identification(findings=(finding, replace(finding, column=None))))
+        for one in summary(fake_identification(findings=(finding, evolve(finding, column=None))))
         if "data check" in one
     )
-    assert "the current and run loaded" in told
-    note = replace(finding, severity="note")
+    assert "the current and run loaded" in message
+    note = evolve(finding, severity="note")
     assert "data check" not in " ".join(summary(fake_identification(findings=(note,))))
 
 
-def test_summary_presumes_nothing_that_a_message_doubts():
-    told = "the fit leaves 22 times its white noise: `pmdc diagnose` tells what is missing"
-    doubted = fake_identification(messages=(told,), doubts=(told,))
+def test_summary_does_not_assume_a_model_that_a_message_doubts():
+    message = "the fit leaves 22 times its white noise: `pmdc diagnose` tells what is missing"
+    doubted = fake_identification(messages=(message,), doubts=(message,))
     assert MODEL_ASSUMPTION not in summary(doubted)
     assert MODEL_ASSUMPTION in summary(fake_identification(messages=("something else",)))
 
 
-def test_several_directions_with_one_reason_are_told_once():
-    unseen = partial_identification()
-    (one, *_) = unseen.unidentified_directions
-    twice = replace(one, parameters=(*one.parameters, "friction"))
-    sentences = summary(replace(unseen, unidentified_directions=(one, twice)))
+def test_summary_states_the_same_reason_only_once():
+    partial = partial_identification()
+    (one, *_) = partial.unidentified_directions
+    twice = evolve(one, parameters=(*one.parameters, "friction"))
+    sentences = summary(evolve(partial, unidentified_directions=(one, twice)))
     assert sum(one.mend in sentence for sentence in sentences) == 1
 
 
 def test_summary_names_the_worst_hold_out_and_its_excess():
-    whole = fake_identification()
-    bad = replace(whole.fit["prbs"], role="holdout", speed_rmse=3.0)
-    sentences = " ".join(summary(fake_identification(fit={**whole.fit, "prbs": bad})))
+    complete = fake_identification()
+    poor = evolve(complete.fit["prbs"], role="holdout", speed_rmse=3.0)
+    sentences = " ".join(summary(fake_identification(fit={**complete.fit, "prbs": poor})))
     assert "The worst of 2 held-out runs, prbs," in sentences
     assert "the speed error is 5.0 times the measurement noise" in sentences
 
 
-def test_json_follows_the_contract():
+def test_json_has_the_documented_keys():
     found = identification_json(fake_identification())
     assert set(found["parameters"]) == set(TRUTH)
     assert set(found["parameters"]["R"]) == {"value", "stderr", "ci95", "unit", "status"}
@@ -360,7 +360,7 @@ def test_json_follows_the_contract():
     assert found["fit"]["loaded"]["load_offset"] == 0.0123
 
 
-def test_json_has_null_for_what_is_unknown_never_nan(tmp_path, capsys):
+def test_json_has_null_for_unknown_values(tmp_path, capsys):
     unknown = Estimate(
         np.float64(0.2), float("nan"), (float("nan"), 1.0), "ohm", "not_identifiable"
     )
@@ -373,7 +373,7 @@ def test_json_has_null_for_what_is_unknown_never_nan(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out) == found
 
 
-def test_files_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_files_are_written_atomically(tmp_path, monkeypatch):
     path = tmp_path / "report.html"
     path.write_text("old")
 
@@ -401,7 +401,7 @@ def test_a_link_or_a_device_is_written_through(tmp_path):
     assert Path("/dev/null").is_char_device()
 
 
-def test_outputs_over_inputs_are_refused(tmp_path):
+def test_an_output_that_is_an_input_is_refused(tmp_path):
     (tmp_path / "a").mkdir()
     with pytest.raises(InputError, match="an input"):
         files.check_outputs({"--json": tmp_path / "a" / ".." / "run.csv"}, [tmp_path / "run.csv"])
@@ -436,7 +436,7 @@ def test_engineering_notation(estimate, expected):
     ("value", "text"),
     [(99.412, "99.41 %"), (12.34, "12.3 %"), (0.04, "0.040 %"), (-250.0, "−250 %"), (None, "–")],
 )
-def test_percent(value, text):
+def test_percent_notation(value, text):
     assert notation.percent(value).replace(notation.NARROW_SPACE, " ") == text
 
 

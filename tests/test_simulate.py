@@ -14,11 +14,11 @@ import pytest
 from attrs import evolve
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from linear_motor import PAPER, exact_step, state_space
 from scipy import linalg, signal
 from scipy.integrate import solve_ivp
 
 import pmdc_jax
-from benchmarks import virtual_bench as vb
 from pmdc_jax.clock import is_even
 from pmdc_jax.effects import CoulombFriction, ResistanceHeating
 from pmdc_jax.motor import PARAMETERS, Motor
@@ -35,7 +35,6 @@ from pmdc_jax.simulate import (
 from pmdc_jax.simulate.exponential import phi_functions
 from pmdc_jax.threads import map_in_threads
 
-PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 BLOCKS = 4  # every tape below has this shape, so that few are compiled
 SAMPLES = 128 * BLOCKS
 
@@ -62,34 +61,26 @@ def recording(name="run", samples=SAMPLES, step=1e-3, seed=0, **columns) -> Reco
     return Recording(name, time, **(given | columns))
 
 
-def continuous(m: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
-    """A and B of the linear motor, written down from the equations once more."""
-    A = np.array([[-m["R"] / m["L"], -m["Kb"] / m["L"]], [m["Kt"] / m["J"], -m["f"] / m["J"]]])
-    return A, np.array([[1 / m["L"], 0.0], [0.0, -1 / m["J"]]])
-
-
 def exact_steps(m: dict[str, float], run: Recording, start) -> np.ndarray:
-    """Current and speed (samples, 2) by scipy's matrix exponential of A and B together."""
-    A, B = continuous(m)
-    step = run.sample_time
-    both = linalg.expm(np.block([[A, B], [np.zeros((2, 4))]]) * step)
+    """Current and speed (samples, 2) by scipy's matrix exponential."""
+    A, B = exact_step(m, run.sample_time)
     states = [np.asarray(start, float)]
     for held in np.stack([run.voltage, run.load], 1)[:-1]:
-        states.append(both[:2, :2] @ states[-1] + both[:2, 2:] @ held)
+        states.append(A @ states[-1] + B @ held)
     return np.array(states)
 
 
-def alone(m: Motor, run: Recording, start=None, **changes) -> np.ndarray:
+def simulated_alone(m: Motor, run: Recording, start=None, **changes) -> np.ndarray:
     """Free run of one recording by the package, (samples, 2); `changes` of its tape."""
     tape = dataclasses.replace(Tape.from_recordings([run], unloaded=True), **changes)
     if start is not None:
         tape = dataclasses.replace(tape, initial=np.array([start]))
-    seen = free_run(m, tape)
-    return np.stack([tape.samples_of(0, seen[:, c], len(run)) for c in range(2)], 1)
+    outputs = free_run(m, tape)
+    return np.stack([tape.samples_of(0, outputs[:, c], len(run)) for c in range(2)], 1)
 
 
 def largest_error(found: np.ndarray, expected: np.ndarray) -> float:
-    """Of any sample of either output, relative to the largest value of that output."""
+    """The largest error of any sample, relative to the largest value of that output."""
     return float((np.abs(found - expected).max(0) / np.abs(expected).max(0)).max())
 
 
@@ -119,7 +110,7 @@ LINEAR = {
 def test_the_linear_motor_is_exact(x64, case):
     run, start = recording(step=case.step), (3.0, -20.0)
     expected = exact_steps(PAPER | case.changes, run, start)
-    assert largest_error(alone(motor(**case.changes), run, start), expected) < 1e-10
+    assert largest_error(simulated_alone(motor(**case.changes), run, start), expected) < 1e-10
 
 
 def test_random_linear_motors_are_exact(x64):
@@ -132,24 +123,24 @@ def test_random_linear_motors_are_exact(x64):
         m = {n: x * 10 ** rng.uniform(-2, 2) for n, x in PAPER.items()}
         run = recording(step=float(f"{10 ** rng.uniform(-5, -1):.6g}"), seed=k)
         expected = exact_steps(m, run, (1.0, 2.0))
-        assert largest_error(alone(motor(**m), run, (1.0, 2.0)), expected) < 1e-9, m
+        assert largest_error(simulated_alone(motor(**m), run, (1.0, 2.0)), expected) < 1e-9, m
 
 
-def test_the_linear_motor_is_scipys_digital_filter(x64):
+def test_the_linear_motor_matches_a_digital_filter_of_scipy(x64):
     """Voltage to speed, from rest, by scipy's own discretisation and filter."""
     run = recording(load=np.zeros(SAMPLES))
-    A, B = continuous(PAPER)
+    A, B = state_space(PAPER)
     b, a = signal.ss2tf(*signal.cont2discrete((A, B[:, :1], np.eye(2), np.zeros((2, 1))), 1e-3)[:4])
     expected = np.stack([signal.lfilter(row, a, run.voltage) for row in b], 1)
-    assert largest_error(alone(motor(), run, (0.0, 0.0)), expected) < 1e-9
+    assert largest_error(simulated_alone(motor(), run, (0.0, 0.0)), expected) < 1e-9
 
 
-def test_phi_functions(x64):
-    """By scipy: phi_k(z) is a block of the exponential of z beside a chain of ones."""
+def test_phi_functions_match_scipy(x64):
+    """phi_k(z) is a block of the exponential of a matrix of z and identity blocks."""
     rng = np.random.default_rng(2)
     z = rng.standard_normal((2, 2, 30)) * 10.0 ** rng.uniform(-9, 1.5, 30)
     z[:, :, 0] = 0.0
-    z[:, :, 1] = [[-1000.0, -3.0], [1e-2, -5e-4]]  # stiff: the electrical half has died away
+    z[:, :, 1] = [[-1000.0, -3.0], [1e-2, -5e-4]]  # stiff: the electrical mode has decayed
     half, whole = jax.jit(phi_functions, static_argnums=1)(jnp.asarray(z), 3)
     for found, of in ((half, z / 2), (whole, z)):
         for k, phi in enumerate(found):
@@ -172,8 +163,8 @@ def _phi_by_scipy(z: np.ndarray, k: int) -> np.ndarray:
 HEAT = {"rise_per_W": 2e-3, "time_constant_s": 0.08}
 
 
-def heated(t, x, v, load):
-    """The motor whose resistance rises with the winding's temperature, written out."""
+def rates_with_heating(t, x, v, load):
+    """Rates of the motor whose resistance rises with the temperature of the winding."""
     i, w, rise = x
     m, R = PAPER, PAPER["R"] * (1 + x[2])
     return [
@@ -183,12 +174,12 @@ def heated(t, x, v, load):
     ]
 
 
-def by_scipy(run: Recording, start) -> np.ndarray:
-    """Restarted at every sample, because the input jumps there."""
+def outputs_by_scipy(run: Recording, start) -> np.ndarray:
+    """Current and speed, restarted at every sample because the inputs jump there."""
     states = [np.array(start, float)]
     for v, load in zip(run.voltage[:-1], run.load[:-1], strict=True):
         held = solve_ivp(
-            heated,
+            rates_with_heating,
             (0, run.sample_time),
             states[-1],
             "DOP853",
@@ -202,12 +193,12 @@ def by_scipy(run: Recording, start) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def heating():
-    """A coarse record, and what scipy makes of it: 64 samples of 4 ms."""
+    """A run of 64 samples of 4 ms, and its solution by scipy."""
     run = recording(samples=64, step=4e-3)
-    return run, by_scipy(run, (5.0, 10.0, 0.0))
+    return run, outputs_by_scipy(run, (5.0, 10.0, 0.0))
 
 
-def finer(run: Recording, times: int) -> Recording:
+def sampled_more_often(run: Recording, times: int) -> Recording:
     """The same held inputs, sampled more often."""
     fine = {q: np.repeat(getattr(run, q), times) for q in ("voltage", "load", "current", "speed")}
     return Recording(run.name, run.sample_time / times * np.arange(times * len(run)), **fine)
@@ -215,13 +206,13 @@ def finer(run: Recording, times: int) -> Recording:
 
 def test_converges_with_order_four(x64, heating):
     run, expected = heating
-    hot = motor((ResistanceHeating(**{n: np.asarray(x) for n, x in HEAT.items()}),))
+    heated = motor((ResistanceHeating(**{n: np.asarray(x) for n, x in HEAT.items()}),))
     errors = []
     for times in (4, 8, 16):
-        found = alone(hot, finer(run, times), (5.0, 10.0))[::times]
+        found = simulated_alone(heated, sampled_more_often(run, times), (5.0, 10.0))[::times]
         errors.append(largest_error(found, expected))
     # a sample of 4 ms is four steps of 1 ms
-    assert largest_error(alone(hot, run, (5.0, 10.0)), expected) == pytest.approx(
+    assert largest_error(simulated_alone(heated, run, (5.0, 10.0)), expected) == pytest.approx(
         errors[0], rel=1e-3
     )
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
@@ -231,8 +222,8 @@ def test_converges_with_order_four(x64, heating):
 
 def test_the_adaptive_reference_agrees_with_scipy(x64, heating):
     run, expected = heating
-    hot = motor((ResistanceHeating(**{n: np.asarray(x) for n, x in HEAT.items()}),))
-    found = reference_solution(hot, run.time, run.voltage, run.load, jnp.array([5.0, 10.0]))
+    heated = motor((ResistanceHeating(**{n: np.asarray(x) for n, x in HEAT.items()}),))
+    found = reference_solution(heated, run.time, run.voltage, run.load, jnp.array([5.0, 10.0]))
     assert largest_error(np.asarray(found).T, expected) < 1e-8
 
 
@@ -246,26 +237,23 @@ EFFECTS = {
 
 
 @pytest.mark.parametrize("effects", EFFECTS.values(), ids=EFFECTS.keys())
-def test_joined_blocks_are_one_sequential_run(x64, effects):
-    """`free_run` guesses where blocks begin and mends; `squared_errors` walks them one by one.
-
-    Against outputs measured as zero the latter is the sum of squares of the plain run; one sample
-    at a time it gives the samples themselves.
-    """
+def test_joined_blocks_match_a_sequential_run(x64, effects):
+    """`free_run` guesses the states in which blocks begin and corrects them; `squared_errors` simulates block after
+    block. With measured outputs of zero, and all weight on one sample, it gives the square of that sample."""
     run = recording(current=np.zeros(SAMPLES), speed=np.zeros(SAMPLES))
     tape = Tape.from_recordings([run])
-    seen = np.asarray(free_run(motor(effects), tape))
+    outputs = np.asarray(free_run(motor(effects), tape))
     one = jax.tree.map(lambda leaf: np.reshape(leaf, 1), motor(effects))
     for block, sample in ((0, 1), (0, 127), (1, 0), (1, 1), (2, 64), (3, 127)):
         weight = np.zeros_like(tape.weight)
         weight[block, :, sample] = 1.0
         only = dataclasses.replace(tape, weight=weight)
         squares = np.array([float(e[0]) for e in squared_errors(one, only)])
-        np.testing.assert_allclose(np.abs(seen[block, :, sample]), np.sqrt(squares), rtol=1e-7)
+        np.testing.assert_allclose(np.abs(outputs[block, :, sample]), np.sqrt(squares), rtol=1e-7)
 
 
-def test_runs_on_one_tape_are_each_as_alone(x64):
-    """Runs of different rate, length, start and load on one tape do not know of each other."""
+def test_runs_on_one_tape_match_runs_simulated_alone(x64):
+    """Runs of different rate, length, start and load on one tape do not affect each other."""
     m = motor((CoulombFriction(np.asarray(0.1)),))
     runs = [
         recording("slow", 200, 5e-3, seed=1),
@@ -274,24 +262,26 @@ def test_runs_on_one_tape_are_each_as_alone(x64):
         recording("slow again", 128, 5e-3, seed=4),
     ]
     tape = Tape.from_recordings(runs)
-    assert tape.value.shape[0] == 8  # one more than filled: the last block holds nothing
+    assert tape.value.shape[0] == 8  # one more than needed: the last block is empty
     offsets = np.array([0.0, 0.05, -0.02, 0.0])
     own = RunUnknowns.as_recorded(tape)._replace(load_offset=jnp.asarray(offsets))
-    seen = free_run(m, tape, own)
+    outputs = free_run(m, tape, own)
     for k, (run, offset) in enumerate(zip(runs, offsets, strict=True)):
         loaded = Recording(
             run.name, run.time, run.voltage, run.current, run.speed, run.load + offset
         )
-        together = np.stack([tape.samples_of(k, seen[:, c], len(run)) for c in range(2)], 1)
-        # the slowest run decides for all how a sample is divided
-        apart = alone(m, loaded, longest=tape.longest)
-        np.testing.assert_allclose(together, apart, rtol=1e-7, atol=1e-7)
+        together = np.stack([tape.samples_of(k, outputs[:, c], len(run)) for c in range(2)], 1)
+        # the slowest run determines for all into how many steps a sample is divided
+        separate = simulated_alone(m, loaded, longest=tape.longest)
+        np.testing.assert_allclose(together, separate, rtol=1e-7, atol=1e-7)
 
 
-# -------------------------------------------------------------------------- driven otherwise
+# ---------------------------------------------------------------------------- other drives
 
 
-def mechanical(drive: np.ndarray, load: np.ndarray, step: float, start: float) -> np.ndarray:
+def speed_by_closed_form(
+    drive: np.ndarray, load: np.ndarray, step: float, start: float
+) -> np.ndarray:
     """Speed under a held torque: J dw/dt = drive - f w - load has a closed form over each sample."""
     rate, gain = np.exp(-PAPER["f"] / PAPER["J"] * step), 1 / PAPER["f"]
     speed = [start]
@@ -300,19 +290,19 @@ def mechanical(drive: np.ndarray, load: np.ndarray, step: float, start: float) -
     return np.array(speed)
 
 
-def test_a_run_driven_by_torque(x64):
+def test_a_run_driven_by_torque_matches_the_closed_form(x64):
     run = recording(voltage=None, current=None, torque=np.sin(np.arange(SAMPLES) / 9))
-    expected = mechanical(run.torque, run.load, 1e-3, run.speed[0])
+    expected = speed_by_closed_form(run.torque, run.load, 1e-3, run.speed[0])
     found = pmdc_jax.simulate(motor(), run)
     np.testing.assert_allclose(found.speed, expected, rtol=1e-9, atol=1e-9)
     assert found.current is None
 
 
-def test_a_run_driven_by_current(x64):
-    """The measured current flows on between its samples, so its mean over each drives."""
+def test_a_run_driven_by_current_matches_the_closed_form(x64):
+    """A measured current is interpolated, so its mean over each sample drives the motor."""
     run = recording(voltage=None, current=8 * np.sin(np.arange(SAMPLES) / 9))
     mean = (run.current + np.append(run.current[1:], run.current[-1])) / 2
-    expected = mechanical(PAPER["Kt"] * mean, run.load, 1e-3, run.speed[0])
+    expected = speed_by_closed_form(PAPER["Kt"] * mean, run.load, 1e-3, run.speed[0])
     found = pmdc_jax.simulate(motor(), run)
     np.testing.assert_allclose(found.speed, expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(found.current, run.current)
@@ -321,9 +311,9 @@ def test_a_run_driven_by_current(x64):
 def test_a_voltage_alone_is_simulated_from_rest(x64, tmp_path):
     run = recording(load=None)
     measured = pmdc_jax.simulate(motor(), evolve(run, current=0 * run.time, speed=0 * run.time))
-    bare = evolve(run, current=None, speed=None)
-    write_recording(bare, tmp_path / "run.csv")
-    for one in (bare, tmp_path / "run.csv"):
+    unmeasured = evolve(run, current=None, speed=None)
+    write_recording(unmeasured, tmp_path / "run.csv")
+    for one in (unmeasured, tmp_path / "run.csv"):
         found = pmdc_jax.simulate(motor(), one)
         np.testing.assert_array_equal(found.speed, measured.speed)
         np.testing.assert_array_equal(found.current, measured.current)
@@ -343,13 +333,15 @@ def candidates():
     ]
 
 
-def test_squared_errors_are_those_of_the_free_run(x64, candidates):
+def test_squared_errors_match_the_free_run(x64, candidates):
     run = recording()
-    run.speed[40:60] = np.nan  # missing samples count for nothing
+    run.speed[40:60] = np.nan  # missing samples do not count
     tape = Tape.from_recordings([run])
     current, speed = squared_errors(population(candidates), tape)
     for k, m in enumerate(candidates):
-        error = alone(motor(**m), run, tape.initial[0]) - np.stack([run.current, run.speed], 1)
+        error = simulated_alone(motor(**m), run, tape.initial[0]) - np.stack(
+            [run.current, run.speed], 1
+        )
         expected = np.nansum(error**2, 0)
         np.testing.assert_allclose([current[k], speed[k]], expected, rtol=1e-8)
 
@@ -357,12 +349,12 @@ def test_squared_errors_are_those_of_the_free_run(x64, candidates):
 def test_squared_errors_add_up_over_runs_of_different_rates(x64, candidates):
     runs = [recording(), recording(step=4e-3)]
     motors = population(candidates)
-    apart = [np.stack(squared_errors(motors, Tape.from_recordings([run]))) for run in runs]
+    separate = [np.stack(squared_errors(motors, Tape.from_recordings([run]))) for run in runs]
     together = np.stack(squared_errors(motors, Tape.from_recordings(runs)))
-    np.testing.assert_allclose(together, apart[0] + apart[1], rtol=1e-10)
+    np.testing.assert_allclose(together, separate[0] + separate[1], rtol=1e-10)
 
 
-NONSENSE = {
+INVALID_VALUES = {
     "R": np.nan,
     "L": 0.0,
     "Kb": 1e200,
@@ -372,23 +364,23 @@ NONSENSE = {
 }
 
 
-def test_a_nonsense_candidate_has_infinite_errors_and_spoils_no_other(x64, candidates):
+def test_an_invalid_candidate_has_huge_errors_and_affects_no_other(x64, candidates):
     tape = Tape.from_recordings([recording()])
     clean = np.stack(squared_errors(population(candidates), tape))
-    spoiled = [dict(m) for m in candidates]
-    for k, (name, value) in enumerate(NONSENSE.items()):
-        spoiled[k][name] = value
-    found = np.stack(squared_errors(population(spoiled), tape))
+    with_invalid = [dict(m) for m in candidates]
+    for k, (name, value) in enumerate(INVALID_VALUES.items()):
+        with_invalid[k][name] = value
+    found = np.stack(squared_errors(population(with_invalid), tape))
     assert not np.isnan(found).any()
-    assert np.all(found[:, : len(NONSENSE)] > 1e3 * clean[:, : len(NONSENSE)]), found
+    assert np.all(found[:, : len(INVALID_VALUES)] > 1e3 * clean[:, : len(INVALID_VALUES)]), found
     assert np.isinf(found[:, :2]).all()
-    np.testing.assert_array_equal(found[:, len(NONSENSE) :], clean[:, len(NONSENSE) :])
+    np.testing.assert_array_equal(found[:, len(INVALID_VALUES) :], clean[:, len(INVALID_VALUES) :])
 
 
 # --------------------------------------------------------------------------------- even samples
 
 
-def test_even_samples_are_left_alone():
+def test_nearly_even_samples_are_not_resampled():
     run = recording(step=1e-3)
     noisy = Recording(
         "r", run.time + 1e-7 * np.sin(np.arange(SAMPLES)), run.voltage, speed=run.speed
@@ -404,11 +396,11 @@ STEPS = st.lists(st.floats(0.5, 1.5), min_size=20, max_size=60)
 
 @settings(max_examples=60, deadline=None)
 @given(steps=STEPS, seed=st.integers(0, 1000))
-def test_resampling_loses_no_volt_second(steps, seed):
-    """Jittered stamps: volt-seconds and newton-metre-seconds up to any grid point are kept."""
+def test_resampling_keeps_the_integrals_of_voltage_and_load(steps, seed):
+    """At jittered stamps, up to any point of the even grid."""
     rng = np.random.default_rng(seed)
     time = 7.0 + 1e-3 * np.append(0.0, np.cumsum(steps))
-    assume(not is_even(time))  # those are taken for rounded ones, and are not resampled
+    assume(not is_even(time))  # such stamps count as rounded, and are not resampled
     run = Recording(
         "r", time, rng.normal(size=len(time)), speed=np.cos(time), load=rng.normal(size=len(time))
     )
@@ -431,14 +423,14 @@ def test_outputs_are_interpolated_but_not_across_gaps():
     inside = (even.time > time[49]) & (even.time < time[50])
     assert 9 <= inside.sum() <= 11
     assert time[-1] <= even.time[-1] < time[-1] + 1e-3
-    lost = inside | (even.time > time[-1])
-    assert np.isnan(even.speed[lost]).all()
-    np.testing.assert_allclose(even.speed[~lost], 1 + 5 * even.time[~lost], rtol=1e-12)
+    unknown = inside | (even.time > time[-1])
+    assert np.isnan(even.speed[unknown]).all()
+    np.testing.assert_allclose(even.speed[~unknown], 1 + 5 * even.time[~unknown], rtol=1e-12)
     np.testing.assert_allclose(even.voltage, 1.0, rtol=1e-12)
 
 
-def test_uneven_runs_of_one_clock_share_a_grid():
-    """Of which each costs an exact step of its own."""
+def test_uneven_runs_of_one_clock_share_a_sample_time():
+    """Each sample time needs step matrices of its own."""
     rng = np.random.default_rng(8)
     stamps = [1e-3 * (np.arange(200) + rng.uniform(-0.1, 0.1, 200)) for _ in range(3)]
     runs = [uniform(Recording("r", t, np.ones(200), speed=t)) for t in stamps]
@@ -446,8 +438,8 @@ def test_uneven_runs_of_one_clock_share_a_grid():
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_speed_from_angle(wrapped):
-    """On an even clock the mean speed over every sample, on another one that of the moment."""
+def test_speed_is_computed_from_the_angle(wrapped):
+    """From even samples the mean speed over each, from uneven ones the instantaneous speed."""
     time = 1e-3 * np.arange(400)
     stamps = time + 2e-4 * np.sin(np.arange(400))
 
@@ -466,7 +458,7 @@ def test_speed_from_angle(wrapped):
     np.testing.assert_allclose(uneven.speed[2:-2], speed[2:-2], rtol=1e-4)
 
 
-def test_missing_angles_are_missing_speeds():
+def test_missing_angles_give_missing_speeds():
     time = 1e-3 * np.arange(100)
     angle = 30 * time
     angle[40] = np.nan
@@ -479,8 +471,8 @@ def test_missing_angles_are_missing_speeds():
 # ------------------------------------------------------------------------------ public function
 
 
-def test_simulate_keeps_the_time_stamps_and_starts_where_the_recording_does():
-    """At uneven stamps too, and whatever the caller's precision is."""
+def test_simulate_keeps_the_time_stamps_and_the_initial_state():
+    """Also at uneven stamps, and without a change of JAX's precision."""
     rng, heavy = np.random.default_rng(7), PAPER | {"J": 0.01}
     time = 2.0 + 1e-3 * np.cumsum(rng.uniform(0.9, 1.1, 300))
     run = Recording(
@@ -492,7 +484,7 @@ def test_simulate_keeps_the_time_stamps_and_starts_where_the_recording_does():
     assert (found.current.dtype, found.speed.dtype) == (np.float64, np.float64)
     np.testing.assert_array_equal(found.time, time)
     assert (found.current[0], found.speed[0]) == (4.0, 9.0)
-    A, B = continuous(heavy)
+    A, B = state_space(heavy)
     rest = np.linalg.solve(A, -B @ [12.0, 0.0])
     expected = np.array([rest + linalg.expm(A * (t - time[0])) @ ([4.0, 9.0] - rest) for t in time])
     curvature = heavy["Kt"] / heavy["J"] * 12.0 / heavy["L"]
@@ -500,8 +492,8 @@ def test_simulate_keeps_the_time_stamps_and_starts_where_the_recording_does():
     np.testing.assert_allclose(found.speed, expected[:, 1], rtol=0, atol=curvature * 1e-6 / 8)
 
 
-def test_simulate_takes_plain_numbers():
-    """A motor written down with Python numbers is the natural first thing to try."""
+def test_simulate_accepts_a_motor_of_plain_numbers():
+    """Python numbers instead of arrays."""
     run = recording()
     plain = pmdc_jax.simulate(Motor(**PAPER), run)
     np.testing.assert_array_equal(plain.speed, pmdc_jax.simulate(motor(), run).speed)
@@ -521,7 +513,7 @@ def test_importing_changes_no_setting_and_prints_nothing():
 
 @pytest.mark.parametrize("double", [True, False])
 def test_threads_work_in_the_precision_of_their_caller(double):
-    """JAX keeps it for each thread, and a new one begins with single precision."""
+    """JAX has a setting for each thread, and a new thread begins with single precision."""
     with jax.enable_x64(double):
         found = map_in_threads(lambda k: (k, jnp.arange(k, dtype=float).dtype.itemsize), range(7))
     assert found == [(k, 8 if double else 4) for k in range(7)]

@@ -1,4 +1,4 @@
-"""A speed that is a difference of angles over one sample or two is taken for the mean that it is."""
+"""Speeds that are differences of angles over one sample or two are recognised as means, and simulated as such."""
 
 from __future__ import annotations
 
@@ -20,43 +20,45 @@ from pmdc_jax.identify.noise import quantum
 from pmdc_jax.recording import OVER_BOTH, OVER_LAST, Recording
 
 # a motor that speeds up within a few samples
-QUICK = {"R": 0.5, "L": 0.001, "Kb": 0.05, "Kt": 0.05, "J": 5e-5, "f": 1e-4}
+FAST_MOTOR = {"R": 0.5, "L": 0.001, "Kb": 0.05, "Kt": 0.05, "J": 5e-5, "f": 1e-4}
 LINES = 8000
-# as strong, in steps, as makes a rounded speed as noisy as counts of the last sample are
+# in quantisation steps: makes a rounded speed as noisy as counts of the last sample
 NOISE = 0.5
 
 
 def recorded(kind: str) -> list[Recording]:
-    """Runs with the speed as counts of an encoder give it, or as an ideal tachometer does with noise as large."""
+    """Runs with a speed from encoder counts, or from a tachometer with noise of the same deviation."""
     rng = np.random.default_rng(5)
     runs = {"prbs": prbs(rng, 4.0), "stairs": staircase(4.0)}
     found = []
-    for name, driven in runs.items():
-        read = simulate(Plant(**QUICK), *driven)
-        count = np.floor(read[:, 2] * LINES / (2 * np.pi))
-        speed = np.gradient(count, driven.time) * 2 * np.pi / LINES
+    for name, excitation in runs.items():
+        outputs = simulate(Plant(**FAST_MOTOR), *excitation)
+        count = np.floor(outputs[:, 2] * LINES / (2 * np.pi))
+        speed = np.gradient(count, excitation.time) * 2 * np.pi / LINES
         if kind == "counts of the last sample":
             speed = np.diff(count, prepend=count[0]) * 2 * np.pi / LINES / 1e-3
         if kind == "tachometer":
-            speed = read[:, 1] + np.std(speed - read[:, 1]) * rng.standard_normal(len(speed))
+            speed = outputs[:, 1] + np.std(speed - outputs[:, 1]) * rng.standard_normal(len(speed))
         if kind == "rounded":
             step = 2 * np.pi / LINES / 1e-3
-            speed = step * np.round(read[:, 1] / step + NOISE * rng.standard_normal(len(speed)))
+            speed = step * np.round(outputs[:, 1] / step + NOISE * rng.standard_normal(len(speed)))
         motion = {"speed": speed}
         if kind == "angle alone":
             motion = {"angle": count * 2 * np.pi / LINES}
-        current = read[:, 0] + 0.1 * rng.standard_normal(len(speed))
-        run = Recording(name, driven.time, driven.voltage, current, load=driven.load, **motion)
+        current = outputs[:, 0] + 0.1 * rng.standard_normal(len(speed))
+        run = Recording(
+            name, excitation.time, excitation.voltage, current, load=excitation.load, **motion
+        )
         found.append(run)
     return found
 
 
-OVER = {
+MEAN_OVER = {
     "counts of two samples": "the last and the next sample",
     "counts of the last sample": "the last sample",
     "tachometer": None,
     "rounded": None,
-    "angle alone": None,  # whose differences nobody has to be told of
+    "angle alone": None,  # differentiated by the package, without a message
 }
 
 
@@ -64,34 +66,38 @@ SLOW = {"counts of two samples", "counts of the last sample", "tachometer"}
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(k, marks=pytest.mark.slow) if k in SLOW else k for k in OVER]
+    "kind", [pytest.param(k, marks=pytest.mark.slow) if k in SLOW else k for k in MEAN_OVER]
 )
-def test_a_mean_is_taken_for_what_it_is(kind):
+def test_a_speed_that_is_a_mean_is_recognised(kind):
     found = identify(recorded(kind), tie=[("Kt", "Kb")])
     means = [m for m in found.messages if "is a mean over" in m]
-    assert [f"over {OVER[kind]}," in m for m in means] == [True] * (OVER[kind] is not None)
+    assert [f"over {MEAN_OVER[kind]}," in m for m in means] == [True] * (
+        MEAN_OVER[kind] is not None
+    )
     for name in ("R", "L", "Kb", "J"):
         estimate = found.parameters[name]
-        assert abs(estimate.value - QUICK[name]) < max(3.5 * estimate.stderr, 2e-3 * QUICK[name])
+        assert abs(estimate.value - FAST_MOTOR[name]) < max(
+            3.5 * estimate.stderr, 2e-3 * FAST_MOTOR[name]
+        )
 
 
-def of_a_toy() -> list[Recording]:
+def runs_of_a_toy_motor() -> list[Recording]:
     """A toy motor behind an encoder of twelve lines, read every 20 ms: its mechanical time constant is 11 ms."""
     toy = Plant(R=1.2, L=3e-4, Kb=1.8e-3, Kt=1.8e-3, J=3e-8, f=2e-7)
     rng, step, lines, runs = np.random.default_rng(9), 0.02, 12, []
     for name, offset in (("about zero", 0.0), ("one way", 1.5)):
-        driven = prbs(rng, 10.0, step, amplitude=1.2, offset=offset, hold=0.2)
-        read = simulate(toy, *driven)
-        count = np.floor(read[:, 2] * lines / (2 * np.pi))
+        excitation = prbs(rng, 10.0, step, amplitude=1.2, offset=offset, hold=0.2)
+        outputs = simulate(toy, *excitation)
+        count = np.floor(outputs[:, 2] * lines / (2 * np.pi))
         speed = np.diff(count, prepend=count[0]) * 2 * np.pi / lines / step
-        current = read[:, 0] + 0.02 * rng.standard_normal(len(speed))
-        runs.append(Recording(name, driven.time, driven.voltage, current, speed=speed))
+        current = outputs[:, 0] + 0.02 * rng.standard_normal(len(speed))
+        runs.append(Recording(name, excitation.time, excitation.voltage, current, speed=speed))
     return runs
 
 
-def test_counts_of_a_motor_that_settles_within_a_sample_are_means():
-    """Taken for speeds of the moment they make R half as large again."""
-    found = identify(of_a_toy(), unloaded=True, tie=[("Kt", "Kb")])
+def test_a_mean_is_recognised_if_the_motor_settles_within_a_sample():
+    """Taken for instantaneous speeds, the counts bias R by half of its value."""
+    found = identify(runs_of_a_toy_motor(), unloaded=True, tie=[("Kt", "Kb")])
     assert [m for m in found.messages if "is a mean over the last sample" in m]
     for name, truth in {"R": 1.2, "Kb": 1.8e-3, "J": 3e-8}.items():
         estimate = found.parameters[name]
@@ -99,37 +105,37 @@ def test_counts_of_a_motor_that_settles_within_a_sample_are_means():
 
 
 @pytest.mark.slow
-def test_nothing_is_late_where_a_speed_is_a_mean():
-    """The half of a sample by which such a mean is late was named a delay of the sensor."""
-    found = diagnose(of_a_toy(), unloaded=True, tie=[("Kt", "Kb")])
+def test_a_mean_is_not_diagnosed_as_a_delay_of_the_sensor():
+    """Such a mean lags by half a sample, which used to be named a delay of the sensor."""
+    found = diagnose(runs_of_a_toy_motor(), unloaded=True, tie=[("Kt", "Kb")])
     assert found.verdict == "none_detected"
 
 
-def late(runs: list[Recording], samples: int) -> list[Recording]:
+def delayed(runs: list[Recording], samples: int) -> list[Recording]:
     return [attrs.evolve(r, speed=np.roll(r.speed, samples)) for r in runs]
 
 
 @pytest.mark.slow
-def test_what_is_later_than_a_mean_over_a_sample_is_none():
-    found = identify(late(recorded("tachometer"), 9))
+def test_a_speed_delayed_beyond_a_sample_is_not_taken_for_a_mean():
+    found = identify(delayed(recorded("tachometer"), 9))
     assert not any("mean over" in m for m in found.messages)
 
 
-def test_counts_show_by_their_noise_what_they_are_the_mean_of():
-    """Whatever moves the rotor, as long as it is slow beside the samples."""
+def test_the_averaging_of_counts_is_recognised_by_their_noise():
+    """For any motion that is slow compared with the sampling."""
     rng = np.random.default_rng(3)
     speed = 300 * ndimage.gaussian_filter1d(rng.standard_normal(12000), 20.0)
     counts = np.floor(np.cumsum(speed))
     assert averaging_of_counts([np.diff(counts)]) == (OVER_LAST, -np.inf)
-    mean, enough = averaging_of_counts([counts[2:] - counts[:-2]])
-    assert mean == OVER_BOTH and enough < 0
+    mean, min_gain = averaging_of_counts([counts[2:] - counts[:-2]])
+    assert mean == OVER_BOTH and min_gain < 0
     assert averaging_of_counts([np.round(speed)])[0] is None
-    # noise may be as strong, but is so at all frequencies: the motion itself must tell
-    mean, enough = averaging_of_counts([np.round(speed + NOISE * rng.standard_normal(12000))])
-    assert mean == OVER_LAST and np.isfinite(enough)
+    # noise may have the same power, but at all frequencies: the fit has to confirm the mean
+    mean, min_gain = averaging_of_counts([np.round(speed + NOISE * rng.standard_normal(12000))])
+    assert mean == OVER_LAST and np.isfinite(min_gain)
 
 
-def test_only_differences_over_two_samples_have_nothing_at_the_highest_frequency():
+def test_differences_over_two_samples_are_recognised_by_missing_power_at_the_nyquist_frequency():
     rng = np.random.default_rng(4)
     speed = 300 * ndimage.gaussian_filter1d(rng.standard_normal(4000), 2.0)
     angle = np.cumsum(speed) + rng.standard_normal(4000)
@@ -139,18 +145,19 @@ def test_only_differences_over_two_samples_have_nothing_at_the_highest_frequency
     assert averaging_of_differences([])[0] is None
 
 
-def test_counts_without_a_current_may_be_late_by_an_inductance():
+def test_counts_without_a_current_are_not_taken_for_means():
+    """Their lag may be that of an inductance."""
     runs = [attrs.evolve(r, current=None) for r in recorded("counts of the last sample")]
     assert not any("mean over" in m for m in identify(runs).messages)
 
 
-def test_counts_of_no_whole_number_of_lines_may_be_late_for_any_reason():
+def test_counts_with_a_fractional_number_of_lines_are_not_taken_for_means():
     runs = recorded("counts of the last sample")
-    stretched = [attrs.evolve(r, speed=1.0001 * r.speed) for r in runs]
-    assert not any("mean over" in m for m in identify(stretched).messages)
+    scaled = [attrs.evolve(r, speed=1.0001 * r.speed) for r in runs]
+    assert not any("mean over" in m for m in identify(scaled).messages)
 
 
-def test_steps_of_counts_over_a_time_are_steps():
+def test_the_quantum_of_counts_divided_by_a_sample_time():
     """Divided by a sample time that is no sum of powers of two, equal counts differ by their last bits."""
     rng = np.random.default_rng(1)
     counts = np.cumsum(rng.integers(-3, 4, 3000))
@@ -158,7 +165,7 @@ def test_steps_of_counts_over_a_time_are_steps():
     assert quantum(np.diff(np.gradient(counts, time))) == pytest.approx(0.5 / 7e-4)
 
 
-def test_steps_of_printed_counts_are_known_to_more_digits_than_one_has():
+def test_the_quantum_of_rounded_decimals_is_more_precise_than_each_of_them():
     """Speeds of 2.80848 rad/s a count in seven digits: their smallest difference is 2.8084, and 2762.08 lines."""
     rng = np.random.default_rng(2)
     counts = np.cumsum(rng.integers(-3, 4, 3000)) * 2 * np.pi / 2762 / 8.1e-4
@@ -166,7 +173,7 @@ def test_steps_of_printed_counts_are_known_to_more_digits_than_one_has():
     assert 2 * np.pi / quantum(np.diff(speed)) / 8.1e-4 == pytest.approx(2762, abs=2e-3)
 
 
-def test_counts_printed_in_few_digits_are_counts():
+def test_counts_printed_in_few_digits_are_recognised():
     """Counts of 3.125 rpm in hundredths of it: by one run's largest speeds alone its 1920 lines are 1919.95 or so."""
     for seed in range(10):
         rng = np.random.default_rng(seed)
@@ -174,14 +181,14 @@ def test_counts_printed_in_few_digits_are_counts():
         rpm = np.round(60 / 1920 / 0.01 * counts, 2)
         (found,) = _in_counts([(rpm * 2 * np.pi / 60, 0.01)])
         np.testing.assert_allclose(found, counts, atol=0.01)
-        # ... and a converter's steps are none
+        # steps of a converter are not counts
         assert not _in_counts([(1.0003 * rpm * 2 * np.pi / 60, 0.01)])
 
 
 @pytest.mark.parametrize("known_by", ["angle", "difference"])
-def test_differences_of_angles_are_as_exact_where_steps_bend_the_motion(known_by):
+def test_differences_of_angles_are_exact_despite_voltage_steps(known_by):
     """Exact angles by the matrix exponential, sampled slowly: a spline is off by 0.27 rad/s and more."""
-    plant, step = QUICK | {"L": 3e-4}, 2e-3
+    plant, step = FAST_MOTOR | {"L": 3e-4}, 2e-3
     rng = np.random.default_rng(11)
     voltage = np.repeat(rng.uniform(-12, 12, 60), 25)
     A, B = np.zeros((3, 3)), np.array([[1 / plant["L"]], [0.0], [0.0]])
@@ -203,7 +210,7 @@ def test_differences_of_angles_are_as_exact_where_steps_bend_the_motion(known_by
         assert found.parameters[name].value == pytest.approx(plant[name], rel=2e-3)
 
 
-def test_counts_are_known_as_such_where_a_speed_leaps():
+def test_the_quantum_of_a_speed_that_jumps_by_many_counts():
     """From sample to sample by dozens of counts, hardly ever by one."""
     rng = np.random.default_rng(8)
     step = 2 * np.pi / 4096 / 0.03

@@ -1,4 +1,4 @@
-"""Tuning: what it promises, what it refuses, and how it is told."""
+"""Tuning: the tuned loop, specifications that are refused, and the report."""
 
 from __future__ import annotations
 
@@ -11,27 +11,26 @@ import jax
 import numpy as np
 import pytest
 from attrs import evolve
+from linear_motor import PAPER
 
-from benchmarks import virtual_bench as vb
 from pmdc_jax import InputError, cli, load_controller, load_uncertainty, save_motor, tune
 from pmdc_jax.control.specification import LoopRequirements
 from pmdc_jax.control.tuning import Tuning, robustness
-from pmdc_jax.motor import PARAMETERS, Motor
+from pmdc_jax.motor import Motor
 from pmdc_jax.report.tuning import summary, tuning_json, write_tuning_report
 
-PAPER = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
 MOTOR = Motor(**{name: np.asarray(value) for name, value in PAPER.items()})
 
 
 @cache
 def example() -> Tuning:
-    """PID for every 1 ms, a sample late, on motors with a spread of 5 %."""
+    """A PID controller with samples of 1 ms and a delay of one sample, for motors with a spread of 5 %."""
     limits = {"voltage_limit": 30.0, "current_limit": 150.0}
     return tune(MOTOR, "pid", setpoint=481.0, **limits, speed_step=0.1, spread=0.05, starts=16)
 
 
 @pytest.mark.slow
-def test_the_tuned_loop_comes_close_to_the_limit():
+def test_the_tuned_loop_settles_nearly_as_fast_as_possible():
     found = example()
     assert found.metrics["SettlingTime"] < 1.25 * found.fastest_possible_settling
     assert found.metrics["Overshoot"] <= 1.0
@@ -45,12 +44,12 @@ def test_the_tuned_loop_comes_close_to_the_limit():
     assert second["SettlingTime"] < found.fastest_possible_settling
     small = found.candidates[0].small_step
     assert 0.9 * 24.05 < small["Peak"] < 1.2 * 24.05
-    told = any("a small step of 24.1 rad/s" in message for message in found.messages)
-    assert told == (small["Overshoot"] > 1.2)
+    mentioned = any("a small step of 24.1 rad/s" in message for message in found.messages)
+    assert mentioned == (small["Overshoot"] > 1.2)
 
 
 @pytest.mark.slow
-def test_most_of_the_drawn_motors_do_as_well():
+def test_the_tuned_loop_is_robust_over_drawn_motors():
     ours, textbook = example().candidates
     assert ours.robust.samples == 256
     assert ours.robust.Overshoot_p95 <= 1.0
@@ -61,7 +60,7 @@ def test_most_of_the_drawn_motors_do_as_well():
 
 
 @pytest.mark.slow
-def test_the_json_is_the_contracts(tmp_path):
+def test_json_has_the_documented_keys(tmp_path):
     content = tuning_json(example())
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     assert content["controller"]["type"] == "pid"
@@ -82,7 +81,7 @@ def test_the_json_is_the_contracts(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_report_tells_the_same(tmp_path):
+def test_report_and_summary_state_the_result(tmp_path):
     found, path = example(), tmp_path / "report.html"
     write_tuning_report(found, path)
     page = path.read_text(encoding="utf-8")
@@ -94,19 +93,19 @@ def test_the_report_tells_the_same(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_loop_that_misses_is_said_to_miss():
+def test_a_loop_that_misses_its_specification_is_reported():
     found = example()
     requirements = evolve(found.requirements, max_overshoot=0.0, max_settling=1e-3)
-    missed = evolve(found, requirements=requirements)
-    assert not missed.meets_specification
+    missing = evolve(found, requirements=requirements)
+    assert not missing.meets_specification
     slow = {**found.metrics, "SettlingTime": None}
-    never = evolve(found, candidates=(evolve(found.candidates[0], metrics=slow),))
-    assert "does not settle" in summary(never)[0]
-    assert not never.meets_specification
+    unsettled = evolve(found, candidates=(evolve(found.candidates[0], metrics=slow),))
+    assert "does not settle" in summary(unsettled)[0]
+    assert not unsettled.meets_specification
 
 
 @pytest.mark.parametrize(("sample_time", "noted"), [(1e-3, False), (0.02, True)])
-def test_samples_too_far_apart_are_noted(sample_time, noted):
+def test_slow_sampling_is_noted(sample_time, noted):
     requirements = LoopRequirements(
         "pi", setpoint=481.0, voltage_limit=30.0, sample_time=sample_time
     )
@@ -148,24 +147,22 @@ IMPOSSIBLE = {
 }
 
 
-@pytest.mark.parametrize(("options", "says"), IMPOSSIBLE.values(), ids=IMPOSSIBLE.keys())
-def test_what_cannot_be_is_refused_with_the_number(options, says):
+@pytest.mark.parametrize(("options", "expected"), IMPOSSIBLE.values(), ids=IMPOSSIBLE.keys())
+def test_an_impossible_specification_is_refused_with_its_limit(options, expected):
     with pytest.raises(InputError) as refusal:
         tune(MOTOR, **options)
-    assert says in str(refusal.value)
+    assert expected in str(refusal.value)
     assert refusal.value.mend
 
 
 @pytest.fixture
-def motor_file(tmp_path, monkeypatch):
+def motor_file(tmp_path, monkeypatch, no_terminal):
     save_motor(tmp_path / "motor.json", MOTOR)
     monkeypatch.chdir(tmp_path)
-    for variable in ("FORCE_COLOR", "TTY_COMPATIBLE"):  # rich takes these for a terminal
-        monkeypatch.delenv(variable, raising=False)
     return tmp_path
 
 
-def test_the_command_refuses_in_one_line(motor_file, capsys):
+def test_the_command_refuses_an_impossible_specification_in_one_line(motor_file, capsys):
     arguments = "tune motor.json --controller pid --setpoint 481 --voltage-limit 24"
     assert cli.main(arguments.split()) == 2
     out, err = capsys.readouterr()
@@ -174,14 +171,14 @@ def test_the_command_refuses_in_one_line(motor_file, capsys):
 
 
 @pytest.mark.slow
-def test_the_command_writes_what_it_is_asked_for(motor_file, capsys, monkeypatch):
+def test_the_command_writes_the_requested_files(motor_file, capsys, monkeypatch):
     given = {}
 
-    def fake(motor, requirements, uncertainty, **options):
+    def fake_design(motor, requirements, uncertainty, **options):
         given.update(motor=motor, requirements=requirements, uncertainty=uncertainty, **options)
         return example()
 
-    monkeypatch.setattr(importlib.import_module("pmdc_jax.control.tuning"), "design", fake)
+    monkeypatch.setattr(importlib.import_module("pmdc_jax.control.tuning"), "design", fake_design)
     arguments = (
         "tune motor.json --controller pid --setpoint 481 --voltage-limit 30 --current-limit 60"
         " --sample-time 1e-3 --max-overshoot 0.5 --max-settling 0.2 --load-torque 0.3 --spread 10"
@@ -205,7 +202,7 @@ def test_the_command_writes_what_it_is_asked_for(motor_file, capsys, monkeypatch
 
 
 @pytest.mark.slow
-def test_json_alone_goes_to_standard_output(motor_file, capsys, monkeypatch):
+def test_json_is_all_that_goes_to_standard_output(motor_file, capsys, monkeypatch):
     tuning = importlib.import_module("pmdc_jax.control.tuning")
     monkeypatch.setattr(tuning, "design", lambda *_, **__: example())
     assert cli.main(["tune", "motor.json", "--controller", "pid", "--json", "-"]) == 0

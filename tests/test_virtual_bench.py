@@ -1,4 +1,4 @@
-"""The virtual bench against an adaptive solver, closed forms, conservation, and its own noise."""
+"""The virtual bench against an adaptive solver, closed forms and conservation of energy; statistics of its noise."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ SMOOTH = {
 }
 
 
-def slow_reference(motor, excitation, start):
+def adaptive_reference(motor, excitation, start):
     """solve_ivp at tight tolerances, restarted at every sample because the voltage jumps there."""
 
     def slope(_, x, v, load):
@@ -50,7 +50,7 @@ def test_agrees_with_the_adaptive_reference(effects, dt):
     motor = replace(vb.paper_motor(), **effects)
     excitation = vb.loaded(rng, duration=60 * dt, dt=dt, hold=7 * dt)
     start = (3.0, -20.0, 0.0)
-    expected = slow_reference(motor, excitation, start)
+    expected = adaptive_reference(motor, excitation, start)
     error = np.abs(vb.simulate(motor, excitation, start) - expected).max(0)
     assert np.all(error < 1e-7 * (1 + np.abs(expected).max(0)))
 
@@ -60,7 +60,7 @@ def coasting_motor():
     return replace(vb.paper_motor(), brush_drop_V=5.0, coulomb_Nm=0.05)
 
 
-def test_coasts_as_the_closed_form_says_and_then_sticks_exactly():
+def test_coasting_matches_the_closed_form_and_ends_in_exact_standstill():
     motor, time = coasting_motor(), np.arange(800) * 1e-3
     rest = vb.Excitation(time, 0 * time, 0 * time)
     current, speed, _ = vb.simulate(motor, rest, start=(0.0, 50.0, 0.0)).T
@@ -73,7 +73,7 @@ def test_coasts_as_the_closed_form_says_and_then_sticks_exactly():
     assert np.all(current == 0)
 
 
-def test_breaks_away_at_the_friction_torque_and_not_before():
+def test_breaks_away_exactly_at_the_friction_torque():
     motor = replace(vb.paper_motor(), coulomb_Nm=0.1)
     time = np.arange(2000) * 1e-3
     ramp = vb.Excitation(time, 0.5 * time, 0 * time)
@@ -83,7 +83,7 @@ def test_breaks_away_at_the_friction_torque_and_not_before():
     assert np.all(speed[first:] > 0)
 
 
-def test_a_held_load_keeps_the_rotor_still_only_within_friction():
+def test_a_constant_load_moves_the_rotor_only_beyond_friction():
     motor, time = replace(vb.paper_motor(), coulomb_Nm=0.1), np.arange(100) * 1e-3
     for load, moves in ((0.0999, False), (-0.0999, False), (0.1001, True), (-0.1001, True)):
         speed = vb.simulate(motor, vb.Excitation(time, 0 * time, load + 0 * time))[:, 1]
@@ -101,7 +101,7 @@ def test_conserves_energy():
     def spent(power_before, power_after):
         return dt * float((power_before + power_after).sum()) / 2
 
-    v, load = excitation.voltage[:-1], excitation.load[:-1]  # held, so one-sided at a jump
+    v, load = excitation.voltage[:-1], excitation.load[:-1]  # held over each step
     supplied = spent(v * i[:-1], v * i[1:])
     lost = motor.R * i**2 + motor.f * w**2 + motor.coulomb_Nm * np.abs(w)
     dissipated = spent(lost[:-1], lost[1:]) + spent(load * w[:-1], load * w[1:])
@@ -109,7 +109,7 @@ def test_conserves_energy():
     assert supplied == pytest.approx(dissipated + stored, rel=1e-5)
 
 
-def test_sensor_noise_is_as_asked():
+def test_sensor_noise_is_white_with_the_requested_deviation():
     noise = vb.Noise(current_A=0.2, speed_rad_s=0.7)
     excitation = vb.staircase()
     columns = vb.record(vb.paper_motor(), excitation, np.random.default_rng(4), noise)
@@ -120,7 +120,7 @@ def test_sensor_noise_is_as_asked():
         assert abs(np.corrcoef(residual[1:], residual[:-1])[0, 1]) < 0.05
 
 
-def test_torque_noise_has_its_spread_and_memory():
+def test_torque_noise_has_the_requested_deviation_and_correlation_time():
     noise = vb.Noise(torque_Nm=0.03, torque_correlation_s=0.02)
     excitation = vb.staircase(duration=40.0, dt=1e-2)
     torque = vb.torque_noise(vb.paper_motor(), excitation, np.random.default_rng(5), noise)
@@ -129,13 +129,13 @@ def test_torque_noise_has_its_spread_and_memory():
     assert np.corrcoef(sampled[2:], sampled[:-2])[0, 1] == pytest.approx(np.exp(-1), abs=0.05)
 
 
-def test_quantises_speed():
+def test_speed_is_quantised():
     noise = vb.Noise(speed_quantum_rad_s=0.5)
     columns = vb.record(vb.paper_motor(), vb.staircase(), np.random.default_rng(6), noise)
     assert np.all(columns["speed_rad_s"] % 0.5 == 0)
 
 
-def test_standard_case_is_seeded_and_has_its_size():
+def test_standard_runs_are_reproducible_and_have_33_000_samples():
     for all_at_1_ms in (False, True):
         first, second = (
             vb.standard_runs(np.random.default_rng(7), all_at_1_ms=all_at_1_ms) for _ in range(2)
@@ -147,7 +147,7 @@ def test_standard_case_is_seeded_and_has_its_size():
                 np.testing.assert_array_equal(first[name][column], second[name][column])
 
 
-def test_writes_what_it_recorded(tmp_path):
+def test_the_csv_file_holds_the_recorded_columns(tmp_path):
     excitation = vb.staircase(duration=0.1)
     columns = vb.record(vb.paper_motor(), excitation, np.random.default_rng(8))
     vb.write_csv(tmp_path / "run.csv", columns)

@@ -1,1 +1,1 @@
-"""Naming benchmark: motors with hidden effects, made without pmdc_jax, and what is said of them."""
+"""Naming benchmark: motors with hidden effects, simulated without pmdc_jax, and the diagnoses of them."""

@@ -1,7 +1,7 @@
 """Run the naming benchmark: `python -m benchmarks.naming --suite singles --cases 17`.
 
-Each case's result is appended to a file of JSON lines as soon as it is there; cases that are in the
-file already are not run again, so that an interrupted run continues. `--dump DIR` writes the CSV
+Each result is appended to a file of JSON lines at once; cases that are in the file already are not
+run again, so that an interrupted run continues. `--dump DIR` writes the CSV
 files of the cases instead, for `pmdc diagnose DIR/singles-0/*.csv --holdout ...`.
 """
 
@@ -37,7 +37,7 @@ SIZES = {
 
 
 def arguments() -> argparse.Namespace:
-    """What was asked for."""
+    """The options of the command line."""
     parser = argparse.ArgumentParser(prog="benchmarks.naming", description=__doc__)
     parser.add_argument("--suite", nargs="+", choices=SUITES, default=list(SUITES))
     parser.add_argument("--cases", type=int, help="cases of each suite (default: all)")
@@ -50,12 +50,12 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def wanted(asked: argparse.Namespace) -> list[tuple[str, int]]:
-    """The cases asked for."""
+def wanted(options: argparse.Namespace) -> list[tuple[str, int]]:
+    """Suite and index of each requested case."""
     return [
         (suite, index)
-        for suite in asked.suite
-        for index in range(asked.first, asked.first + (asked.cases or SIZES[suite]))
+        for suite in options.suite
+        for index in range(options.first, options.first + (options.cases or SIZES[suite]))
     ]
 
 
@@ -72,7 +72,7 @@ def read_results(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def answer(method: str, made: Case) -> dict[str, Any]:
-    """The method's answer; a crash is an answer too, a bad one."""
+    """The answer of the method; an exception counts as the answer "error"."""
     try:
         return METHODS[method](made.runs, made.holdout)
     except Exception as error:
@@ -116,25 +116,25 @@ def dump_case(folder: Path, made: Case) -> None:
 
 
 def main() -> None:
-    """Run what is missing and print the tables."""
-    asked, console = arguments(), Console(width=200)
-    if asked.dump:
-        for suite, index in wanted(asked):
-            dump_case(asked.dump, case(suite, index, asked.seeds))
+    """Run the cases without a result and print the tables."""
+    options, console = arguments(), Console(width=200)
+    if options.dump:
+        for suite, index in wanted(options):
+            dump_case(options.dump, case(suite, index, options.seeds))
         return
-    path = asked.out or OUT / f"naming-{asked.method}-{asked.seeds}.jsonl"
+    path = options.out or OUT / f"naming-{options.method}-{options.seeds}.jsonl"
     path.parent.mkdir(parents=True, exist_ok=True)
     results = read_results(path)
-    for suite, index in () if asked.show else wanted(asked):
+    for suite, index in () if options.show else wanted(options):
         if f"{suite}/{index}" in results:
             continue
-        result = run(asked.method, asked.seeds, case(suite, index, asked.seeds))
+        result = run(options.method, options.seeds, case(suite, index, options.seeds))
         results[result["key"]] = result
         with path.open("a", encoding="utf-8") as lines:
             lines.write(json.dumps(result) + "\n")
         done = f"{result['key']} {result['detail']} ({result['noise']}): {outcome_of(result)}"
         print(f"{done}, {result['seconds']:.1f} s", file=sys.stderr, flush=True)
-    shown = {f"{suite}/{index}" for suite, index in wanted(asked)}
+    shown = {f"{suite}/{index}" for suite, index in wanted(options)}
     for table in all_tables([r for key, r in results.items() if key in shown]):
         console.print(table)
 

@@ -1,21 +1,21 @@
-"""Cases by seed: a motor about the paper's, what is hidden in it, its runs and its noise.
+"""Cases by seed: a motor about the paper's, its hidden effects, runs and noise.
 
 The suites:
 
-    singles       each effect at clear strength; white, coloured (two memories), quantised noise
+    singles       each effect at clear strength; white, coloured (two correlation times), quantised noise
     strengths     each effect from 0.3 to 20 times its smallest detectable amplitude
     nulls         no effect, the four kinds of noise
     pairs         two effects at clear strength, the four kinds of noise
-    formulas      an effect by another law than the library's: the same name is expected
-    outside       something no library has: not_in_library or ambiguous is expected
-    blind         excitation that cannot tell: only an asserted wrong name is a mistake
-    noise_sweep   each effect at 0.1, 0.5, 1, 2.5, 5 % noise, of the spread of each signal
-    rough         singles with pulses at the bridge, an uneven clock, unequal noise in every run
+    formulas      an effect with another formula than the library's: the same name is expected
+    outside       an effect outside the library: not_in_library or ambiguous is expected
+    blind         excitation that cannot distinguish effects: only an asserted wrong name is a mistake
+    noise_sweep   each effect with noise of 0.1, 0.5, 1, 2.5, 5 % of the spread of each signal
+    rough         singles with PWM, an uneven clock, and different noise in every run
     foreign       no effect or one, in motors, drives and sensors of all kinds (see `foreign`)
     foreign_pairs two effects in those
 
-Two sets of seeds: methods are tuned on `tuning`, figures are reported on `report`. Both were fixed
-before anything was tuned. Sample k of every suite is the same whatever else is asked for.
+Two sets of seeds: methods are tuned on `tuning`, results are reported on `report`. Both were fixed
+before anything was tuned. Case k of a suite does not depend on what other cases are run.
 """
 
 from __future__ import annotations
@@ -43,17 +43,18 @@ SETS = {"tuning": 20_251, "report": 70_912}
 NOISES = ("white", "coloured_fast", "coloured_slow", "quantised")
 SWEEP_PERCENT = (0.1, 0.5, 1.0, 2.5, 5.0)
 VISIBLE = (0.3, 0.6, 1.0, 1.5, 2.5, 5.0, 10.0, 20.0)
-CLEAR = (1.45, 20.0)  # baseline residual over noise; 1.3 at least where amplitudes are met roughly
+# range of the baseline residual over noise; at least 1.3 in fact, for amplitudes are set approximately
+CLEAR = (1.45, 20.0)
 UNLOADED = {"load_torque_Nm": 0.0}
 
 
 @dataclass(frozen=True)
 class Case:
-    """One case: what is given to a method, and the truth.
+    """One case: the data for a method, and the truth.
 
-    `expected` is what an honest method answers: "named", "none_detected", "outside" (then
-    not_in_library or ambiguous), or "blind" (then anything but a wrong name). `effects` are the true
-    parameters by name; a stranger is in `stranger` instead. `response` is how much shows.
+    `expected` is the right answer: "named", "none_detected", "outside" (then not_in_library or
+    ambiguous), or "blind" (then anything but a wrong name). `effects` are the true parameters by
+    name; an effect outside the library is in `stranger` instead. `response` measures its strength.
     """
 
     suite: str
@@ -77,7 +78,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Bench:
-    """How the runs are recorded: sensors and torque noise by run, pulses, an uneven clock.
+    """How the runs are recorded: noise of sensors and torque by run, PWM, an uneven clock.
 
     Sensors may have noise on the voltage, round voltage and current, count the lines of an encoder, or read the angle
     by lines and no speed.
@@ -106,14 +107,14 @@ def _disturbance(rng: Generator, samples: int, steps: int, dt: float, noise: Noi
 
 
 def _begin(plant: Plant, rng: Generator) -> tuple[Plant, dict[str, float]]:
-    """Where a run happens to begin: anywhere in the turn, the play and a foreign machine's cycle."""
+    """A random start of a run: anywhere in the turn, in the backlash and in the cycle of an external torque."""
     angle, twist, phase = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(-0.5, 0.5), rng.uniform()
     later = plant._replace(shake_phase=plant.shake_phase + 2.0 * math.pi * phase)
     return later, {"angle": angle, "twist": twist * plant.gap_rad}
 
 
 def record(plant: Plant, excitation: Excitation, rng: Generator, noise: Noise, bench: Bench):
-    """Run the motor and measure."""
+    """Simulate the motor and measure."""
     plant, start = _begin(plant._replace(pwm_Hz=bench.pwm_Hz), rng)
     excitation = jittered(excitation, rng, bench.jitter)
     dt = float(np.median(np.diff(excitation.time)))
@@ -145,13 +146,13 @@ def _rounded(values, quantum: float):
 
 
 def _counted(time, angle, lines: float):
-    """Lines passed from the sample before to the one after, as a speed."""
+    """The speed by the count of lines from the last to the next sample."""
     count = np.floor(angle * lines / (2 * math.pi))
     return np.gradient(count, time) * 2 * math.pi / lines
 
 
 def drawn_noise(rng: Generator, kind: str) -> Noise:
-    """Sensors within a factor of two of the usual, and what else the kind says."""
+    """Noise of sensors within a factor of two of the usual, and further noise by kind."""
     current, speed = log_uniform(rng, 0.05, 0.2), log_uniform(rng, 0.25, 1.0)
     torque, quantum = log_uniform(rng, 0.003, 0.02), log_uniform(rng, 0.5, 3.0)
     if kind == "quantised":
@@ -187,20 +188,20 @@ def _ideal(plant: Plant, excitations: Excitations) -> list[Outputs]:
 
 @dataclass(frozen=True)
 class Tuner:
-    """Sets the amplitude of hidden things in one motor, driven and measured in one way."""
+    """Sets the amplitudes of hidden effects in one motor with given excitations and noise."""
 
     plant: Plant
     excitations: Excitations
     noise: tuple[float, float]
 
     def __post_init__(self):
-        """Simulate once what every response is compared with."""
+        """Simulate the reference of all responses once."""
         training = {n: e for n, e in self.excitations.items() if n != HOLDOUT}
         object.__setattr__(self, "gauge", Gauge(self.plant, training, self.noise))
         object.__setattr__(self, "without", _ideal(self.plant, self.excitations))
 
     def response(self, plant: Plant) -> Response:
-        """How much the plant differs from the one without effects."""
+        """How much the outputs of the plant differ from those without effects."""
         pairs = zip(_ideal(plant, self.excitations), self.without, strict=True)
         return self.gauge([a - b for a, b in pairs])
 
@@ -234,7 +235,7 @@ def _clear(rng: Generator, low: float = CLEAR[0], high: float = CLEAR[1]) -> flo
 
 @dataclass(frozen=True)
 class Plan:
-    """What a suite asks for in one case: noise, excitation, and amplitudes of hidden things."""
+    """The specification of one case: noise, excitation, and amplitudes of hidden effects."""
 
     noise: str
     expected: str
@@ -243,11 +244,11 @@ class Plan:
     of: Callable[[Response], float] = _peak
     detail: str = ""
     drive: Callable[[Generator], Excitations] = standard
-    percent: float | None = None  # noise of that share of each signal instead of a drawn one
+    percent: float | None = None  # noise in % of each signal, instead of random noise
     rough: bool = False
     load_known: bool = True
-    plant: Plant | None = None  # in place of one about the paper's
-    noises: Noise | None = None  # in place of a drawn one
+    plant: Plant | None = None  # instead of one about the paper's
+    noises: Noise | None = None  # instead of a random one
     sensors: Mapping[str, float] = field(default_factory=dict)  # fields of `Bench`
 
 
@@ -328,31 +329,31 @@ def build(suite: str, index: int, plan: Plan, rng: Generator) -> Case:
 # ------------------------------------------------------------------------------------------- suites
 
 
-def _turn(values, index: int):
-    """One of the values, and how often all of them had been used."""
+def _cycled(values, index: int):
+    """The value at this index when cycling through them, and the number of complete cycles before."""
     values = tuple(values)
     return values[index % len(values)], index // len(values)
 
 
 def _single(index: int, rng: Generator) -> Plan:
-    name, turn = _turn(NAMES, index)
-    noise, _ = _turn(NOISES, turn)
+    name, turn = _cycled(NAMES, index)
+    noise, _ = _cycled(NOISES, turn)
     return Plan(noise, "named", (LIBRARY[name],), (_clear(rng),), detail=name)
 
 
 def _strength(index: int, rng: Generator) -> Plan:
-    name, turn = _turn(NAMES, index)
-    visible, turn = _turn(VISIBLE, turn)
-    noise, _ = _turn(("white", "coloured_fast"), turn)
+    name, turn = _cycled(NAMES, index)
+    visible, turn = _cycled(VISIBLE, turn)
+    noise, _ = _cycled(("white", "coloured_fast"), turn)
     detail = f"{name} x{visible:g}"
     return Plan(noise, "named", (LIBRARY[name],), (visible,), _visible, detail)
 
 
 def _null(index: int, rng: Generator) -> Plan:
-    return Plan(_turn(NOISES, index)[0], "none_detected")
+    return Plan(_cycled(NOISES, index)[0], "none_detected")
 
 
-# pairs that are not two effects: one contains or replaces the other, or both are one spring
+# pairs that are not two effects: one contains or replaces the other, or both are the same spring
 NO_PAIRS = (
     {"coulomb_friction", "stribeck_friction"},
     {"coulomb_friction", "asymmetric_friction"},
@@ -370,7 +371,7 @@ def _two_names(rng: Generator) -> tuple[str, ...]:
 
 
 def _pair(index: int, rng: Generator) -> Plan:
-    noise, _ = _turn(NOISES, index)
+    noise, _ = _cycled(NOISES, index)
     names = _two_names(rng)
     wanted = tuple(_clear(rng, 1.5, 8.0) for _ in names)
     hidden = tuple(LIBRARY[n] for n in names)
@@ -378,14 +379,14 @@ def _pair(index: int, rng: Generator) -> Plan:
 
 
 def _formula(index: int, rng: Generator) -> Plan:
-    label, turn = _turn(FORMULAS, index)
-    noise, _ = _turn(NOISES, turn)
+    label, turn = _cycled(FORMULAS, index)
+    noise, _ = _cycled(NOISES, turn)
     return Plan(noise, "named", (FORMULAS[label],), (_clear(rng, CLEAR[0], 10.0),), detail=label)
 
 
 def _outside(index: int, rng: Generator) -> Plan:
-    label, turn = _turn(STRANGERS, index)
-    noise, _ = _turn(NOISES, turn)
+    label, turn = _cycled(STRANGERS, index)
+    noise, _ = _cycled(NOISES, turn)
     return Plan(noise, "outside", (STRANGERS[label],), (_clear(rng, CLEAR[0], 10.0),), detail=label)
 
 
@@ -395,15 +396,15 @@ _BLIND_ROWS = tuple(
 
 
 def _blind(index: int, rng: Generator) -> Plan:
-    (label, drive, name), turn = _turn(_BLIND_ROWS, index)
-    noise, _ = _turn(NOISES, turn)
+    (label, drive, name), turn = _cycled(_BLIND_ROWS, index)
+    noise, _ = _cycled(NOISES, turn)
     detail, hidden = f"{label}: {name}", (LIBRARY[name],)
     return Plan(noise, "blind", hidden, (_clear(rng, 1.1, 5.0),), detail=detail, drive=drive)
 
 
 def _noise_sweep(index: int, rng: Generator) -> Plan:
-    percent, turn = _turn(SWEEP_PERCENT, index)
-    name, _ = _turn(NAMES, turn)
+    percent, turn = _cycled(SWEEP_PERCENT, index)
+    name, _ = _cycled(NAMES, turn)
     share = 100.0 * log_uniform(rng, 0.01, 0.05) / percent  # of the signal, in noise
     detail = f"{name} {percent:g} %"
     return Plan("white", "named", (LIBRARY[name],), (share,), detail=detail, percent=percent)
@@ -414,18 +415,18 @@ def _rough(index: int, rng: Generator) -> Plan:
 
 
 def _foreign(index: int, rng: Generator) -> Plan:
-    name, turn = _turn((None, *NAMES), index)
-    kind, _ = _turn(foreign.SENSORS, index + turn)
+    name, turn = _cycled((None, *NAMES), index)
+    kind, _ = _cycled(foreign.SENSORS, index + turn)
     return _in_foreign(rng, kind, (name,) if name else ())
 
 
 def _foreign_pair(index: int, rng: Generator) -> Plan:
-    kind, _ = _turn(foreign.SENSORS, index)
+    kind, _ = _cycled(foreign.SENSORS, index)
     return _in_foreign(rng, kind, _two_names(rng))
 
 
 def _in_foreign(rng: Generator, kind: str, names: tuple[str, ...]) -> Plan:
-    """Effects in a foreign motor with a kind of sensors, or with ordinary ones if those cannot have the effects."""
+    """Effects in a foreign motor with a kind of sensors, or with ordinary ones if the effects need them."""
     if kind in foreign.WITHOUT_SPEED_SENSOR and set(names) & set(foreign.OF_SPEED_SENSOR):
         kind = foreign.SENSORS[0]
     plant = foreign.motor(rng)

@@ -1,4 +1,4 @@
-"""What the motors are driven with: the standard runs, and runs that cannot tell effects apart."""
+"""Excitations of the motors: the standard runs, and runs that cannot distinguish some effects."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _held(levels: NDArray[np.float64], duration: float, dt: float = 1e-3) -> Exc
 
 
 def fast_steps(rng: Generator, duration: float = 4.0, amplitude: float = 16.0) -> Excitation:
-    """Levels in both directions and shorted rests, changed every 0.1 s; ends at rest."""
+    """Levels in both directions and pauses at zero voltage, changed every 0.1 s; ends at rest."""
     levels = rng.choice([-1.0, -0.6, -0.3, 0.0, 0.0, 0.3, 0.6, 1.0], round(duration / 0.1))
     levels[:2], levels[-4:] = 0.0, 0.0
     return _held(amplitude * levels, duration)
@@ -43,7 +43,7 @@ def standard(rng: Generator) -> Excitations:
     }
 
 
-# -------------------------------------------------------------------- excitation that cannot tell
+# ---------------------------------------------------------- excitations that cannot distinguish effects
 
 
 def _times(rng: Generator, count: int, make: Callable[[], Excitation]) -> Excitations:
@@ -52,7 +52,7 @@ def _times(rng: Generator, count: int, make: Callable[[], Excitation]) -> Excita
 
 
 def one_way(rng: Generator) -> Excitations:
-    """Forward only and never slow: what opposes forward motion is all one."""
+    """Forward only and never slow: all torques that oppose forward motion look the same."""
 
     def make() -> Excitation:
         return _held(rng.uniform(10.0, 16.0, 20), 4.0)
@@ -61,7 +61,7 @@ def one_way(rng: Generator) -> Excitations:
 
 
 def one_speed(rng: Generator) -> Excitations:
-    """Small moves about one working point."""
+    """Small changes about one operating point."""
 
     def make() -> Excitation:
         return vb.prbs(rng, duration=4.0, amplitude=0.5, offset=12.0, hold=0.05)
@@ -70,7 +70,7 @@ def one_speed(rng: Generator) -> Excitations:
 
 
 def slow_drives(rng: Generator) -> Excitations:
-    """Below a hertz: a lag is a delay."""
+    """Below 1 Hz a lag looks like a delay."""
 
     def make() -> Excitation:
         time = np.arange(4000) * 1e-3
@@ -82,7 +82,7 @@ def slow_drives(rng: Generator) -> Excitations:
 
 
 def fast_reversals(rng: Generator) -> Excitations:
-    """Full speed either way, through zero at once: dry friction shows its level, not its shape."""
+    """Full speed in either direction, with fast zero crossings: they show the level of dry friction, not its shape."""
 
     def make() -> Excitation:
         signs = np.where(np.arange(8) % 2 == 0, 1.0, -1.0)
@@ -92,7 +92,7 @@ def fast_reversals(rng: Generator) -> Excitations:
 
 
 def motoring(rng: Generator) -> Excitations:
-    """Slow ramps both ways, never braking: brushes and a dead zone take the same volts."""
+    """Slow ramps in both directions, never braking: brushes and a dead zone reduce the voltage alike."""
 
     def make() -> Excitation:
         wave = vb.slow_triangle(duration=4.0, amplitude=rng.uniform(12.0, 18.0), period=8.0)
@@ -102,7 +102,7 @@ def motoring(rng: Generator) -> Excitations:
 
 
 def one_amplitude(rng: Generator) -> Excitations:
-    """The same small square wave again and again: play and a soft shaft ring alike."""
+    """The same small square wave repeatedly: backlash and a compliant shaft ring alike."""
 
     def make() -> Excitation:
         return _held(np.where(np.arange(10) % 2 == 0, 3.0, 5.0), 4.0)
@@ -110,7 +110,7 @@ def one_amplitude(rng: Generator) -> Excitations:
     return _times(rng, 4, make)
 
 
-# where each excitation cannot tell: the effects hidden in it, one a case
+# for each excitation the effects that it cannot distinguish, of which one is hidden per case
 BLIND: Mapping[str, tuple[Callable[[Generator], Excitations], tuple[str, ...]]] = {
     "one_way": (one_way, ("coulomb_friction", "constant_load", "asymmetric_friction")),
     "one_speed": (one_speed, ("coulomb_friction", "current_sensor_offset", "brush_voltage_drop")),
@@ -122,7 +122,7 @@ BLIND: Mapping[str, tuple[Callable[[Generator], Excitations], tuple[str, ...]]] 
 
 
 def jittered(excitation: Excitation, rng: Generator, share: float) -> Excitation:
-    """The same held inputs on an uneven clock: each time is off by that share of an interval."""
+    """The same held inputs on an uneven clock: each time has jitter of that share of an interval."""
     if not share:
         return excitation
     interval = float(np.diff(excitation.time).mean())

@@ -1,7 +1,7 @@
-"""Motors, drives and sensors of all kinds, far from the paper's: 6 to 48 V, 3 to 80 A, 0.2 to 5 ms a sample.
+"""Motors, drives and sensors of all kinds, far from the paper's: 6 to 48 V, 3 to 80 A, samples of 0.2 to 5 ms.
 
-Effects are drawn relative to the motor they are in. Few runs, some of a speed loop whose rough voltage the motor
-feels; sensors that count, round, measure the angle alone, or put noise on the voltage, which it does not feel.
+Effects are drawn relative to their motor. Few runs, some of a speed loop with a noisy voltage that acts on the motor;
+sensors that count, round, measure only the angle, or add noise to the recorded voltage, which does not act on it.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ SENSORS = ("ordinary", "encoder", "noisy_voltage", "converter", "angle")
 # an encoder has neither
 OF_SPEED_SENSOR = ("speed_sensor_lag", "speed_sensor_delay")
 WITHOUT_SPEED_SENSOR = ("encoder", "angle")
-COUNT = 0.01  # of the largest speed is what one line of an encoder makes
+LINE_SHARE = 0.01  # of the largest speed is one line of an encoder per sample
 SAMPLE_TIMES = (2e-4, 5e-4, 1e-3, 2e-3, 5e-3)
 Voltage = Callable[[Generator, "Size", NDArray[np.float64]], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
 class Size:
-    """What is large for a motor, and slow."""
+    """Scales of a motor: its largest speed, current and torque, and its time constant."""
 
     volt: float
     speed: float  # without load, rad/s
@@ -41,7 +41,7 @@ class Size:
 
     @classmethod
     def of(cls, plant: Plant) -> Size:
-        """That of a motor on its supply."""
+        """The scales of a motor at its supply voltage."""
         stall = plant.bus_V / plant.R
         slow = plant.J * plant.R / plant.Kb / plant.Kt
         return cls(plant.bus_V, plant.bus_V / plant.Kb, stall, plant.Kt * stall, slow)
@@ -61,7 +61,7 @@ def motor(rng: Generator) -> Plant:
 
 
 def sample_time(rng: Generator, plant: Plant, kind: str) -> float:
-    """One that a careful engineer might choose for the motor: the speed of an encoder is a mean over two samples."""
+    """A reasonable sample time for the motor: the speed of an encoder is a mean over two samples."""
     longest = Size.of(plant).mechanical_s / (32 if kind == "encoder" else 8)
     return float(f"{min(rng.choice(SAMPLE_TIMES), longest):.1g}")
 
@@ -80,7 +80,7 @@ def _two_levels(rng: Generator, size: Size, time):
 
 
 def _held(rng: Generator, size: Size, time) -> tuple[int, NDArray[np.int64]]:
-    """How many levels, and which one when."""
+    """The number of levels, and the index of the level at each sample."""
     hold = max(2.0 * time[1], size.mechanical_s * rng.uniform(0.3, 1.5))
     held = (time / hold + 1e-6).astype(int)
     return int(held[-1]) + 1, held
@@ -109,7 +109,7 @@ def _staircase(rng: Generator, size: Size, time):
 
 
 def _speed_loop(rng: Generator, size: Size, time):
-    """The voltage of a PI loop about a motor of first order, which answers to a noisy speed."""
+    """The voltage of a PI loop around a first-order motor, which reacts to a noisy speed."""
     dt, per_speed = time[1], size.volt / size.speed
     wanted = 0.6 * size.speed * _eight_levels(rng, len(time))
     speed, sum_of_errors, voltage = 0.0, 0.0, np.empty(len(time))
@@ -123,7 +123,7 @@ def _speed_loop(rng: Generator, size: Size, time):
 
 
 def _eight_levels(rng: Generator, samples: int) -> NDArray[np.float64]:
-    """One after another, between -1 and 1."""
+    """Eight random levels between -1 and 1, one after another."""
     return np.repeat(rng.uniform(-1.0, 1.0, 8), -(-samples // 8))[:samples]
 
 
@@ -161,9 +161,9 @@ def excitations(rng: Generator, plant: Plant, kind: str) -> Excitations:
 
 
 def noise(rng: Generator, plant: Plant, kind: str) -> Noise:
-    """That of good sensors, or the rounding of an encoder, and in every third case a torque that fluctuates."""
+    """Noise of good sensors, or the rounding of an encoder, and in every third case torque noise."""
     size = Size.of(plant)
-    of_speed = COUNT / math.sqrt(6.0) if kind == "encoder" else 0.002
+    of_speed = LINE_SHARE / math.sqrt(6.0) if kind == "encoder" else 0.002
     shaken = 0.006 * size.torque * float(rng.random() < 1 / 3)
     memory = size.mechanical_s * log_uniform(rng, 0.1, 1.0)
     good = {"torque_Nm": shaken, "torque_correlation_s": memory}
@@ -171,11 +171,11 @@ def noise(rng: Generator, plant: Plant, kind: str) -> Noise:
 
 
 def sensors(kind: str, plant: Plant, driven: Excitation) -> dict[str, float]:
-    """What else a kind of sensors does, as fields of `Bench`."""
+    """Further properties of a kind of sensors, as fields of `Bench`."""
     size, dt = Size.of(plant), float(driven.time[1])
     return {
         "ordinary": {},
-        "encoder": {"encoder_lines": round(math.pi / (COUNT * size.speed * dt))},
+        "encoder": {"encoder_lines": round(math.pi / (LINE_SHARE * size.speed * dt))},
         "angle": {"angle_lines": 4096.0},
         "noisy_voltage": {"voltage_V": 0.004 * size.volt},
         "converter": {
@@ -189,7 +189,7 @@ def sensors(kind: str, plant: Plant, driven: Excitation) -> dict[str, float]:
 
 
 def _share(field: str, low: float, high: float, of: Callable[[Size], float]):
-    """A field between shares of what is large."""
+    """A field drawn between two shares of a scale of the motor."""
     return lambda rng, plant: {field: log_uniform(rng, low, high) * of(Size.of(plant))}
 
 
@@ -230,7 +230,7 @@ def _heating(rng: Generator, plant: Plant) -> Parameters:
 
 
 def _shaft(rng: Generator, plant: Plant) -> Parameters:
-    """One that rings within reach of most of the sample times."""
+    """A shaft whose resonance most of the sample times resolve."""
     rate = 2 * math.pi * log_uniform(rng, 0.6, 2.0) / Size.of(plant).mechanical_s
     share = rng.uniform(0.3, 0.7)
     reduced = plant.J * share * (1 - share)
@@ -268,5 +268,5 @@ _DRAWS: Mapping[str, Callable[[Generator, Plant], Parameters]] = {
 EFFECTS: dict[str, Hidden] = {
     name: replace(LIBRARY[name], draw=draw) for name, draw in _DRAWS.items()
 }
-# beyond that hardly any inductance would be left
+# beyond that hardly any inductance would remain
 EFFECTS["inductance_saturation"] = replace(EFFECTS["inductance_saturation"], limits=(1e-4, 1.0))

@@ -1,7 +1,7 @@
-"""What may be hidden in a motor: the seventeen effects, other formulas of them, and strangers.
+"""Effects that may be hidden in a motor: the seventeen of the library, other formulas of them, and strangers.
 
-`LIBRARY` has the effects by their names in the contract. `FORMULAS` are the same effects by another
-law, to be called by the same name. `STRANGERS` are in no library.
+`LIBRARY` has the effects by their documented names. `FORMULAS` are the same effects with other
+formulas, to be named the same. `STRANGERS` are effects outside the library.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ Parameters = dict[str, float]
 
 @dataclass(frozen=True)
 class Hidden:
-    """One thing that may be hidden.
+    """An effect that may be hidden.
 
-    `draw` gives parameters at a middling amplitude; an amplitude factor multiplies those named in
+    `draw` gives parameters at a medium amplitude; an amplitude factor multiplies those named in
     `scaled` and divides those in `inverse`. `fields` turns parameters into constants of the plant.
     `limits` are the factors within which the effect remains physical.
     """
 
     label: str
-    name: str | None  # what it should be called; None: it has no name in the library
+    name: str | None  # its name in the library; None for a stranger
     draw: Callable[[Generator, Plant], Parameters]
     fields: Callable[[Parameters], Parameters]
     scaled: tuple[str, ...]
@@ -54,7 +54,7 @@ def _phase(rng: Generator) -> float:
 
 
 def _renamed(**names: str) -> Callable[[Parameters], Parameters]:
-    """Parameters that only have another name in the plant: field = parameter."""
+    """Renames parameters to fields of the plant: field = parameter."""
     return lambda p: {field: p[name] for field, name in names.items()}
 
 
@@ -101,7 +101,7 @@ def _signed(draw: Callable[[Generator, Plant], Parameters], name: str):
 def _coupling_draw(
     rng: Generator, plant: Plant, hertz: tuple[float, float], damped: tuple[float, float]
 ) -> Parameters:
-    """A spring by its resonance, the two inertias against each other, and its damping ratio."""
+    """A spring with a given resonance of the two inertias against each other, and damping ratio."""
     share, ratio = rng.uniform(0.3, 0.7), log_uniform(rng, *damped)
     reduced, speed = plant.J * share * (1.0 - share), 2.0 * math.pi * log_uniform(rng, *hertz)
     damping = 2.0 * ratio * reduced * speed
@@ -113,7 +113,7 @@ def _compliance_draw(rng: Generator, plant: Plant) -> Parameters:
 
 
 def _backlash_draw(rng: Generator, plant: Plant) -> Parameters:
-    """Teeth so stiff that it is the play that shows, not their spring."""
+    """Teeth so stiff that the backlash matters, not their compliance."""
     contact = _coupling_draw(rng, plant, (500.0, 900.0), (0.3, 0.8))
     return contact | {"gap_rad": log_uniform(rng, 0.01, 0.1)}
 
@@ -233,7 +233,7 @@ NAMES = tuple(LIBRARY)
 
 
 def _variant(label: str, name: str, also: Callable[[Generator], Parameters]) -> Hidden:
-    """An effect of the library with further constants of the plant, named as there."""
+    """An effect of the library with further constants of the plant, and the same name."""
     row = LIBRARY[name]
 
     def draw(rng: Generator, plant: Plant) -> Parameters:
@@ -323,7 +323,8 @@ def _seizing_draw(rng: Generator, plant: Plant) -> Parameters:
 
 
 def _eccentric_draw(rng: Generator, plant: Plant) -> Parameters:
-    gear = float(rng.integers(5, 30) + rng.uniform(0.2, 0.8))  # never a whole period a turn
+    # never a whole number of periods per turn
+    gear = float(rng.integers(5, 30) + rng.uniform(0.2, 0.8))
     return {"eccentric_Nm": 0.05, "eccentric_gear": gear, "eccentric_phase": _phase(rng)}
 
 

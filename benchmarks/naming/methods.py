@@ -33,7 +33,7 @@ def _recordings(runs: Runs):
 
 
 def _with_speed(method: Callable[[Runs, Runs], Answer]) -> Callable[[Runs, Runs], Answer]:
-    """A method that knows no angle, given its differences where no speed was measured."""
+    """A method that does not use the angle, given differences of it if no speed was measured."""
 
     def speed(columns: Columns) -> Columns:
         if "speed_rad_s" in columns:

@@ -1,4 +1,4 @@
-"""A motor with every effect of the library, others outside it, and an integrator of its own.
+"""A motor with all effects of the library and others outside it, and its own integrator.
 
     L(i) di/dt    = u - R (1 + x1 + x2) i - e(theta) Kb w - brush(i)
     J_m dw/dt     = Kt(i, theta) i - f w - drag - cogging(theta) - friction(w, t) - coupling
@@ -6,9 +6,9 @@
     tau dx/dt     = rise P - x,  P the copper loss           relative rise of resistance
     lag dy/dt     = w - y,  speed read at t_k is y(t_k - delay)
 
-Integration is RK4 in 20 or more fine steps a sample. Dry friction and the brush drop are
-set-valued: at zero speed (zero current) they take whatever value within their level holds it
-there, and entering or leaving that state is located in time by bisection. Row k of a record is the
+Integration is RK4 in 20 or more fine steps per sample. Dry friction and the brush drop are
+set-valued: at zero speed (zero current) they take the value within their level that keeps it
+there, and the times of entering or leaving that state are found by bisection. Row k of a record is the
 state at t_k, before the voltage of row k acts; that voltage is held until t_(k+1). SI throughout.
 
 Nothing here is taken from pmdc_jax; the formulas are those of the textbooks: B. Armstrong-Helouvry
@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-# without the GIL, so that runs can be simulated side by side; a checked division is a slow one
+# without the GIL, so that runs can be simulated in parallel; checked divisions would be slow
 compiled = njit(cache=True, nogil=True, error_model="numpy")
 Samples = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ class Plant(NamedTuple):
     stiffness: float = 0.0
     damping: float = 0.0
     load_share: float = 0.0
-    gap_rad: float = 0.0  # whole play
+    gap_rad: float = 0.0  # total backlash
     brush_V: float = 0.0
     brush_onset_A: float = 0.0  # brush_V tanh(i / onset); 0: set-valued
     heat_per_W: float = 0.0
@@ -80,7 +80,7 @@ class Plant(NamedTuple):
     delay_s: float = 0.0
     offset_A: float = 0.0
     # outside the library
-    shake_Nm: float = 0.0  # torque of a machine nearby, periodic in time
+    shake_Nm: float = 0.0  # external torque, periodic in time
     shake_Hz: float = 1.0
     shake_phase: float = 0.0
     bump_Nm: float = 0.0  # friction at one speed
@@ -91,7 +91,7 @@ class Plant(NamedTuple):
     eccentric_Nm: float = 0.0  # weight on an arm behind a gear
     eccentric_gear: float = 1.0
     eccentric_phase: float = 0.0
-    sag_ohm: float = 0.0  # the recorded voltage is duty times a bus that is weaker under current
+    sag_ohm: float = 0.0  # the recorded voltage is the duty cycle times the nominal bus, which drops under current
     sag_s: float = 1.0
     bus_V: float = 24.0
     pwm_Hz: float = 0.0  # centred pulses of the bus; 0: ideal amplifier
@@ -168,7 +168,7 @@ def _coupling(x, p):
 
 @compiled
 def _load_torque(x, t, load, p):
-    """What the world outside the motor takes (N m), `load` being held."""
+    """Torque of all external loads (N m); `load` is held."""
     torque = load + p.load_Nm
     if p.shake_Nm != 0.0:
         torque += p.shake_Nm * math.sin(2.0 * math.pi * p.shake_Hz * t + p.shake_phase)
@@ -268,7 +268,7 @@ def _rk4(x, t, h, v, load, disturbance, mode_i, mode_w, p, work, out):
 
 @compiled
 def _brush_leaves(x, v, mode, p):
-    """Has the current come through zero, or has the voltage overcome the brushes?"""
+    """Whether the current has crossed zero, or the voltage has overcome the brushes."""
     if p.brush_V == 0.0 or p.brush_onset_A != 0.0:
         return False
     return abs(_electric(x, v, p)) > p.brush_V if mode == 0 else x[CURRENT] * mode < 0.0
@@ -276,7 +276,7 @@ def _brush_leaves(x, v, mode, p):
 
 @compiled
 def _rotor_leaves(x, t, load, disturbance, mode, p):
-    """Has the speed come through zero, or has the drive overcome static friction?"""
+    """Whether the speed has crossed zero, or the driving torque has overcome static friction."""
     if not _sticks(p):
         return False
     if mode != 0:
@@ -287,7 +287,7 @@ def _rotor_leaves(x, t, load, disturbance, mode, p):
 
 @compiled
 def _settle(x, t, v, load, disturbance, mode_i, mode_w, p):
-    """Modes just after an event; what came through zero is put there."""
+    """Modes just after an event; a state that crossed zero is set to zero."""
     if _brush_leaves(x, v, mode_i, p):
         x[CURRENT] = 0.0
         push = _electric(x, v, p)
@@ -309,7 +309,7 @@ def _event(x, t, v, load, disturbance, mode_i, mode_w, p):
 def _advance(x, t, h, v, load, disturbance, mode_i, mode_w, p, work):
     """One fine step, in place, broken where a dry element starts or stops slipping."""
     out = work[5]
-    for _ in range(16):  # more events in one fine step than ever occur
+    for _ in range(16):  # more events than occur in one fine step
         _rk4(x, t, h, v, load, disturbance, mode_i, mode_w, p, work, out)
         if not _event(out, t + h, v, load, disturbance, mode_i, mode_w, p):
             break
@@ -348,7 +348,7 @@ def _applied(v, t, h, p):
 
 @compiled
 def _run(time, voltage, load, disturbance, substeps, start, p):
-    """What ideal sensors read at each sample: current, speed, angle, shape (samples, 3)."""
+    """Readings of ideal sensors at each sample: current, speed, angle, shape (samples, 3)."""
     samples = time.size
     read = np.empty((samples, 3))
     history = np.empty((samples - 1) * substeps + 1)
@@ -378,7 +378,7 @@ def _run(time, voltage, load, disturbance, substeps, start, p):
 
 @compiled
 def _delayed(time, history, substeps, delay, read):
-    """The speed of `delay` ago, straight lines between fine steps; before the record, its start."""
+    """The speed `delay` earlier, linear between fine steps; before the record, its initial value."""
     k = 0
     for n in range(time.size):
         t = time[n] - delay
@@ -404,7 +404,7 @@ def ornstein_uhlenbeck(white, decay, sd):
 
 
 def substeps(plant: Plant, interval: float, least: int = 20) -> int:
-    """Fine steps a sample: at least `least`, more for what is fast, and whole ones a pulse."""
+    """Fine steps per sample: at least `least`, more for fast effects, and a whole number per pulse."""
     stiff = 8.0 * plant.R / plant.L
     if plant.stiffness:
         reduced = plant.J * plant.load_share * (1.0 - plant.load_share)
@@ -432,7 +432,7 @@ def simulate(
     least: int = 20,
     steps: int | None = None,
 ) -> NDArray[np.float64]:
-    """What ideal sensors read: current (A), speed (rad/s), true angle (rad) per sample, (N, 3).
+    """Readings of ideal sensors: current (A), speed (rad/s), true angle (rad) per sample, (N, 3).
 
     `disturbance` is a torque (N m) for every fine step, shape (N, substeps). `steps` are the fine
     steps of a sample where accuracy matters less than time.

@@ -1,11 +1,11 @@
-"""What an answer is worth: which sets of effects are one, and the outcome of a case.
+"""Scores of answers: which sets of effects are equivalent, and the outcome of a case.
 
-An answer is a dictionary as `pmdc diagnose --json` writes it. Equal are sets that no record of
-motion tells apart (`canonical`):
+An answer is a dictionary as `pmdc diagnose --json` writes it. Sets are equivalent if no record of
+motion distinguishes them (`canonical`):
 
 - asymmetric friction = Coulomb friction + constant load: the same torque while moving;
 - Stribeck friction contains Coulomb friction;
-- where no run has a load column every run has an unknown constant load, so one more says nothing.
+- if no run has a load column, every run has an unknown constant load, and a further one has no meaning.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Answer = Mapping[str, Any]
 Outcome = Literal[
     "exact",  # the true set, asserted; for a null, none detected
     "incomplete",  # part of the true set, asserted
-    "wrong",  # a name that is not there, asserted; for a null, any alarm
+    "wrong",  # a false name, asserted; for a null, any finding
     "rivals",  # ambiguous, the true set among the rivals
     "elsewhere",  # ambiguous, the true set not among them
     "unlisted",  # not in library
@@ -34,11 +34,11 @@ SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "drag": ("coefficient", "drag_Nms2"),
     "saturation": ("c", "saturation_per_A2", "per_A2"),
 }
-NUISANCE = {"phase", "periods"}  # a run may begin anywhere in the turn; a count has no interval
+NUISANCE = {"phase", "periods"}  # runs begin at random angles; an integer has no interval
 
 
 def canonical(names: Iterable[str], load_known: bool = True) -> frozenset[str]:
-    """One form for all sets of effects that are the same while the motor turns."""
+    """The canonical form of all sets of effects that are equivalent while the motor turns."""
     found = set(names)
     if "asymmetric_friction" in found:
         found = found - {"asymmetric_friction"} | {"coulomb_friction", "constant_load"}
@@ -59,7 +59,7 @@ def _split(rival: str) -> list[str]:
 
 
 def rivals(answer: Answer) -> list[list[str]]:
-    """All sets that the answer holds possible: the best, and each with one rival put in."""
+    """All sets that the answer considers possible: the best, and each rival of it."""
     best, sets = named(answer), [named(answer)]
     for place, effect in enumerate(answer.get("effects", [])):
         for rival in effect.get("also_possible") or ():
@@ -70,7 +70,7 @@ def rivals(answer: Answer) -> list[list[str]]:
 def outcome(
     expected: str, truth: Iterable[str], answer: Answer, load_known: bool = True
 ) -> Outcome:
-    """What the answer is worth; `truth` has no names for a null or a stranger."""
+    """The outcome of an answer; `truth` has no names for a null or a stranger."""
     verdict = answer["verdict"]
     if verdict == "error":
         return "error"
@@ -88,12 +88,12 @@ def outcome(
 def _asserted(expected: str, true: frozenset[str], found: frozenset[str]) -> Outcome:
     if found == true:
         return "exact"
-    # where excitation cannot tell, part of the truth is asserted as groundlessly as anything else
+    # if the excitation cannot distinguish effects, asserting part of the truth is unfounded, too
     return "incomplete" if found < true and expected != "blind" else "wrong"
 
 
 def right(expected: str, result: Outcome) -> bool:
-    """Is this what an honest method answers?"""
+    """Whether this outcome is right for the expected answer."""
     if expected == "outside":
         return result in ("unlisted", "rivals", "elsewhere")
     if expected == "blind":

@@ -2,10 +2,10 @@
 
     di/dt = a v + b i + c w + electrical terms,      dw/dt = d i + e w + g T_load + mechanical terms
 
-Both are integrated over short windows, so that noise is never differentiated and steps of the
-voltage do no harm (the weak form); the angle is the integral of the speed. Every term is scaled to
-unit size, so that one threshold serves all. What has no term in an equation of the
-motor alone (lag, delay, soft shaft, play) cannot be named. S. Brunton, J. Proctor, J. N. Kutz, PNAS
+Both are integrated over short windows, so that noise is not differentiated and steps of the
+voltage cause no errors (the weak form); the angle is the integral of the speed. Every term is scaled
+to unit size, so that one threshold applies to all. Effects without a term in an equation of the
+motor alone (lag, delay, compliant shaft, backlash) cannot be named. S. Brunton, J. Proctor, J. N. Kutz, PNAS
 113 (2016) 3932, doi:10.1073/pnas.1517384113.
 """
 
@@ -30,13 +30,13 @@ PERIODS = range(1, 13)
 
 
 def _held(x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-    """Integral over windows of what is constant between samples."""
+    """Integral over windows of a signal that is held between samples."""
     total = np.concatenate([[0.0], np.cumsum(x) * dt])
     return (total[WINDOW:] - total[:-WINDOW])[:-1]
 
 
 def _integral(x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-    """Integral over windows of what changes smoothly, by the trapezoidal rule."""
+    """Integral over windows of a smooth signal, by the trapezoidal rule."""
     return _held(0.5 * (x + np.append(x[1:], x[-1])), dt)
 
 
@@ -47,7 +47,7 @@ def _change(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def terms(c: Columns) -> tuple[Terms, Terms]:
     """Columns of the electrical and of the mechanical equation; `name:part` belongs to an effect.
 
-    What they explain, the change of current or speed in a window, is the column `change`.
+    The column `change` is the regressand: the change of current or speed in a window.
     """
     dt = float(np.median(np.diff(c["time_s"])))
     v, i, w = c["voltage_V"], c["current_A"], c["speed_rad_s"]
@@ -89,7 +89,7 @@ def selected(equations: list[Terms]) -> dict[str, float]:
 
     joint = {n: np.concatenate([e[n] for e in equations]) for n in equations[0]}
     change = joint.pop("change")
-    # load columns are empty where nothing was ever braked
+    # load columns are zero if no run has a load
     joint = {n: c for n, c in joint.items() if np.any(c)}
     spread = np.array([np.sqrt(np.mean(c**2)) for c in joint.values()])
     matrix = np.column_stack(list(joint.values())) / spread

@@ -1,10 +1,10 @@
-"""Baseline: what a careful engineer writes by hand.
+"""Baseline: stepwise selection as a careful engineer would write it by hand.
 
 Forward selection with swaps by BIC, white noise assumed; every promising effect is refitted with all
 constants of the motor in full nonlinear simulation (Levenberg-Marquardt, finite differences). It
-is given the formulas and the integrator of the very generator that made the data, an advantage no
-method has in practice. Candidates of a round are ranked by one linear step from the model so far,
-shapes on a grid, and the best few refitted. Where a run's rotor began in its turn is fitted too.
+has the formulas and the integrator of the generator of the data, an advantage no method has in
+practice. Candidates of a round are ranked by one linear step from the current model, with shapes
+on a grid, and the best few are refitted. The initial angle of each run is fitted too.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from .plant import Plant, simulate
 
 Runs = Mapping[str, Columns]
 REFITTED = 4  # candidates of each round
-HOPELESS = 6.0  # chi-square by the linear step; BIC asks for about eleven a parameter
-MOST = 3  # effects
+MIN_GAIN = 6.0  # chi-square by the linear step; BIC requires about eleven per parameter
+MAX_EFFECTS = 3
 SIGNED = {("constant_load", "torque_Nm"), ("current_sensor_offset", "offset_A")}
 ANGLE = ("cogging_torque", "torque_ripple")
 
 
 def _spring(hertz: float, damped: float = 0.1) -> Parameters:
-    """A half and half shaft of that resonance, for an inertia like the paper's."""
+    """A shaft with this resonance between two halves of the paper's inertia."""
     reduced, speed = 0.25 * paper_motor().J, 2.0 * math.pi * hertz
     damping = 2.0 * damped * reduced * speed
     return {"stiffness": reduced * speed**2, "damping": damping, "load_share": 0.5}
@@ -48,7 +48,7 @@ def _periodic(name: str, size: float) -> list[Parameters]:
     ]
 
 
-# where each effect is tried from: its shapes at a small amplitude
+# the starts of each effect: its shapes at a small amplitude
 STARTS: Mapping[str, list[Parameters]] = {
     "coulomb_friction": [{"torque_Nm": 0.01}],
     "stribeck_friction": [
@@ -73,12 +73,12 @@ STARTS: Mapping[str, list[Parameters]] = {
     "speed_sensor_delay": [{"delay_s": 5e-4}],
     "current_sensor_offset": [{"offset_A": 0.1}],
 }
-FIXED = {"periods", "phase"}  # a count; and runs have angles of their own
+FIXED = {"periods", "phase"}  # an integer; and runs have initial angles of their own
 
 
 @dataclass
 class Model:
-    """A plant with effects, and the angle in which each run began."""
+    """A plant with effects, and the initial angle of each run."""
 
     base: dict[str, float]
     effects: dict[str, Parameters]
@@ -115,13 +115,13 @@ class Model:
 
 
 def rough_noise(measured: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Third differences of a smooth signal are noise; a median forgets its steps."""
+    """From third differences, in which a smooth signal vanishes; the median is robust to steps."""
     steps = np.concatenate([np.diff(m, 3, axis=0) for m in measured])
     return np.maximum(np.median(np.abs(steps), axis=0) / 0.6745 / math.sqrt(20.0), 1e-3)
 
 
 class Bench:
-    """The recordings, and the residuals of models in them, over white noise of unknown size."""
+    """The recordings, and residuals of models relative to white noise of unknown size."""
 
     def __init__(self, runs: Runs, noise: NDArray[np.float64] | None = None):
         self.runs = list(runs.values())
@@ -142,7 +142,7 @@ class Bench:
         return (measured - out[:, :2]) / self.noise
 
     def residual(self, model: Model) -> NDArray[np.float64]:
-        """Measured less simulated over noise, all runs, both channels, flat."""
+        """Measured minus simulated over noise, of all runs and both channels, flattened."""
         plant = model.plant()
         jobs = [
             (plant, c, angle, m)
@@ -224,7 +224,7 @@ def _judged(bench: Bench, model: Model) -> Model:
 
 
 def baseline(bench: Bench) -> Model:
-    """The motor without effects, from the paper's."""
+    """The motor without effects, fitted from the paper's."""
     base = {name: getattr(paper_motor(), name) for name in SIX}
     return fit(bench, Model(base, {}, np.zeros(len(bench.runs))), steps=40)
 
@@ -233,7 +233,7 @@ def baseline(bench: Bench) -> Model:
 
 
 def _periods_pairs(name: str) -> Iterator[list[Parameters]]:
-    """Starts that are judged together: sine and cosine of the same periods, others alone."""
+    """Starts that are judged together: sine and cosine of the same periods; others one by one."""
     starts = STARTS[name]
     yield from (
         (starts[k : k + 2] for k in range(0, len(starts), 2))
@@ -243,7 +243,7 @@ def _periods_pairs(name: str) -> Iterator[list[Parameters]]:
 
 
 def screened(bench: Bench, model: Model) -> list[tuple[float, str, Model]]:
-    """Every effect not yet there at its most promising start, the most promising first."""
+    """Every further effect at its start of largest gain, in order of the gain."""
     q, _ = np.linalg.qr(jacobian(bench, model))
     left = model.residual - q @ (q.T @ model.residual)
 
@@ -267,7 +267,7 @@ def screened(bench: Bench, model: Model) -> list[tuple[float, str, Model]]:
 
 
 def _sized(model: Model, name: str, start: Parameters, size: float) -> Model:
-    """The start at the amplitude that the linear step suggests, within reason."""
+    """The start at the amplitude of the linear step, within limits."""
     row = LIBRARY[name]
     signed = any((name, p) in SIGNED for p in start)
     size = size if signed else float(np.clip(size, 0.1, 100.0))
@@ -287,9 +287,9 @@ def _turned(model: Model, name: str, by: NDArray[np.float64]) -> Model:
 
 
 def forward(bench: Bench, model: Model) -> Model:
-    """Add effects while BIC falls."""
-    while len(model.effects) < MOST:
-        starts = [start for gain, _, start in screened(bench, model)[:REFITTED] if gain > HOPELESS]
+    """Add effects while the BIC falls."""
+    while len(model.effects) < MAX_EFFECTS:
+        starts = [start for gain, _, start in screened(bench, model)[:REFITTED] if gain > MIN_GAIN]
         best = min((fit(bench, start) for start in starts), key=lambda m: m.bic, default=model)
         if best.bic >= model.bic:
             break
@@ -298,7 +298,7 @@ def forward(bench: Bench, model: Model) -> Model:
 
 
 def swapped(bench: Bench, model: Model, bare: Model) -> Model:
-    """Drop each effect in turn, and put the best others in its place; keep what lowers BIC."""
+    """Replace each effect in turn by the best others; keep replacements that lower the BIC."""
     for name in tuple(model.effects) if len(model.effects) > 1 else ():
         others = {n: p for n, p in model.effects.items() if n != name}
         less = fit(bench, replace(model, effects=others))
@@ -326,7 +326,7 @@ def _parameters(model: Model, name: str) -> dict[str, Any]:
 
 
 def _holdout_rms(holdout: Runs, noise: NDArray[np.float64], model: Model) -> float:
-    """Residual over noise in the hold-outs, each from the angle that suits it best."""
+    """Residual over noise in the hold-outs, each from its best initial angle."""
     bench = Bench(holdout, noise)
     angles = np.linspace(0.0, 2.0 * np.pi, 48 if _turns(model) else 1, endpoint=False)
     tried = (replace(model, angles=np.full(len(bench.runs), a)) for a in angles)

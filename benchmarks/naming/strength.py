@@ -1,9 +1,9 @@
-"""How much of an effect shows: its response beside noise, after what a refit would absorb.
+"""Strength of an effect: its response relative to noise, without the part that a refit would absorb.
 
 The response is the difference between the motor with and without the effect, both simulated without
-noise. Subtracted from it is its projection (least squares) on what the six constants could explain:
-their sensitivities in the linear motor. What is left, over the noise of each channel, is what a
-baseline fit would leave in its residuals on top of the noise.
+noise. Its projection (least squares) on the sensitivities of the linear motor to its six constants
+is subtracted. The rest, over the noise of each channel, is what the residuals of a baseline fit
+would contain in addition to the noise.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from benchmarks.virtual_bench import SIX, Excitation
 from .plant import Plant, compiled
 
 Outputs = NDArray[np.float64]  # current (A) and speed (rad/s), shape (samples, 2)
-DETECTABLE = 30.0  # chi-square a single effect needs: p < 1e-7, so that many looks are paid for
+DETECTABLE = 30.0  # chi-square that a single effect needs: p < 1e-7, to allow for many tests
 
 
 class Response(NamedTuple):
-    """An effect's unexplained response, in noise: by run, and altogether.
+    """The unexplained response to an effect, relative to noise.
 
     `peak` is its largest root mean square in any run; `chi_square` the sum of squares over all.
     """
@@ -59,7 +59,7 @@ def _scan(step, force, inputs):
     return out
 
 
-@lru_cache(maxsize=16)  # the runs of a case come one after another, on the same clock
+@lru_cache(maxsize=16)  # the runs of a case have the same sample time
 def _exact_step(p: Plant, dt: float) -> NDArray[np.float64]:
     """Current and speed one interval later, from current, speed, voltage, load; shape (2, 4)."""
     system = np.zeros((4, 4))
@@ -96,7 +96,7 @@ class Gauge:
         self.basis, _ = np.linalg.qr(np.concatenate(blocks).reshape(-1, len(SIX)))
 
     def __call__(self, differences: list[Outputs]) -> Response:
-        """The response whose differences, with less without the effect, are given run by run."""
+        """The response, from the differences of the outputs with and without the effect in each run."""
         d = np.concatenate(differences) / self.noise
         flat = d.reshape(-1)
         left = (flat - self.basis @ (self.basis.T @ flat)).reshape(d.shape)
@@ -116,8 +116,8 @@ def amplitude_for(
 ) -> float:
     """The amplitude factor whose measure is `wanted` within the tolerance, or the nearest tried.
 
-    Responses grow about in proportion, so each try is scaled by what is lacking, kept inside the
-    bracket found so far; bisection where that would leave it.
+    Responses are about proportional to it, so each try is scaled by the ratio that is missing, within
+    the bracket found so far; by bisection if that would leave the bracket.
     """
     low, high = math.log(limits[0]), math.log(limits[1])
     x, best, nearest = min(0.0, high), 0.0, math.inf

@@ -26,7 +26,7 @@ def outcome_of(result: Result) -> Outcome:
 
 
 def is_right(result: Result) -> bool:
-    """Did the method answer as an honest one does?"""
+    """Whether the answer is right."""
     return right(result["expected"], outcome_of(result))
 
 
@@ -50,7 +50,7 @@ def _table(title: str, first: str, headings: Sequence[str]) -> Table:
 
 
 def _share_covered(results: Iterable[Result]) -> str:
-    """Share of 95 % intervals that cover, where the effect follows the library's formula."""
+    """Share of 95 % intervals that cover the truth, for effects with the formula of the library."""
     exact = (r for r in results if outcome_of(r) == "exact" and r["suite"] != "formulas")
     covers = [i.covers for r in exact for i in intervals(r["truth"], r["answer"])]
     return f"{_percent(sum(covers), len(covers))} of {len(covers)}" if covers else "-"
@@ -87,7 +87,7 @@ def _answered(result: Result) -> list[str]:
 
 
 def confusion(results: Sequence[Result]) -> Table:
-    """Truth against what was asserted; numbers stand for the effects in the order of the rows."""
+    """Truth against asserted names; numbers stand for the effects in the order of the rows."""
     columns = [*NAMES, *ABSTAINED.values()]
     headings = [*(str(n + 1) for n in range(len(NAMES))), *ABSTAINED.values()]
     table = _table("What was asserted", "truth", ["cases", *headings])
@@ -104,7 +104,7 @@ def confusion(results: Sequence[Result]) -> Table:
 
 
 def mistakes(results: Sequence[Result]) -> Table:
-    """Every case that is not right, and what was said of it."""
+    """Every case with a wrong answer, and the answer."""
     table = Table(title="Not right", title_justify="left")
     for heading in ("case", "noise", "hidden", "visible", "outcome", "answer"):
         table.add_column(heading)
@@ -124,7 +124,7 @@ def mistakes(results: Sequence[Result]) -> Table:
     return table
 
 
-EDGES = (0.45, 0.8, 1.25, 2.0, 3.5, 7.0, 14.0)  # between the multiples asked for
+EDGES = (0.45, 0.8, 1.25, 2.0, 3.5, 7.0, 14.0)  # between the multiples of the suite
 
 
 def strengths(results: Sequence[Result]) -> Table:
@@ -141,7 +141,7 @@ def strengths(results: Sequence[Result]) -> Table:
 
 
 def noise_sweep(results: Sequence[Result]) -> Table:
-    """Recovery by noise beside what was published for known base parameters."""
+    """Recovery by noise beside the published one for known base parameters."""
     table = _table(
         "Recovery by noise", "noise %", ("cases", "named right %", "wrong %", "published %")
     )
@@ -156,7 +156,7 @@ def noise_sweep(results: Sequence[Result]) -> Table:
 
 
 def all_tables(results: Sequence[Result]) -> list[Table]:
-    """Everything there is to show about these results."""
+    """All tables of these results."""
     tables = [summary(results), confusion(results), mistakes(results)]
     for suite, table in (("strengths", strengths), ("noise_sweep", noise_sweep)):
         if rows := [r for r in results if r["suite"] == suite]:

@@ -1,4 +1,4 @@
-"""What else can compute the same numbers: honest, tuned, and independent of the package.
+"""Other implementations of the same computations, tuned for speed and independent of the package.
 
 A peer's population cost takes `candidates`, shape (P, 6) in the order R, L, Kb, Kt, J, f in SI, and
 one `run`, a dictionary of canonical columns, and returns the sums of squared errors of current

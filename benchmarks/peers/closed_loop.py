@@ -1,4 +1,4 @@
-"""The same sampled PID loop by others: numba by hand, python-control, gym-electric-motor."""
+"""The same sampled PID loop in hand-written numba, python-control and gym-electric-motor."""
 
 import numpy as np
 from numba import njit, prange
@@ -43,7 +43,7 @@ def control_speeds(gains: NDArray, motion: NDArray, setpoint: float, step: float
     reference = np.full(samples, setpoint)
     seen = np.empty((len(gains), 2))
     for n, (kp, ki, kd, filter_time, weight, _) in enumerate(gains):
-        # states: current, speed, voltage decided last, integral, filtered
+        # states: current, speed, last voltage command, integral, filtered
         lead = kd / (filter_time + step)
         asked = np.array([0.0, -kp - lead, 0.0, 1.0, lead])
         A = np.zeros((5, 5))

@@ -1,7 +1,7 @@
 """`jax.vmap` over a diffrax Tsit5 solve: the obvious way to simulate a population in JAX.
 
-Time runs in samples, so that the held voltage is an exact floor of it. Both step controllers tell
-the solver where the voltage jumps; without that, its last stage would see the next voltage.
+The unit of time is the sample, so that the held voltage is indexed by its exact floor. Both step
+controllers tell the solver where the voltage jumps; otherwise its last stage would use the next voltage.
 """
 
 from functools import partial
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from benchmarks.peers.held import Run
 
 
-class OneStepASample(diffrax.AbstractStepSizeController):
-    """Constant steps that end just before the voltage jumps and begin at the jump."""
+class OneStepPerSample(diffrax.AbstractStepSizeController):
+    """Constant steps that end just before a jump of the voltage and begin at the jump."""
 
     def wrap(self, direction):
         return self
@@ -62,7 +62,7 @@ def _constant(parameters, run):
         parameters,
         run,
         dt0=None,
-        stepsize_controller=OneStepASample(),
+        stepsize_controller=OneStepPerSample(),
         saveat=diffrax.SaveAt(t0=True, steps=True),
         max_steps=len(run.voltage) - 1,
     )
@@ -91,7 +91,7 @@ def _population_adaptive(candidates, run, jumps):
 
 
 def squared_errors(candidates: NDArray, run: Run) -> NDArray[np.float64]:
-    """Errors of linear motors, shape (2, P), with one Tsit5 step a sample."""
+    """Errors of linear motors, shape (2, P), with one Tsit5 step per sample."""
     with jax.enable_x64(True):
         return np.asarray(_population_constant(jnp.asarray(candidates), run))
 

@@ -1,4 +1,4 @@
-"""One record as the peers take it, and the exact step of the linear motor between samples."""
+"""A record as the peers take it, and the exact step of the linear motor between samples."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -18,7 +18,7 @@ class Run(NamedTuple):
 
     @classmethod
     def of(cls, columns: Mapping[str, NDArray]) -> "Run":
-        """From canonical columns; a record without a load column ran without load."""
+        """From canonical columns; a record without a load column is one without load."""
         time, voltage = columns["time_s"], columns["voltage_V"]
         load = columns.get("load_torque_Nm", np.zeros_like(voltage))
         dt = float((time[-1] - time[0]) / (len(time) - 1))
@@ -35,13 +35,19 @@ def exact_step(parameters: NDArray, dt: float) -> NDArray:
     R, L, Kb, Kt, J, f = np.moveaxis(np.asarray(parameters), -1, 0)
     a, b, c, d = -R / L, -Kb / L, Kt / J, -f / J
     mean, square = (a + d) / 2, (a - d) ** 2 / 4 + b * c
-    swings = square.real < 0  # two branches keep real arithmetic real, as the complex step needs
-    gap = np.sqrt(np.where(swings, -square, square))
+    oscillates = (
+        square.real < 0
+    )  # two branches keep real arithmetic real, as the complex step needs
+    gap = np.sqrt(np.where(oscillates, -square, square))
     gap = np.where(np.abs(gap * dt) < 1e-7, 1e-7 / dt, gap)
-    apart, turn, decay = np.where(swings, 0.0, gap), np.where(swings, gap, 0.0), np.exp(mean * dt)
+    apart, turn, decay = (
+        np.where(oscillates, 0.0, gap),
+        np.where(oscillates, gap, 0.0),
+        np.exp(mean * dt),
+    )
     slow, fast = np.exp((mean + apart) * dt), np.exp((mean - apart) * dt)
-    even = np.where(swings, decay * np.cos(turn * dt), (slow + fast) / 2)
-    odd = np.where(swings, decay * np.sin(turn * dt), (slow - fast) / 2) / gap
+    even = np.where(oscillates, decay * np.cos(turn * dt), (slow + fast) / 2)
+    odd = np.where(oscillates, decay * np.sin(turn * dt), (slow - fast) / 2) / gap
     phi = [[even + odd * (a - mean), odd * b], [odd * c, even + odd * (d - mean)]]
     # A^-1 (Phi - I) applied to the columns (1/L, 0) of the voltage and (0, -1/J) of the load
     det = a * d - b * c

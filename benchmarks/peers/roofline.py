@@ -1,4 +1,4 @@
-"""The fastest we can write: numba kernels, threads over tiles of candidates, vectors inside a tile.
+"""The fastest implementation we can write: numba kernels, threads over tiles of candidates, vectors within a tile.
 
 A tile's state lives in one flat buffer with constant offsets, which is what lets LLVM prove that
 the rows do not overlap and vectorise over the candidates.
@@ -49,7 +49,7 @@ def _exact_step(p, dt, tile, j):
 
 @njit(**FAST)
 def _linear_tile(tile, voltage, load, current, speed):
-    """March one tile through the record; rows: i, w, errors of i, of w, then the coefficients."""
+    """Simulate one tile over the record; rows: i, w, errors of i, of w, then the coefficients."""
     T = TILE
     for k in range(voltage.size):
         v, t, yi, yw = voltage[k], load[k], current[k], speed[k]
@@ -90,14 +90,14 @@ def squared_errors(candidates: NDArray, run: Run) -> NDArray[np.float64]:
     return _linear(np.ascontiguousarray(candidates), *run)
 
 
-# ------------------------------------------------------- three effects, RK4 with one step a sample
+# ----------------------------------------------------- three effects, RK4 with one step per sample
 
 
 @njit(**FAST)
 def _exp_twice(x):
     """exp(2x), saturating, without branches or tables so that it vectorises.
 
-    A polynomial squared up five times; its relative error grows only where tanh is flat.
+    A polynomial squared five times; its relative error grows only where tanh is flat.
     """
     y = min(max(x, -19.0), 19.0) / 16.0
     square = y * y
@@ -113,7 +113,7 @@ def _exp_twice(x):
 
 @njit(**FAST)
 def _two_tanh(x, y):
-    """tanh of both, to 2e-11, for one division: division is what costs here."""
+    """tanh of both, to 2e-11, with a single division, which is the costly operation here."""
     a, b = _exp_twice(x) + 1.0, _exp_twice(y) + 1.0
     share = 2.0 / (a * b)
     return 1.0 - share * b, 1.0 - share * a

@@ -1,9 +1,9 @@
 """The strongest identification script we can write by hand for the six linear parameters.
 
 Exact held steps in numba with forward sensitivities of the logarithms of the parameters and of each
-run's initial state; 64 random starts about an integrated-equation regression, screened by the
-roofline kernel; the best four refined side by side on two threads; the winner polished with the
-noise of each channel as found. Loads must be known. Same interface as the others: columns in SI.
+run's initial state; 64 random starts about a regression on the integrated equations, screened by the
+roofline kernel; the best four refined in parallel on two threads; the best of these polished with
+the estimated noise of each channel. Loads must be known. Same interface as the others: columns in SI.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -85,7 +85,7 @@ def _screened(case: Case, rng: np.random.Generator) -> NDArray:
 
 @njit(fastmath=True, cache=True, nogil=True, error_model="numpy")
 def _products(step, d_step, start, voltage, load, current, speed):
-    """March one run and sum the products of its derivatives and residual, shape (2, 9, 9).
+    """Simulate one run and sum the products of its derivatives and residual, shape (2, 9, 9).
 
     For each channel: derivatives by 6 log parameters and 2 initial states; last, the residual.
     Blocks of samples stay in cache and go through BLAS. `d_step` and the derivatives live in flat
@@ -110,7 +110,9 @@ def _products(step, d_step, start, voltage, load, current, speed):
                 s[j] = a * si + b * sw + push_i
                 s[8 + j] = c * si + d * sw + push_w
             i, w = a * i + b * w + (e * v + g * t), c * i + d * w + (h * v + q * t)
-        for j in range(16):  # initial states fade away: subnormal numbers would be very slow
+        for j in range(
+            16
+        ):  # effects of initial states decay to subnormal numbers, which are very slow
             if abs(s[j]) < 1e-30:
                 s[j] = 0.0
         for channel in range(2):
@@ -152,7 +154,7 @@ def _normal_equations(unknowns: NDArray, case: Case) -> tuple[float, NDArray, ND
 
 
 def _refine(unknowns: NDArray, case: Case, tolerance: float) -> tuple[float, NDArray]:
-    """Minimise from one start until the whole Gauss-Newton step promises too little of the cost."""
+    """Minimise from one start until the predicted reduction by a Gauss-Newton step is below the tolerance."""
     cost, gradient, matrix = _normal_equations(unknowns, case)
     damping = 1e-2
     for _ in range(100):
@@ -193,14 +195,14 @@ def _refine_by_scipy(unknowns: NDArray, case: Case, tolerance: float) -> tuple[f
         return factor(x)[:, :-1]
 
     reach = np.full(len(unknowns), np.inf)
-    reach[:6] = 5.0  # in logarithms: a wild first step must not overflow
+    reach[:6] = 5.0  # in logarithms, so that a long first step does not overflow
     bounds = (unknowns - reach, unknowns + reach)
     options = {"bounds": bounds, "x_scale": "jac", "ftol": tolerance, "xtol": 1e-10}
     result = least_squares(residual, unknowns, jacobian, **options)
     return result.cost, result.x
 
 
-# ------------------------------------------------------------------------------------ whole script
+# ------------------------------------------------------------------------------ complete script
 
 
 def _noise(unknowns: NDArray, runs: Sequence[Run]) -> NDArray:
@@ -214,7 +216,7 @@ def identify(
     seed: int = 0,
     refine: Callable[[NDArray, Case, float], tuple[float, NDArray]] = _refine,
 ) -> dict[str, float]:
-    """R, L, Kb, Kt, J and f of the motor that made the records."""
+    """R, L, Kb, Kt, J and f of the motor, from records of it."""
     runs = [Run.of(columns) for columns in records]
     spread = [
         np.std(np.concatenate(signals)) for signals in zip(*(r[3:] for r in runs), strict=True)
