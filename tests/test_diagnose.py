@@ -30,11 +30,11 @@ from pmdc_jax.diagnose.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.periodic import common_line, spectrum
 from pmdc_jax.diagnose.pipeline import may_be_absent
 from pmdc_jax.diagnose.quantisation import ROUNDING_DRAWS, rounding_errors
-from pmdc_jax.diagnose.refits import common_phase
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensor_changes
 from pmdc_jax.diagnose.rows import _batches
 from pmdc_jax.diagnose.shortlist import effect_of, most_promising, shortlist
 from pmdc_jax.diagnose.signals import Screen, Signal, gain_common_to_waves, log_p_value
+from pmdc_jax.diagnose.starts import common_phase
 from pmdc_jax.diagnose.trials import TRIALS
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate, Identification
@@ -320,7 +320,7 @@ def test_regression_matches_least_squares_by_numpy(own_phase):
     solution, squares, *_ = np.linalg.lstsq(matrix, y)
     errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)))
     assert fit.squares == pytest.approx(squares[0], rel=1e-10)
-    np.testing.assert_allclose(fit.moved, solution[:4], rtol=1e-8)
+    np.testing.assert_allclose(fit.parameter_changes, solution[:4], rtol=1e-8)
     if own_phase:
         first = 4 + own[0].shape[1]
         np.testing.assert_allclose(fit.coefficients[0][0], solution[first : first + 2], rtol=1e-8)

@@ -96,7 +96,7 @@ def amplitude_candidates(
             shapes = [{**shape, other: x} for shape in shapes for x in grid(scales)]
 
         def candidate(shape: Values) -> Candidate:
-            def build(c: np.ndarray, dry: float) -> Values | None:
+            def build(c: np.ndarray, coulomb_torque: float) -> Values | None:
                 return {field: float(c[0]), **shape} if signed or c[0] > 0 else None
 
             return Candidate(name, ({field: small, **shape},), (small,), build, field)
@@ -111,7 +111,7 @@ def finite_candidates(field: str, grid: Callable[[Scales], Sequence[float]]) -> 
 
     def make(name: str, scales: Scales) -> list[Candidate]:
         def candidate(size: float) -> Candidate:
-            def build(c: np.ndarray, dry: float) -> Values | None:
+            def build(c: np.ndarray, coulomb_torque: float) -> Values | None:
                 return {field: size * float(np.clip(c[0], 0.2, 5.0))} if c[0] > 0 else None
 
             return Candidate(name, ({field: size},), (1.0,), build, field)
@@ -131,11 +131,11 @@ def stribeck_candidates(name: str, scales: Scales) -> list[Candidate]:
     small = SMALL * scales.torque
 
     def candidate(speed: float) -> Candidate:
-        def build(c: np.ndarray, dry: float) -> Values | None:
-            if c[1] <= 0 or c[0] + c[1] + dry <= 0:
+        def build(c: np.ndarray, coulomb_torque: float) -> Values | None:
+            if c[1] <= 0 or c[0] + c[1] + coulomb_torque <= 0:
                 return None
             # at a much smaller value no run would be sensitive to it, and a refit could not recover it
-            coulomb = max(float(c[0]) + dry, 0.1 * float(c[1]))
+            coulomb = max(float(c[0]) + coulomb_torque, 0.1 * float(c[1]))
             return {"coulomb_Nm": coulomb, "static_Nm": coulomb + float(c[1]), "speed_rad_s": speed}
 
         flat = {"coulomb_Nm": small, "static_Nm": small, "speed_rad_s": speed}
@@ -149,10 +149,13 @@ def asymmetric_candidates(name: str, scales: Scales) -> list[Candidate]:
     """Friction of each direction, beside the Coulomb friction that the model has already."""
     small = SMALL * scales.torque
 
-    def build(c: np.ndarray, dry: float) -> Values | None:
-        if min(c) + dry <= 0:
+    def build(c: np.ndarray, coulomb_torque: float) -> Values | None:
+        if min(c) + coulomb_torque <= 0:
             return None
-        return {"forward_Nm": float(c[0]) + dry, "backward_Nm": float(c[1]) + dry}
+        return {
+            "forward_Nm": float(c[0]) + coulomb_torque,
+            "backward_Nm": float(c[1]) + coulomb_torque,
+        }
 
     columns = (
         {"forward_Nm": small, "backward_Nm": TINY},
@@ -172,7 +175,7 @@ def periodic_candidates(
         def candidate(periods: int, other: Values) -> Candidate:
             shape = {"periods": float(periods), **other}
 
-            def build(c: np.ndarray, dry: float) -> Values | None:
+            def build(c: np.ndarray, coulomb_torque: float) -> Values | None:
                 phase = float(np.arctan2(c[1], c[0]))
                 return {field: float(np.hypot(c[0], c[1])), "phase_rad": phase, **shape}
 
@@ -209,7 +212,7 @@ def compliance_candidates(name: str, scales: Scales) -> list[Candidate]:
             name,
             (values,),
             (1.0,),
-            lambda c, dry: values if c[0] > 0 else None,
+            lambda c, coulomb_torque: values if c[0] > 0 else None,
             full_simulation=True,
         )
 

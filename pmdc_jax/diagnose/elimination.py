@@ -44,7 +44,7 @@ class BackwardElimination:
                 return self.reduced(smaller)
         for effect in model.effects:
             for simple in self._simpler_forms(effect):
-                simpler = self.refits.in_place(model, white, effect, simple)
+                simpler = self.refits.with_replacement(model, white, effect, simple)
                 if self.is_new(simpler) and self._is_as_good(simpler, model):
                     return self.reduced(simpler)
                 pair = simpler and self._simple_form_with_another(simpler, model, effect)
@@ -53,9 +53,12 @@ class BackwardElimination:
         return model
 
     def _simpler_forms(self, effect: str) -> list[str]:
-        """The simpler effects that may replace one: contained ones that were begun, and that of which it is fuller."""
+        """The simpler effects that may replace one: contained ones that were fitted before, and that of which it is
+        fuller."""
         of_fuller = {s for s, form in FULLER.items() if form.effect == effect and form.to_simple}
-        return sorted(CONTAINS.get(effect, set()) & self.refits.begun.keys() | of_fuller)
+        return sorted(
+            CONTAINS.get(effect, set()) & self.refits.starts.first_values.keys() | of_fuller
+        )
 
     def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:
         """A model with a simpler form of a rich effect, and one more effect of comparable gain (`COMPARABLE_GAIN`).

@@ -37,7 +37,7 @@ class Regression(NamedTuple):
     """A least-squares fit by the motor's own parameters and some blocks."""
 
     squares: float  # sum of the squared white residuals that are left
-    moved: Float[np.ndarray, " parameters"]  # change of the motor's search coordinates
+    parameter_changes: Float[np.ndarray, " parameters"]  # of the motor's search coordinates
     coefficients: list[Float[np.ndarray, "*runs columns"]]  # of every block
     errors: list[Float[np.ndarray, "*runs columns"]]  # their standard errors
 
@@ -87,8 +87,8 @@ class Evidence(NamedTuple):
                 first_shared += width
                 coefficients.append(found.shared[part, 0])
                 errors.append(found.shared_errors[part])
-        moved = found.shared[: self.parameters, 0]
-        return Regression(float(found.squares[0]), moved, coefficients, errors)
+        changes = found.shared[: self.parameters, 0]
+        return Regression(float(found.squares[0]), changes, coefficients, errors)
 
     def _solve(
         self, blocks: Sequence[Block], targets: Sequence[int], min_eigenvalue: float

@@ -91,7 +91,7 @@ class Model:
         }
 
     @property
-    def dry(self) -> float:
+    def coulomb_torque(self) -> float:
         """Coulomb friction, N m, the mean of both directions."""
         return sum(self._friction) / 2
 

@@ -77,7 +77,7 @@ class StepwiseSelection:
         """`base` is the motor without effects, and `solved` how it was found."""
         self.base, self.library = base, Library(base)
         self.comparison = Comparison()
-        self.refits = Refits(base, solved, self.library, self.comparison, report)
+        self.refits = Refits(base, solved, self.library.scales, self.comparison, report)
         self.assessments: dict[Model, Assessment] = {}
         # by effect: alternatives that were as good when it was added
         self.equivalents: dict[str, set[str]] = {}
@@ -312,9 +312,9 @@ class StepwiseSelection:
         decisive = nearest.fit.fitness / DECISIVE_RATIO
         if not sticks or decisive < noise:  # not even a perfect fit would cut the misfit so far
             return []
-        searched = [self.refits.sought(current, "coulomb_friction")]
+        searched = [self.refits.with_global_search(current, "coulomb_friction")]
         if "asymmetric_friction" in nearest.effects_at_end:
-            searched.append(self.refits.sought(searched[0], "constant_load"))
+            searched.append(self.refits.with_global_search(searched[0], "constant_load"))
         return [model for model in searched if model.fit.fitness < decisive]
 
     def _in_other_forms(
@@ -332,7 +332,7 @@ class StepwiseSelection:
         if len(current.effects) < 2:
             return []
         return [
-            self.refits.in_place(current, found.screen.white, effect, other)
+            self.refits.with_replacement(current, found.screen.white, effect, other)
             for effect in current.effects
             for other in sorted(
                 (self.equivalents.get(effect, set()) | TRIALS[effect].alike.keys())
@@ -351,7 +351,7 @@ class StepwiseSelection:
     ) -> list[Model | None]:
         """The model with each of some effects replaced by its refit-only form, if it has one."""
         return [
-            self.refits.in_place(current, found.screen.white, simpler, REFIT_ONLY[simpler])
+            self.refits.with_replacement(current, found.screen.white, simpler, REFIT_ONLY[simpler])
             for simpler in sorted(effects & REFIT_ONLY.keys())
         ]
 

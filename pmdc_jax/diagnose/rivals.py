@@ -33,7 +33,7 @@ def rivals_of(
     rivals = [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]
     # with the fuller form held clearly present: a free fit would return to the simple form where the runs show little
     simple = [effect for effect in chosen.effects if effect in FULLER]
-    fuller = [refits.clearly_in_full(chosen, white, effect) for effect in simple]
+    fuller = [refits.with_fuller_form_held(chosen, white, effect) for effect in simple]
     limit = comparison.fitted(chosen, white).squares + RULED_OUT
     return rivals + [m for m in fuller if comparison.fitted(m, white).squares < limit]
 

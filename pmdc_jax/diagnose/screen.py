@@ -42,7 +42,7 @@ def screen(model: Model, library: Library) -> Screen:
         candidate_blocks=blocks[: len(library.candidates)],
         curves=curves,
         curve_blocks=blocks[len(library.candidates) :],
-        dry=model.dry,
+        coulomb_torque=model.coulomb_torque,
         sensor_floors=library.sensor_floors,
     )
     white = whitener(_without_clearest(found, rows))
@@ -82,7 +82,7 @@ def _without_clearest(found: Screen, rows: Sequence[Rows]) -> list[Series]:
     for k, (fit, X, _) in enumerate(rows):
         coefficients = best.coefficients[0][k] if clearest.per_run else best.coefficients[0]
         known = fit.residual.known
-        rest = fit.residual.values - fit.shared.values @ best.moved
+        rest = fit.residual.values - fit.shared.values @ best.parameter_changes
         rest = rest - X[..., columns] @ coefficients
         own = fit.own.values
         unknowns = np.linalg.lstsq(own[known].reshape(-1, own.shape[-1]), rest[known].ravel())[0]

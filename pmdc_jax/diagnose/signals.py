@@ -38,7 +38,7 @@ class Screen(NamedTuple):
     candidate_blocks: list[Block]
     curves: list[Curve]
     curve_blocks: list[Block]
-    dry: float  # Coulomb friction in the model, N m
+    coulomb_torque: float  # Coulomb friction in the model, N m
     # by unit: the amplitude that imperfect sensors alone may produce
     sensor_floors: Mapping[str, float]
 
@@ -47,7 +47,7 @@ class Screen(NamedTuple):
         if candidate.own_phase:
             return True
         amplitude = abs(coefficients[-1]) * candidate.unit
-        physical = candidate.build(coefficients, self.dry) is not None
+        physical = candidate.build(coefficients, self.coulomb_torque) is not None
         return physical and bool(amplitude >= self.sensor_floor(candidate))
 
     def sensor_floor(self, candidate: Candidate) -> float:
