@@ -14,7 +14,7 @@ from benchmarks.naming.cases import Bench, record
 from benchmarks.naming.plant import Plant
 from experiments.bench import recording
 from pmdc_jax import Recording
-from pmdc_jax.diagnose import diagnose
+from pmdc_jax.diagnose import Diagnosis, diagnose
 from pmdc_jax.recording_file import read_recording
 
 
@@ -101,21 +101,37 @@ def test_no_effect_is_named_if_none_is_missing(noise):
     assert 0 < by_name["coulomb_friction"].amplitude < 0.05
 
 
+def with_ripple(run: Recording, share: float, periods: int) -> Recording:
+    """The run with a speed reading that varies with the angle, by a share of the speed."""
+    angle = np.append(0, np.cumsum((run.speed[1:] + run.speed[:-1]) / 2 * np.diff(run.time)))
+    return attrs.evolve(run, speed=run.speed * (1 + share * np.cos(periods * angle)))
+
+
+def sensor_ripple_of(found: Diagnosis) -> tuple[float, float]:
+    """Share of the speed and periods per turn of the clearest unknown term, which is the speed sensor's."""
+    clearest = found.curves[0]
+    assert (clearest.equation, clearest.variable) == ("sensor", "angle")
+    return float(np.max(np.abs(clearest.value))), 2 * np.pi / clearest.x[-1]
+
+
 @pytest.mark.parametrize("periods", [1, pytest.param(14, marks=pytest.mark.slow)])
 def test_an_error_of_the_speed_over_the_angle_is_attributed_to_the_sensor(periods):
     """Eccentricity of an encoder and ripple of a tachometer vary with the angle as cogging does."""
-    runs = []
-    for run in recorded(vb.BenchMotor(**PAPER), 6, NOISE):
-        angle = np.append(0, np.cumsum((run.speed[1:] + run.speed[:-1]) / 2 * np.diff(run.time)))
-        measured = run.speed * (1 + 0.02 * np.cos(periods * angle))
-        runs.append(attrs.evolve(run, speed=measured))
-    found = diagnose(runs)
+    runs = recorded(vb.BenchMotor(**PAPER), 6, NOISE)
+    found = diagnose([with_ripple(run, 0.02, periods) for run in runs])
     assert found.verdict == "not_in_library"
     assert found.effects == ()
-    clearest = found.curves[0]
-    assert (clearest.equation, clearest.variable) == ("sensor", "angle")
-    assert 2 * np.pi / clearest.x[-1] == pytest.approx(periods)
-    assert np.max(np.abs(clearest.value)) == pytest.approx(0.02, rel=0.05)
+    assert sensor_ripple_of(found) == pytest.approx((0.02, periods), rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_ripple_of_the_speed_sensor_hides_no_friction():
+    runs = recorded(vb.BenchMotor(**PAPER, coulomb_Nm=0.08), 6, NOISE)
+    found = diagnose([with_ripple(run, 0.01, 14) for run in runs])
+    (effect,) = found.effects
+    assert effect.name == "coulomb_friction"
+    assert effect.parameters["torque_Nm"].value == pytest.approx(0.08, rel=0.01)
+    assert sensor_ripple_of(found) == pytest.approx((0.01, 14), rel=0.1)
 
 
 @pytest.mark.slow
