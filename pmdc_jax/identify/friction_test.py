@@ -42,7 +42,9 @@ class MissingFriction(NamedTuple):
 
     friction_Nm: float
     z_score: float  # its value in standard errors
-    bias: Float[np.ndarray, " parameters"]  # of the coordinates for want of it
+    bias: Float[
+        np.ndarray, " parameters"
+    ]  # of the search coordinates without friction in the model
 
 
 def missing_friction(given: Prepared, fit: Fit) -> MissingFriction | None:

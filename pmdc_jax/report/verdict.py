@@ -169,7 +169,7 @@ def disagreement(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> str:
 def intervals_in_words(
     variable: str, intervals: Sequence[Interval], largest: float | None = None
 ) -> str:
-    """Intervals of one variable in words; `largest` is its largest magnitude in the runs, but for a few samples."""
+    """Intervals of one variable in words; `largest` is its largest magnitude in the runs, a few outliers excluded."""
     joined = _merged(intervals)
     if variable == "time":
         parts = [f"{percent(100 * low)} to {percent(100 * high)}" for low, high in joined]
