@@ -27,7 +27,7 @@ def write_page(path: str | Path, template: str, **content: Any) -> None:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["options"] = _options
+    environment.filters["commands"] = _commands
     page = environment.get_template(template).render(
         plotly_js=Markup(get_plotlyjs()),
         versions=_versions(),
@@ -44,10 +44,14 @@ def figure_json(figure: go.Figure) -> Markup:
     return Markup((text or "{}").replace("<", "\\u003c"))
 
 
-def _options(text: str) -> Markup:
-    """Plain text as HTML with command-line options marked as code, which the style never breaks over two lines."""
-    option = r"(--[a-z][\w-]*(?: \w+=\w+| [A-Z]+\b)?)"
-    return Markup(re.sub(option, r"<code>\1</code>", str(escape(text))))
+def _commands(text: str) -> Markup:
+    """Plain text as HTML, with `quoted` commands and command-line options marked as code, which the style never breaks
+    over two lines."""
+    quoted, option = r"`([^`]+)`", r"(--[a-z][\w-]*(?: \w+=\w+| [A-Z]+\b)?)"
+    marked = re.sub(
+        f"{quoted}|{option}", lambda m: f"<code>{m[1] or m[2]}</code>", str(escape(text))
+    )
+    return Markup(marked)
 
 
 def _versions() -> dict[str, str]:
