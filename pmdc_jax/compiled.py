@@ -88,7 +88,7 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+        if is_traced(args, kwargs):
             return inlined(*args, **kwargs)
         if programs() is None:
             return jitted()(*args, **kwargs)
@@ -111,6 +111,11 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
         return cast(T, eqx.combine(returned, program.non_arrays))
 
     return call
+
+
+def is_traced(*values: object) -> bool:
+    """Whether a call with these arguments comes from code that is being compiled."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
 def quickly_compiled(function: Callable[P, T]) -> Callable[P, T]:

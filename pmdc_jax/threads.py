@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
@@ -16,9 +17,11 @@ T = TypeVar("T")
 
 CORES = os.cpu_count() or 1
 
+_this_thread = threading.local()
+
 
 def map_in_threads(function: Callable[[A], T], items: Iterable[A]) -> list[T]:
-    """Results of a function for every item, computed in parallel on all cores. Not to be nested: it could deadlock."""
+    """Results of a function for every item, computed in parallel on all cores."""
     return [future.result() for future in [submit(function, item) for item in items]]
 
 
@@ -35,7 +38,7 @@ def map_in_threads_until(
 
 
 def run_one_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
-    """Results of calls in their order, with the next call already running in another thread. Must not be nested."""
+    """Results of calls in their order, with the next call already running in another thread."""
     waiting: Future[T] | None = None
     for call in calls:
         before, waiting = waiting, submit(call)
@@ -46,10 +49,18 @@ def run_one_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
 
 
 def submit(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-    """Run a call in another thread, with the caller's precision, which JAX keeps for each thread."""
+    """Run a call in another thread, with the caller's precision, which JAX keeps for each thread.
+
+    In such a thread the call runs at once: all cores are at work, and waiting for another thread could deadlock.
+    """
+    if getattr(_this_thread, "is_worker", False):
+        done: Future[T] = Future()
+        done.set_result(function(*args, **kwargs))
+        return done
     double = jax.config.read("jax_enable_x64")
 
     def call() -> T:
+        _this_thread.is_worker = True
         with jax.enable_x64(double):
             return function(*args, **kwargs)
 

@@ -276,6 +276,20 @@ def test_runs_on_one_tape_match_runs_simulated_alone(x64):
         np.testing.assert_allclose(together, separate, rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 16])
+def test_a_tape_is_cut_into_parts_between_runs(x64, count):
+    """Simulated part by part, the runs give what they give on the whole tape."""
+    m = motor((CoulombFriction(np.asarray(0.1)),))
+    lengths = (2900, 1000, 2200, 1900)
+    tape = Tape.from_recordings([recording(samples=n, seed=k) for k, n in enumerate(lengths)])
+    parts = tape.parts(count)
+    assert len(parts) == {1: 1, 2: 2, 3: 3, 16: 4}[count]
+    assert len({part.value.shape for part, _ in parts}) == 1
+    assert all(part.begins[0] and np.all(part.weight[blocks:] == 0) for part, blocks in parts)
+    outputs = np.concatenate([np.asarray(free_run(m, part))[:blocks] for part, blocks in parts])
+    np.testing.assert_allclose(outputs, free_run(m, tape), rtol=1e-7, atol=1e-7)
+
+
 # ---------------------------------------------------------------------------- other drives
 
 
@@ -517,3 +531,9 @@ def test_threads_work_in_the_precision_of_their_caller(double):
     with jax.enable_x64(double):
         found = map_in_threads(lambda k: (k, jnp.arange(k, dtype=float).dtype.itemsize), range(7))
     assert found == [(k, 8 if double else 4) for k in range(7)]
+
+
+def test_threads_may_start_threads():
+    """All cores may be waiting for others already, so these work on one after another."""
+    found = map_in_threads(lambda k: sum(map_in_threads(lambda j: j * k, range(9))), range(20))
+    assert found == [36 * k for k in range(20)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..compiled import compiled, quickly_compiled
+from ..compiled import compiled, is_traced, quickly_compiled
 from ..simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, sensitivities
+from ..threads import CORES, map_in_threads
 from .parameters import Parameters
 from .whitening import Whitening
 
@@ -113,12 +115,34 @@ class Evaluation(NamedTuple):
 
 def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     """Simulate every run of the problem and compare it with the measurement."""
-    # Levenberg-Marquardt traces under an empty mesh; without a mesh everything would be traced a second time
-    with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-        # without whitening and nuisance, so that the simulation, slow to compile, is compiled only once
-        bare = replace(problem, whitening=None, nuisance=None)
-        simulated = (_evaluate if bare.parameters.effects else _evaluate_linear)(bare, unknowns)
+    # without whitening and nuisance, so that the simulation, slow to compile, is compiled only once
+    bare = replace(problem, whitening=None, nuisance=None)
+    has_effects = bool(bare.parameters.effects)
+    with _empty_mesh():
+        if has_effects and not is_traced(problem, unknowns):
+            simulated = _evaluate_in_threads(bare, unknowns)
+        else:
+            simulated = (_evaluate if has_effects else _evaluate_linear)(bare, unknowns)
         return whitened(problem, _without_nuisance(problem, simulated))
+
+
+def _evaluate_in_threads(problem: Problem, unknowns: Unknowns) -> Evaluation:
+    """The evaluation with the runs divided among threads, because XLA simulates all of them on one core."""
+    parts = problem.tape.parts(CORES if jax.default_backend() == "cpu" else 1)
+
+    def of_part(part: tuple[Tape, int]) -> list[np.ndarray]:
+        tape, blocks = part
+        with _empty_mesh():
+            evaluation = _evaluate(replace(problem, tape=tape), unknowns)
+        return [np.asarray(values)[:blocks] for values in evaluation]
+
+    by_signal = zip(*map_in_threads(of_part, parts), strict=True)
+    return Evaluation(*(jnp.asarray(np.concatenate(values)) for values in by_signal))
+
+
+def _empty_mesh() -> AbstractContextManager[None]:
+    """Levenberg-Marquardt traces under an empty mesh; without a mesh everything would be traced a second time."""
+    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ()))
 
 
 def whitened(problem: Problem, plain: Evaluation) -> Evaluation:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -61,13 +62,20 @@ class Whitening(eqx.Module):
     ) -> Float[Array, "blocks 2 samples columns"]:
         """Whiten columns such as residuals, in A and rad/s."""
         blocks, outputs, samples, columns = signal.shape
-        in_time = jnp.moveaxis(signal, 1, 2).reshape(-1, CHUNK * outputs, columns)
-        chunks = samples // CHUNK
-        of_chunk = jnp.repeat(jnp.asarray(run), chunks, total_repeat_length=len(in_time))
-        goes_on = (jnp.roll(of_chunk, 1) == of_chunk).at[0].set(False)
-        before = jnp.where(goes_on[:, None, None], jnp.roll(in_time, 1, axis=0), 0.0)
-        window = jnp.concatenate([before, in_time], axis=1)
-        white = jnp.einsum("kij,kjc->kic", self.bands[of_chunk], window)
+        run = jnp.asarray(run)
+        chunks = jnp.moveaxis(signal, 1, 2).reshape(blocks, -1, CHUNK * outputs, columns)
+        goes_on = (jnp.roll(run, 1) == run).at[0].set(False)
+        last = jnp.where(goes_on[:, None, None, None], jnp.roll(chunks[:, -1:], 1, axis=0), 0.0)
+        before = jnp.concatenate([last, chunks[:, :-1]], axis=1)
+        window = jnp.concatenate([before, chunks], axis=2)
+
+        def of_block(
+            block: tuple[Int[Array, ""], Float[Array, "chunks seen columns"]],
+        ) -> Float[Array, "chunks white columns"]:
+            return jnp.einsum("ij,kjc->kic", self.bands[block[0]], block[1])
+
+        # block after block: all at once, every block would have its own copy of the bands, in four times the time
+        white = jax.lax.map(of_block, (run, window))
         white = jnp.moveaxis(white.reshape(blocks, samples, outputs, columns), 2, 1)
         return white * self.usable[..., None]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -141,13 +142,38 @@ class Tape(eqx.Module):
         return self.initial.shape[0]
 
     def of_runs(self, runs: Sequence[int]) -> Tape:
-        """The tape of some runs, padded to one of few array shapes with blocks of other runs at weight 0."""
-        mine = np.isin(np.asarray(self.run), runs)
-        blocks = np.argsort(~mine, kind="stable")[: _round_up(int(mine.sum()))]
-        counting = replace(self, weight=self.weight * mine[:, None, None])
+        """The tape of some runs, padded to one of few array shapes."""
+        blocks = np.flatnonzero(np.isin(np.asarray(self.run), runs))
+        return self._of_blocks(blocks, _round_up(len(blocks)))
+
+    def parts(self, count: int) -> list[tuple[Tape, int]]:
+        """The tape cut between runs into at most `count` parts of similar length, padded to one array shape; and the
+        number of blocks of each, without the padding."""
+        run, blocks = np.asarray(self.run), self.value.shape[0]
+        begins = np.unique(run, return_index=True)[1]
+        even = np.arange(1, count) * blocks / count
+        cuts = begins[np.argmin(np.abs(begins[:, None] - even), axis=0)]
+        ends = np.unique([0, *cuts, blocks])
+        longest = _round_up(int(np.diff(ends).max()))
+        return [
+            (self._of_blocks(np.arange(first, end), longest), int(end - first))
+            for first, end in pairwise(ends)
+        ]
+
+    def _of_blocks(self, blocks: Int[np.ndarray, " _"], size: int) -> Tape:
+        """The tape of some blocks, padded to `size` by the last one, with weight 0."""
+        padded = np.pad(blocks, (0, size - len(blocks)), mode="edge")
+        is_padding = np.arange(size) >= len(blocks)
         names = ("value", "load", "measured", "weight", "run", "begins", "grid", "turn", "rise")
-        signals = {name: getattr(counting, name) for name in names}
-        return replace(counting, **{n: s if s is None else s[blocks] for n, s in signals.items()})
+        signals = {name: getattr(self, name) for name in names}
+        taken = replace(
+            self, **{n: None if s is None else np.asarray(s)[padded] for n, s in signals.items()}
+        )
+        return replace(
+            taken,
+            weight=np.where(is_padding[:, None, None], 0.0, taken.weight),
+            begins=taken.begins | is_padding,
+        )
 
     def blocks_of(self, run: int) -> Bool[np.ndarray, " blocks"]:
         """Mask of the blocks of one run."""
