@@ -105,7 +105,7 @@ class StepwiseSelection:
         ways = [self._by_evidence, self._by_likeliest_effect, self._by_unfiltered_misfit]
         if found.unexplained < ABSORBED_SHARE:
             ways = [self._by_unfiltered_misfit, self._by_evidence, self._by_likeliest_effect]
-        ways.append(self._by_exchange)
+        ways += [self._by_earlier_evidence, self._by_exchange]
         models = (self._accepted(current, found, way(current, found)) for way in ways)
         return next(filter(None, models), None)
 
@@ -175,23 +175,42 @@ class StepwiseSelection:
         """The current model with the effect of the largest gain, however small that is, if it then leaves little.
 
         An effect gains more in a refit than to first order if its absence biases the parameters of others, or if the
-        motor's have moved far to compensate for two effects. Not tried where what is left may be model-form error or a
-        ripple of the speed sensor.
+        motor's have moved far to compensate for two effects.
         """
-        full = len(current.effects) == MAX_EFFECTS
-        if (
-            full
-            or found.p_value >= FALSE_ALARM
-            or found.may_be_model_form_error(current)
-            or found.is_sensor_ripple()
-        ):
+        if not self._is_room_for_another(current, found):
             return None
         if current.effects:
             others = [s for s in clear_signals(found) if effect_of(s) not in current.effects]
             likeliest = sorted(others, key=lambda s: -s.gain)[:1]
         else:
             likeliest = shortlist(current, found)
-        better = self._better(current, found, self._with_signals(current, found, likeliest))
+        return self._if_little_is_left(current, found, likeliest)
+
+    def _by_earlier_evidence(self, current: Model, found: Assessment) -> Model | None:
+        """The current model with the effect of the largest gain among those that were clear before its own were added,
+        if it then leaves little: the whitening filter of what is left now may absorb it."""
+        if not self._is_room_for_another(current, found):
+            return None
+        present = set(current.effects)
+        earlier = [self.assess(m) for m in self.superseded if set(m.effects) < present]
+        clear = {effect_of(s) for assessment in earlier for s in clear_signals(assessment)}
+        others = [s for s in found.candidate_signals if effect_of(s) in clear - present]
+        return self._if_little_is_left(current, found, sorted(others, key=lambda s: -s.gain)[:1])
+
+    def _is_room_for_another(self, current: Model, found: Assessment) -> bool:
+        """Whether one more effect may be missing, rather than model-form error or a ripple of the speed sensor."""
+        return (
+            len(current.effects) < MAX_EFFECTS
+            and found.p_value < FALSE_ALARM
+            and not found.may_be_model_form_error(current)
+            and not found.is_sensor_ripple()
+        )
+
+    def _if_little_is_left(
+        self, current: Model, found: Assessment, signals: Sequence[Signal]
+    ) -> Model | None:
+        """The best of the models with the effect of each signal, in a form in which it leaves little."""
+        better = self._better(current, found, self._with_signals(current, found, signals))
         return self._in_form_that_settles(
             lambda model: self._leaves_little(current, model), current, better
         )

@@ -41,6 +41,8 @@ SHORT_REFIT_STEPS = 8
 SAME_OPTIMUM_RATIO = 1.05
 # A fuller form whose short refits leave no less than this share of the simple form's misfit is searched no further
 MAX_FULLER_MISFIT = 0.9
+# A fuller form held where it clearly acts is fitted no further if a short refit leaves so many times the misfit
+MAX_HELD_MISFIT = 4.0
 
 # Fits a model; None if physics forbids it
 Refit = Callable[[], Model | None]
@@ -121,8 +123,9 @@ class Refits:
         assert model is not None
         return model
 
-    def with_fuller_form_held(self, current: Model, white: Whitener, effect: str) -> Model:
-        """The current model with a fuller form of an effect, whose extra parameters are held where they clearly act."""
+    def with_fuller_form_held(self, current: Model, white: Whitener, effect: str) -> Model | None:
+        """The current model with a fuller form of an effect, whose extra parameters are held where they clearly act;
+        None if a short refit shows that it fits far worse."""
         fuller = FULLER[effect]
         effects = (*(e for e in current.effects if e != effect), fuller.effect)
         given, start = self.starts.from_simple_form(current, effect, effects)
@@ -132,7 +135,13 @@ class Refits:
             held.add("Kt")
         free = jnp.asarray([name not in held for name in given.problem.parameters.names])
         given = given._replace(problem=replace(given.problem, free=free))
-        return refit_from(effects, given, start, white)
+        misfit = polish(
+            with_whitening(current.given, white).problem, current.fit.optimum, 0
+        ).fitness
+        end = polish(with_whitening(given, white).problem, start, SHORT_REFIT_STEPS).optimum
+        if end.fitness > MAX_HELD_MISFIT * misfit:
+            return None
+        return refit_from(effects, given, end, white)
 
     def without(self, model: Model, effect: str, white: Whitener) -> Model:
         """The model without one of its effects; fitted again if the larger one's parameters beat the stored fit."""

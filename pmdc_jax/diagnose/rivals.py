@@ -35,7 +35,7 @@ def rivals_of(
     simple = [effect for effect in chosen.effects if effect in FULLER]
     fuller = [refits.with_fuller_form_held(chosen, white, effect) for effect in simple]
     limit = comparison.fitted(chosen, white).squares + RULED_OUT
-    return rivals + [m for m in fuller if comparison.fitted(m, white).squares < limit]
+    return rivals + [m for m in fuller if m and comparison.fitted(m, white).squares < limit]
 
 
 def p_values_without(
