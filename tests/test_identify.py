@@ -913,6 +913,7 @@ INVALID = {
     "twice the same name": (lambda r: identify([r[0], r[0]]), "two runs have this name"),
     "in training and hold-out": (lambda r: identify(r, holdout=[r[0]]), "two runs"),
     "unknown parameter tied": (lambda r: identify(r, tie=(("Kt", "Ke"),)), "Ke"),
+    "tied to another unit": (lambda r: identify(r, tie=(("R", "L"),)), "different units"),
     "tied to itself": (lambda r: identify(r, tie=(("Kt", "Kt"),)), "circle"),
     "tied in a circle": (lambda r: identify(r, tie=(("Kt", "Kb"), ("Kb", "Kt"))), "circle"),
     "tied twice": (lambda r: identify(r, tie=(("Kt", "Kb"), ("Kt", "R"))), "tie"),

@@ -172,6 +172,9 @@ def _check_arguments(
             raise InputError(
                 "--tie", f"{target}={source} forms a circle or ties a known value", "Drop one"
             )
+        if {target, source} != {"Kt", "Kb"}:
+            what = f"{target} and {source} are measured in different units"
+            raise InputError("--tie", what, "Tie Kt=Kb: in SI units these two are equal")
     for name, value in (known or {}).items():
         if not 0 < value < np.inf:
             raise InputError("--known", f"{name}={value} is not positive", "Give a value in SI")
