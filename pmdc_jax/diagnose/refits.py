@@ -267,8 +267,8 @@ def _refit_with_population(
     factors: Mapping[str, float],
     seed: int,
 ) -> Model:
-    """The better of two refits, by the whitening filter of the residuals at the start: one from there, and one from the
-    best of a population around where that ended."""
+    """A refit; or a second one from the best of a population around where the first ended, if that point is better and
+    so is the refit, by the whitening filter of the residuals at the start."""
     white = whitener(residuals_of(given, polish(given.problem, start, steps=0)))
     whitened = with_whitening(given, white).problem
 
@@ -278,6 +278,8 @@ def _refit_with_population(
     model = refit_from(effects, given, start, white)
     nearer = {name: np.sqrt(factor) for name, factor in factors.items()}
     elsewhere = _best_around(given, model.fit.optimum, nearer, seed)
+    if elsewhere.fitness >= _misfit(model):
+        return model
     return min((model, refit_from(effects, given, elsewhere, white)), key=whitened_misfit)
 
 
