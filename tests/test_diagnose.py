@@ -28,7 +28,7 @@ from pmdc_jax.diagnose.library import Change, Library
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
 from pmdc_jax.diagnose.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.periodic import common_line, spectrum
-from pmdc_jax.diagnose.pipeline import may_be_absent
+from pmdc_jax.diagnose.pipeline import implausible_effect, may_be_absent
 from pmdc_jax.diagnose.quantisation import ROUNDING_DRAWS, rounding_errors
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensor_changes
 from pmdc_jax.diagnose.rows import _batches
@@ -36,7 +36,7 @@ from pmdc_jax.diagnose.shortlist import effect_of, most_promising, shortlist
 from pmdc_jax.diagnose.signals import Screen, Signal, gain_common_to_waves, log_p_value
 from pmdc_jax.diagnose.starts import common_phase
 from pmdc_jax.diagnose.trials import TRIALS
-from pmdc_jax.effects import EFFECTS
+from pmdc_jax.effects import EFFECTS, ShaftCompliance
 from pmdc_jax.identify.identification import Estimate, Identification
 from pmdc_jax.identify.noise_model import Series, whitener
 from pmdc_jax.identify.polish import polish
@@ -369,6 +369,21 @@ def test_an_amplitude_with_an_interval_down_to_zero_may_be_none(
     estimate = Estimate(0.35, 0.1, interval, "", "identified")
     found = Mock(spec=Identification, parameters={f"{effect}.{field}": estimate})
     assert may_be_absent(found, effect, field) is may_be_zero
+
+
+@pytest.mark.parametrize(
+    ("damping_ratio", "implausible"), [(0.05, None), (3.0, "shaft_compliance")]
+)
+def test_a_shaft_that_cannot_ring_is_implausible(damping_ratio, implausible):
+    """The ends of s J and (1 - s) J oscillate at sqrt(k / (s (1 - s) J)), damped by d / (2 s (1 - s) J)."""
+    stiffness, share = 2.0, 0.6
+    reduced = share * (1 - share) * PAPER["J"]
+    rate = np.sqrt(stiffness / reduced)
+    shaft = ShaftCompliance(
+        *map(np.asarray, (stiffness, damping_ratio * 2 * rate * reduced, share))
+    )
+    motor = Motor(**{n: np.asarray(x) for n, x in PAPER.items()}, effects=(shaft,))
+    assert implausible_effect(motor) == implausible
 
 
 def test_a_gain_common_to_waves_of_all_periods_is_no_evidence():

@@ -8,6 +8,7 @@ import attrs
 import numpy as np
 import pytest
 from linear_motor import PAPER
+from scipy import signal
 
 from benchmarks import virtual_bench as vb
 from benchmarks.naming.cases import Bench, record
@@ -132,6 +133,22 @@ def test_a_ripple_of_the_speed_sensor_hides_no_friction():
     assert effect.name == "coulomb_friction"
     assert effect.parameters["torque_Nm"].value == pytest.approx(0.08, rel=0.01)
     assert sensor_ripple_of(found) == pytest.approx((0.01, 14), rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coulomb_Nm", [0.0, 0.08])
+def test_a_current_that_is_read_late_is_no_shaft(coulomb_Nm):
+    """An RC filter before the converter: the motor then seems to respond before its current, like a shaft with so much
+    damping that it could not ring."""
+    runs, lag = [], 4e-4
+    for run in recorded(vb.BenchMotor(**PAPER, coulomb_Nm=coulomb_Nm), 7, NOISE):
+        decay = np.exp(-(run.time[1] - run.time[0]) / lag)
+        late = signal.lfilter([1 - decay], [1, -decay], run.current)
+        runs.append(attrs.evolve(run, current=late))
+    found = diagnose(runs)
+    names = {effect.name for effect in found.effects}
+    assert "shaft_compliance" not in names
+    assert found.verdict == "not_in_library" or (coulomb_Nm and names == {"coulomb_friction"})
 
 
 @pytest.mark.slow

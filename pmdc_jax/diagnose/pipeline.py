@@ -10,12 +10,13 @@ import numpy as np
 from scipy import stats
 
 from ..compiled import free_memory_maps
-from ..effects import EFFECTS
+from ..effects import EFFECTS, ShaftCompliance
 from ..identify.identification import Identification, Role, RunFit
 from ..identify.noise import MIN_RELATIVE_NOISE
 from ..identify.prepare import prepare
 from ..identify.results import results_of
 from ..identify.solve import Solved, solve
+from ..motor import Motor
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..recording_file import Runs
@@ -47,6 +48,8 @@ CURVE_UNITS = {"mechanical": "N m", "electrical": "V", "sensor": ""}
 CERTAIN_P_VALUE = 1e-30
 # ... and one whose interval of the amplitude reaches down to this share of the estimate may be absent
 ABSENT_SHARE = 1e-2
+# Damping over critical damping from which a shaft is none: couplings of rubber reach 0.3
+MAX_DAMPING_RATIO = 2.0
 
 
 @double_precision
@@ -84,8 +87,11 @@ def diagnose(
     report("estimating the uncertainty", naming.chosen.fit.fitness)
     base = results_of(given, solved)
     final = _identification(naming, solved)
-    while (unneeded := _unneeded_effect(naming, final, selection.library)) is not None:
-        naming = selection.without(naming, unneeded)
+    while effect := (
+        implausible_effect(naming.chosen.motor)
+        or _unneeded_effect(naming, final, selection.library)
+    ):
+        naming = selection.without(naming, effect)
         final = _identification(naming, solved)
     before, after = (electrical_misfit(m) for m in (selection.base, naming.chosen))
     verdict = "not_in_library" if breaks_electrical_equation(before, after) else _verdict(naming)
@@ -124,6 +130,13 @@ def _identification(naming: Naming, solved: Solved) -> Identification:
     """The identification of the chosen motor."""
     given, fit = naming.final_fit
     return results_of(given, solved._replace(fit=fit))
+
+
+def implausible_effect(motor: Motor) -> str | None:
+    """The shaft, if its damping keeps it from any oscillation: it then stands for something else that is missing, such
+    as a current that was read late."""
+    shafts = (e for e in motor.effects if isinstance(e, ShaftCompliance))
+    return next((e.name for e in shafts if e.damping_ratio(motor) > MAX_DAMPING_RATIO), None)
 
 
 def _unneeded_effect(naming: Naming, final: Identification, library: Library) -> str | None:

@@ -34,6 +34,11 @@ class _TwoInertias(AbstractEffect):
     def load_at_rotor(self, load: Scalars) -> Scalars:
         return 0.0 * load
 
+    def damping_ratio(self, motor: Motor) -> Scalars:
+        """Damping over critical damping, d / (2 sqrt(k J s (1 - s))): below 1 the ends oscillate against each other."""
+        reduced = motor.J * self.load_share * (1 - self.load_share)
+        return self.damping_Nms_rad / (2 * jnp.sqrt(self.stiffness_Nm_rad * reduced))
+
     def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
         speed, twist = self.states
         net = self.torque(state) - load
