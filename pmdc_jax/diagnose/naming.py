@@ -181,7 +181,7 @@ class StepwiseSelection:
             return None
         if current.effects:
             others = [s for s in clear_signals(found) if effect_of(s) not in current.effects]
-            likeliest = sorted(others, key=lambda s: -s.gain)[:1]
+            likeliest = _of_largest_gain(others)
         else:
             likeliest = shortlist(current, found)
         return self._if_little_is_left(current, found, likeliest)
@@ -195,7 +195,7 @@ class StepwiseSelection:
         earlier = [self.assess(m) for m in self.superseded if set(m.effects) < present]
         clear = {effect_of(s) for assessment in earlier for s in clear_signals(assessment)}
         others = [s for s in found.candidate_signals if effect_of(s) in clear - present]
-        return self._if_little_is_left(current, found, sorted(others, key=lambda s: -s.gain)[:1])
+        return self._if_little_is_left(current, found, _of_largest_gain(others))
 
     def _is_room_for_another(self, current: Model, found: Assessment) -> bool:
         """Whether one more effect may be missing, rather than model-form error or a ripple of the speed sensor."""
@@ -415,3 +415,8 @@ class StepwiseSelection:
             rival = set(other.model.effects)
             if len(chosen - rival) == len(rival - chosen) == 1 and are_rivals(chosen, rival):
                 self.equivalents.setdefault(*(chosen - rival), set()).update(rival - chosen)
+
+
+def _of_largest_gain(signals: Sequence[Signal]) -> list[Signal]:
+    """The signal of the largest gain; empty if there is none."""
+    return sorted(signals, key=lambda s: -s.gain)[:1]

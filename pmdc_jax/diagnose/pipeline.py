@@ -134,7 +134,10 @@ def _identification(naming: Naming, solved: Solved) -> Identification:
 
 def implausible_effect(motor: Motor) -> str | None:
     """The shaft, if its damping keeps it from any oscillation: it then stands for something else that is missing, such
-    as a current that was read late."""
+    as a current that was read late.
+
+    Judged only once a set is chosen: on the way to a gear, the play may appear as damping of a shaft.
+    """
     shafts = (e for e in motor.effects if isinstance(e, ShaftCompliance))
     return next((e.name for e in shafts if e.damping_ratio(motor) > MAX_DAMPING_RATIO), None)
 

@@ -41,7 +41,7 @@ SHORT_REFIT_STEPS = 8
 SAME_OPTIMUM_RATIO = 1.05
 # A fuller form whose short refits leave no less than this share of the simple form's misfit is searched no further
 MAX_FULLER_MISFIT = 0.9
-# A fuller form held where it clearly acts is fitted no further if a short refit leaves so many times the misfit
+# A fuller form held where it clearly acts is fitted no further if a short refit leaves so many times the squares
 MAX_HELD_MISFIT = 4.0
 
 # Fits a model; None if physics forbids it
@@ -135,11 +135,9 @@ class Refits:
             held.add("Kt")
         free = jnp.asarray([name not in held for name in given.problem.parameters.names])
         given = given._replace(problem=replace(given.problem, free=free))
-        misfit = polish(
-            with_whitening(current.given, white).problem, current.fit.optimum, 0
-        ).fitness
         end = polish(with_whitening(given, white).problem, start, SHORT_REFIT_STEPS).optimum
-        if end.fitness > MAX_HELD_MISFIT * misfit:
+        squares = end.fitness * given.problem.most_samples
+        if squares > MAX_HELD_MISFIT * self.comparison.fitted(current, white).squares:
             return None
         return refit_from(effects, given, end, white)
 
