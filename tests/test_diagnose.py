@@ -13,6 +13,7 @@ import pytest
 from attrs import evolve
 from linear_motor import PAPER
 from scipy import stats
+from scipy.linalg import block_diag
 
 from benchmarks import virtual_bench as vb
 from experiments.bench import recording
@@ -34,7 +35,7 @@ from pmdc_jax.diagnose.response import kicks, path_of, respond, sensor_changes
 from pmdc_jax.diagnose.rows import _batches
 from pmdc_jax.diagnose.shortlist import effect_of, most_promising, shortlist
 from pmdc_jax.diagnose.signals import Screen, Signal, gain_common_to_waves, log_p_value
-from pmdc_jax.diagnose.starts import common_phase
+from pmdc_jax.diagnose.starts import Starts, common_phase
 from pmdc_jax.diagnose.trials import TRIALS
 from pmdc_jax.effects import EFFECTS, ShaftCompliance
 from pmdc_jax.identify.identification import Estimate, Identification
@@ -301,6 +302,24 @@ def random_evidence(seed: int, runs: int = 3, rows: int = 400):
     return J, own, X, r
 
 
+def test_late_readings_are_noise_of_their_own_covariance():
+    """Regressed with what is known of them, they leave as much as generalised least squares."""
+    J, own, X, r = random_evidence(1)
+    late, deviation = [x[:, :1] for x in X], 0.03
+    pieces = [[np.hstack(p)] for p in zip(J, late, X, [y[:, None] for y in r], own, strict=True)]
+    known = np.zeros((1, pieces[0][0].shape[1]))
+    known[0, J[0].shape[1]] = 1 / deviation
+    pieces[0].append(known)
+    evidence = gather_evidence(pieces, J[0].shape[1], own[0].shape[1], late_readings=1)
+
+    c = np.concatenate(late)[:, 0]
+    white = np.linalg.cholesky(np.linalg.inv(np.eye(len(c)) + deviation**2 * np.outer(c, c))).T
+    A = white @ np.hstack([np.concatenate(J), block_diag(*own)])
+    y = white @ np.concatenate(r)
+    left = y - A @ np.linalg.lstsq(A, y)[0]
+    assert evidence.regress().squares == pytest.approx(left @ left, rel=1e-9)
+
+
 @pytest.mark.parametrize("own_phase", [False, True])
 def test_regression_matches_least_squares_by_numpy(own_phase):
     """Applied to the whole matrix, with separate columns for each run's own unknowns."""
@@ -424,7 +443,10 @@ def test_rounding_errors_of_a_coarse_reading_are_no_evidence():
             residual.values[..., None],
         )
         rows = np.concatenate([*parts, own.values], -1)[:, 0] * np.sqrt(12)
-        evidence, drag = gather_evidence([[rows]], 1, 1, ROUNDING_DRAWS), Block((1,))
+        evidence, drag = (
+            gather_evidence([[rows]], 1, 1, rounding_errors=ROUNDING_DRAWS),
+            Block((1,)),
+        )
         gain = evidence.regress().squares - evidence.regress([drag]).squares
         noise = evidence.rounding_dispersion(drag)
         false_alarms["as if white"] += stats.chi2.sf(gain, 1) < 0.01
@@ -681,15 +703,31 @@ def test_runs_of_unknown_initial_angle_are_aligned_with_the_first():
     np.testing.assert_allclose(np.cos(phases - phase - 7.0 * corrections), 1.0, atol=1e-3)
 
 
-def test_effects_that_need_a_current_are_not_tried_without_one(x64):
-    """Voltage and speed alone do not determine the scale of the current."""
+def model_at(coordinates: list[float], effects: tuple[str, ...] = (), **missing: None) -> Model:
+    """A motor, not fitted, with these search coordinates, and a run of the bench without what is `missing`."""
     rng = np.random.default_rng(7)
     columns = vb.record(vb.BenchMotor(**PAPER), vb.prbs(rng, 2.0), rng, vb.Noise())
-    run = evolve(recording("no current", columns), current=None, load=None)
-    given = prepare([run], [], unloaded=True)
-    coordinates = jnp.log(jnp.asarray([PAPER[n] for n in PARAMETERS]))
-    start = Unknowns(coordinates, RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1))))
-    base = model_of((), given, polish(given.problem, Optimum(start, np.inf, (), False), steps=0))
+    run = evolve(recording("run", columns), load=None, **missing)
+    given = prepare([run], [], effects=[EFFECTS[e] for e in effects], unloaded=True)
+    start = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1))))
+    point = Optimum(start, np.inf, (), False)
+    return model_of(effects, given, polish(given.problem, point, steps=0))
+
+
+def test_an_undetermined_effect_without_start_values_is_kept_as_it_is(x64):
+    """As of one that a global search added: friction too small for the runs, to which another effect is added."""
+    coordinates = np.log([*(PAPER[n] for n in PARAMETERS), 2e-10]).tolist()
+    model = model_at(coordinates, ("coulomb_friction",))
+    assert model.undetermined == {"coulomb_friction.torque_Nm"}
+    values = {"current_sensor_offset": {"offset_A": 0.5}}
+    effects = ("coulomb_friction", "current_sensor_offset")
+    start = Starts(SCALES).from_model(model, effects, values).point.unknowns.coordinates
+    np.testing.assert_allclose(start, [*coordinates, 0.5])
+
+
+def test_effects_that_need_a_current_are_not_tried_without_one(x64):
+    """Voltage and speed alone do not determine the scale of the current."""
+    base = model_at([np.log(PAPER[n]) for n in PARAMETERS], current=None)
     tried = {candidate.effect for candidate in Library(base).candidates}
     assert {"coulomb_friction", "speed_sensor_delay"} <= tried
     assert not any(EFFECTS[name].needs_current for name in tried)

@@ -151,6 +151,26 @@ def test_a_current_that_is_read_late_is_no_shaft(coulomb_Nm):
     assert found.verdict == "not_in_library" or (coulomb_Nm and names == {"coulomb_friction"})
 
 
+def by_euler_steps(run: Recording, steps: int, rng: np.random.Generator) -> Recording:
+    """The run by an explicit Euler simulation of the linear motor, with so many steps per sample."""
+    R, L, Kb, Kt, J, f = (PAPER[name] for name in ("R", "L", "Kb", "Kt", "J", "f"))
+    h = (run.time[1] - run.time[0]) / steps
+    step = np.eye(2) + h * np.array([[-R / L, -Kb / L], [Kt / J, -f / J]])
+    gain = h * np.diag([1 / L, -1 / J])
+    gain_of_sample = sum(np.linalg.matrix_power(step, k) for k in range(steps)) @ gain
+    system = (np.linalg.matrix_power(step, steps), gain_of_sample, np.eye(2), np.zeros((2, 2)), 1)
+    inputs = np.stack([run.voltage, run.load], axis=1)
+    current, speed = (signal.dlsim(system, inputs)[1] + rng.normal(0, (0.1, 0.5), inputs.shape)).T
+    return attrs.evolve(run, current=current, speed=speed)
+
+
+def test_the_steps_of_a_simple_simulator_are_no_effect():
+    """Explicit Euler steps of a tenth of a sample make the speed half a step late, which is clear but means nothing."""
+    rng = np.random.default_rng(39)
+    runs = [by_euler_steps(run, 10, rng) for run in recorded(vb.BenchMotor(**PAPER), 8, NOISE)]
+    assert diagnose(runs).verdict == "none_detected"
+
+
 @pytest.mark.slow
 def test_a_voltage_quantised_to_ten_bits_is_not_diagnosed_as_a_dead_zone():
     """Each level is off by up to half a bit for as long as it lasts; the motor is driven by the exact voltage."""

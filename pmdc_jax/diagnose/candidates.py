@@ -59,6 +59,11 @@ class Candidate(NamedTuple):
         return self.columns[-1][self.amplitude]
 
     @property
+    def min_amplitude(self) -> float:
+        """Lower limit of the amplitude: that to which a finite size may be scaled; none of an effect that is linear."""
+        return self.unit / MAX_SCALING if self.units[-1] == 1.0 else 0.0
+
+    @property
     def max_amplitude(self) -> float:
         """Upper limit of the amplitude: the scale itself, which no real motor exceeds; infinite at finite sizes."""
         return np.inf if self.units[-1] == 1.0 else self.units[-1] / SMALL
@@ -69,6 +74,8 @@ MakeCandidates = Callable[[str, Scales], list[Candidate]]
 
 # A small amplitude, as a share of its scale: the response to it is practically a derivative
 SMALL = 1e-4
+# A finite size may be scaled by this factor, up or down
+MAX_SCALING = 5.0
 # An amplitude in SI units that stands for zero where it must be positive
 TINY = 1e-12
 # Numbers of periods per turn that are tried for effects of the rotor angle
@@ -107,12 +114,13 @@ def amplitude_candidates(
 
 
 def finite_candidates(field: str, grid: Callable[[Scales], Sequence[float]]) -> MakeCandidates:
-    """An effect tried at finite sizes; the coefficient scales each size, within a factor of 5 either way."""
+    """An effect tried at finite sizes; the coefficient scales each size, by a factor of `MAX_SCALING` at most."""
 
     def make(name: str, scales: Scales) -> list[Candidate]:
         def candidate(size: float) -> Candidate:
             def build(c: np.ndarray, coulomb_torque: float) -> Values | None:
-                return {field: size * float(np.clip(c[0], 0.2, 5.0))} if c[0] > 0 else None
+                scaling = float(np.clip(c[0], 1 / MAX_SCALING, MAX_SCALING))
+                return {field: size * scaling} if c[0] > 0 else None
 
             return Candidate(name, ({field: size},), (1.0,), build, field)
 

@@ -34,7 +34,7 @@ def consecutive_blocks(orders: Iterable[tuple[int, bool]], first: int) -> list[B
 
 
 class Regression(NamedTuple):
-    """A least-squares fit by the motor's own parameters and some blocks."""
+    """A least-squares fit by the motor's own parameters, the late readings and some blocks."""
 
     squares: float  # sum of the squared white residuals that are left
     parameter_changes: Float[np.ndarray, " parameters"]  # of the motor's search coordinates
@@ -53,8 +53,8 @@ class _Solution(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """Inner products of the white rows of every run: the motor's parameters first, then the columns of what may be
-    missing, those of rounding errors, and the residual last.
+    """Inner products of the white rows of every run: the motor's parameters first, late readings, then the columns of
+    what may be missing, those of rounding errors, and the residual last.
 
     The run's own unknowns (its initial state, its load) are nuisance parameters: they are projected out, and columns
     that can hardly be told from them are set to zero.
@@ -62,18 +62,23 @@ class Evidence(NamedTuple):
 
     products: Float[np.ndarray, "runs columns columns"]
     parameters: int  # number of columns that are the motor's
-    rows: int  # number of white rows in all runs
+    late_readings: int  # number of columns that are those
     rounding_columns: tuple[int, ...] = ()  # of the rounding errors of coarse converters
+
+    @property
+    def first_column(self) -> int:
+        """The first column of what may be missing."""
+        return self.parameters + self.late_readings
 
     def regress(
         self, blocks: Sequence[Block] = (), min_eigenvalue: float = MIN_EIGENVALUE
     ) -> Regression:
-        """Least squares of the residual on the motor's parameters and some blocks.
+        """Least squares of the residual on the motor's parameters, the late readings and some blocks.
 
         Directions whose eigenvalue, with columns scaled to unit length, is below `min_eigenvalue` are not moved.
         """
         found = self._solve(blocks, [-1], min_eigenvalue)
-        first_shared, first_per_run = self.parameters, 0
+        first_shared, first_per_run = self.first_column, 0
         coefficients, errors = [], []
         for block in blocks:
             width = len(block.columns)
@@ -93,10 +98,10 @@ class Evidence(NamedTuple):
     def _solve(
         self, blocks: Sequence[Block], targets: Sequence[int], min_eigenvalue: float
     ) -> _Solution:
-        """Least squares of the `targets`, which are columns, on the motor's parameters and some blocks."""
+        """Least squares of the `targets`, which are columns, on what `regress` has."""
         per_run = np.array([c for b in blocks if b.per_run for c in b.columns], int)
         shared = [
-            *range(self.parameters),
+            *range(self.first_column),
             *(c for b in blocks if not b.per_run for c in b.columns),
         ]
         kept, n = np.array([*shared, *targets]), len(shared)
@@ -150,23 +155,23 @@ def _errors(inverse: Float[np.ndarray, "*runs n n"]) -> Float[np.ndarray, "*runs
 
 
 def gather_evidence(
-    runs: Iterable[Iterable[Float[np.ndarray, "rows _"]]],
+    runs: Iterable[Iterable[Float[np.ndarray, "_ _"]]],
     parameters: int,
     run_unknowns: int,
+    late_readings: int = 0,
     rounding_errors: int = 0,
 ) -> Evidence:
     """Gather the evidence from white rows, those of each run in several pieces.
 
-    **Arguments**: `runs`, the pieces of each run, with columns for the motor's `parameters`, what may be missing, the
-    simulated `rounding_errors` of coarse converters, the residual, and last the `run_unknowns`; the numbers are how
-    many columns each has.
+    **Arguments**: `runs`, the pieces of each run, with columns for the motor's `parameters`, the `late_readings`, what
+    may be missing, the simulated `rounding_errors` of coarse converters, the residual, and last the `run_unknowns`; the
+    numbers are how many columns each has.
     """
-    products, rows = [], 0
+    products = []
     for pieces in runs:
         total = np.zeros(())
         for piece in pieces:
             total = total + piece.T @ piece
-            rows += len(piece)
         kept, nuisance = slice(0, -run_unknowns), slice(-run_unknowns, None)
         cross = total[nuisance, kept]
         projected = total[kept, kept] - cross.T @ _inverse(total[nuisance, nuisance]) @ cross
@@ -174,4 +179,4 @@ def gather_evidence(
         products.append(projected * distinct * distinct[:, None])
     found, residual = np.array(products), products[0].shape[0] - 1
     rounding = (k for k in range(residual - rounding_errors, residual) if found[:, k, k].any())
-    return Evidence(found, parameters, rows, tuple(rounding))
+    return Evidence(found, parameters, late_readings, tuple(rounding))

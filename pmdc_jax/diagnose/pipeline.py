@@ -282,7 +282,8 @@ def _detectable_effects(found: Screen) -> tuple[Detectable, ...]:
             continue
         error = float(np.min(found.evidence.regress([block]).errors[0][..., -1]))
         error *= np.sqrt(found.evidence.rounding_dispersion(block))
-        amplitude = max(float(needed * error * candidate.unit), found.sensor_floor(candidate))
+        least = max(found.sensor_floor(candidate), candidate.min_amplitude)
+        amplitude = max(float(needed * error * candidate.unit), least)
         known = smallest.get(candidate.effect)
         if error > 0 and amplitude < (known.amplitude if known else candidate.max_amplitude):
             unit = EFFECTS[candidate.effect].ranges[field].unit

@@ -1,5 +1,5 @@
 """The rows of the regression: in every training run, derivatives by the motor's parameters and responses to terms that
-may be missing.
+may be missing; also what late readings and rounding change.
 
 The columns are kept in single precision, and whitened and multiplied in double, some rows at a time, so that a million
 samples fit into memory.
@@ -26,30 +26,43 @@ from .response import Path, respond
 
 # Samples that are whitened at once, to limit the memory
 CHUNK = 2048
+# Standard deviation of how late the readings of a channel are, in sampling intervals: converters read one channel after
+# the other, and simulators go in small steps
+TIMING_ERROR = 0.03
 
 
 class Rows(NamedTuple):
-    """One training run: its fit, the responses to every candidate and curve, and rounding errors; A and rad/s."""
+    """One training run: its fit, what late readings change, the responses to every candidate and curve, and rounding
+    errors; A and rad/s."""
 
     fit: RunSeries
+    late: Float[np.ndarray, "samples outputs outputs"]  # by output, if that is an interval late
     columns: Float[np.ndarray, "samples outputs columns"]
     rounding: Float[np.ndarray, "samples outputs draws"]
 
     def white(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
-        """Whitened rows, `CHUNK` samples at a time; columns in the order that `gather_evidence` expects."""
+        """Whitened rows, `CHUNK` samples at a time; columns in the order that `gather_evidence` expects.
+
+        The last rows of the first run say that no reading is late, to within `TIMING_ERROR`.
+        """
         shared, own, residual, _ = self.fit
+        columns = (
+            shared.values,
+            self.late,
+            self.columns,
+            self.rounding,
+            residual.values[..., None],
+            own.values,
+        )
         back = len(whiten.filters[run])
         for first in range(back, len(residual.values), CHUNK):
             part = slice(first - back, first + CHUNK)
-            columns = (
-                shared.values[part],
-                self.columns[part],
-                self.rounding[part],
-                residual.values[part, :, None],
-                own.values[part],
-            )
-            values = np.concatenate(columns, axis=-1)
+            values = np.concatenate([x[part] for x in columns], axis=-1)
             yield whiten(run, Series(values, residual.known[part], residual.kind))
+        if run == 0:
+            outputs, parameters = self.late.shape[-1], shared.values.shape[-1]
+            width = sum(x.shape[-1] for x in columns)
+            yield np.eye(outputs, width, parameters) / TIMING_ERROR
 
 
 def gather_rows(
@@ -59,8 +72,13 @@ def gather_rows(
     `bare`, propagates."""
     tape, fits = model.given.problem.tape, series_of_runs(model)
     rows_of_runs = [
-        Rows(f, np.empty((*f.residual.values.shape, count), np.float32), rounding_errors(f, k))
-        for k, f in enumerate(fits)
+        Rows(
+            fit,
+            _late_readings(fit),
+            np.empty((*fit.residual.values.shape, count), np.float32),
+            rounding_errors(fit, k),
+        )
+        for k, fit in enumerate(fits)
     ]
     first = 0
     for change, width in _batches(changes, columns_at_once(tape)):
@@ -70,6 +88,13 @@ def gather_rows(
             rows.columns[..., first : first + width] = series_of(tape, run, signal).values
         first += width
     return rows_of_runs
+
+
+def _late_readings(fit: RunSeries) -> Float[np.ndarray, "samples outputs outputs"]:
+    """What changes where one output is read a sampling interval late; the last axis is the output."""
+    simulated = fit.simulated.values
+    change = -np.diff(simulated, axis=0, prepend=simulated[:1])
+    return change[..., None] * np.eye(change.shape[1])
 
 
 @compiled

@@ -25,15 +25,14 @@ def screen(model: Model, library: Library) -> Screen:
     """
     tape, path = model.given.problem.tape, model.path
     curves, changes_of_curves = curves_along(library, tape, path)
-    parameters = model.given.problem.free.shape[0]
     orders = [(c.order, c.own_phase) for c in library.candidates]
     orders += [(c.order, c.per_run) for c in curves]
-    blocks = consecutive_blocks(orders, parameters)
     count = sum(order for order, _ in orders)
     changes = chain(library.changes(tape, path), changes_of_curves)
     rows = gather_rows(model, library.bare, path, changes, count)
     scaling = scaling_whitener([run.fit.residual for run in rows])
     unfiltered = _evidence(rows, scaling)
+    blocks = consecutive_blocks(orders, unfiltered.first_column)
     found = Screen(
         evidence=unfiltered,
         white=scaling,
@@ -58,8 +57,13 @@ def share_beyond_curves(found: Screen) -> float:
 def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
     """The evidence from all rows, whitened by one filter."""
     white = (run.white(k, whiten) for k, run in enumerate(rows))
+    first = rows[0]
     return gather_evidence(
-        white, rows[0].fit.shared.values.shape[-1], UNKNOWNS_PER_RUN, ROUNDING_DRAWS
+        white,
+        parameters=first.fit.shared.values.shape[-1],
+        run_unknowns=UNKNOWNS_PER_RUN,
+        late_readings=first.late.shape[-1],
+        rounding_errors=ROUNDING_DRAWS,
     )
 
 
@@ -77,11 +81,12 @@ def _without_clearest(found: Screen, rows: Sequence[Rows]) -> list[Series]:
         key=lambda s: s.log_p,
     ).block
     best = found.evidence.regress([clearest])
-    columns = np.array(clearest.columns) - found.evidence.parameters
+    columns = np.array(clearest.columns) - found.evidence.first_column
     series = []
-    for k, (fit, X, _) in enumerate(rows):
+    for k, (fit, _, X, _) in enumerate(rows):
         coefficients = best.coefficients[0][k] if clearest.per_run else best.coefficients[0]
         known = fit.residual.known
+        # late readings are noise, and stay
         rest = fit.residual.values - fit.shared.values @ best.parameter_changes
         rest = rest - X[..., columns] @ coefficients
         own = fit.own.values

@@ -110,8 +110,8 @@ class Starts:
         values: Mapping[str, Values],
         changes: np.ndarray | float,
     ) -> list[float]:
-        """Search coordinates of some parameters: those of the current model where its runs determine them, else start
-        values, given or the first of the effect."""
+        """Search coordinates of some parameters: those of the current model where its runs determine them or no start
+        value is known, as of an effect from a global search; else start values, given or the first of the effect."""
         names, fitted = current.given.problem.parameters.names, current.fit.unknowns.coordinates
         # the regression may change a parameter that no run determines by any amount
         near = np.asarray(fitted) + np.clip(changes, -1.0, 1.0)
@@ -119,10 +119,12 @@ class Starts:
         coordinates, undetermined = [], current.undetermined
         for name, log in zip(parameters.names, parameters.logarithmic, strict=True):
             effect, _, field = name.partition(".")
-            if name in by_name and not (field and name in undetermined):
+            start = values.get(effect, self.first_values.get(effect))
+            if name in by_name and (start is None or name not in undetermined):
                 coordinates.append(by_name[name])
             else:
-                value = values.get(effect, self.first_values.get(effect, {}))[field]
+                assert start is not None
+                value = start[field]
                 coordinates.append(np.log(max(value, 1e-300)) if log else value)
         return coordinates
 
