@@ -162,6 +162,25 @@ def test_effects_of_little_expected_gain_are_not_tried(gains, min_gain, listed):
     assert [effect_of(signal) for signal in found] == list(gains)[:listed]
 
 
+@pytest.mark.parametrize(
+    ("added", "misfit", "is_genuine"),
+    [
+        ("quadratic_drag", 0.3, True),
+        ("quadratic_drag", 0.5, False),
+        ("torque_constant_saturation", 0.3, True),  # of the torque, not the voltage
+        ("inductance_saturation", 0.3, False),  # a voltage over the current, too
+    ],
+)
+def test_a_decisive_effect_on_other_axes_is_no_model_form_error(added, misfit, is_genuine):
+    """Beside a brush drop of another formula, which leaves far more than noise."""
+    current = Mock(spec=Model, effects=("brush_voltage_drop",), fit=Mock(fitness=1.0))
+    better = Mock(spec=Model, effects=("brush_voltage_drop", added), fit=Mock(fitness=misfit))
+    selection = StepwiseSelection.__new__(StepwiseSelection)
+    selection._leaves_little = lambda current, better: False
+    found = Mock(spec=Assessment, exceeds_model_form_error=lambda model: False)
+    assert selection._is_genuine_improvement(current, found, better) == is_genuine
+
+
 @pytest.mark.parametrize("leaves_little", [True, False])
 def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(leaves_little):
     """Friction and drag, for which viscous friction compensates: no single effect gains much, but each more than

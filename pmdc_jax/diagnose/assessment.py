@@ -101,7 +101,7 @@ class Assessment(NamedTuple):
         if self.unexplained < MODEL_FORM_SHARE:
             return True
         clearest = self.clearest.term
-        own_curve = isinstance(clearest, Curve) and _has_axes_of(model, clearest)
+        own_curve = isinstance(clearest, Curve) and has_axes_of(model, clearest)
         within = self.unexplained < OWN_MODEL_FORM_SHARE
         return self._belongs_to(model) or bool(own_curve and within)
 
@@ -155,10 +155,10 @@ class Assessment(NamedTuple):
         assert isinstance(best_curve.term, Curve) and best is not None
         # of model-form error a curve over the effect's own variable explains nearly all
         own_curve = (
-            _has_axes_of(model, best_curve.term)
+            has_axes_of(model, best_curve.term)
             and best_curve.gain > CURVE_SHARE * self.clearest.gain
         )
-        return not (own_curve or _has_axes_of(model, EFFECTS[best.effect]))
+        return not (own_curve or has_axes_of(model, EFFECTS[best.effect]))
 
 
 def _gain(signal: Signal) -> float:
@@ -170,7 +170,7 @@ def _has_refit_only(model: Model) -> bool:
     return bool(set(model.effects) & set(REFIT_ONLY.values()))
 
 
-def _has_axes_of(model: Model, term: Curve | type[AbstractEffect]) -> bool:
+def has_axes_of(model: Model, term: Curve | type[AbstractEffect]) -> bool:
     """Whether a curve or an effect has the same equation and variable as one of the model's effects."""
     return term.variable is not None and _axes(term) in {_axes(EFFECTS[e]) for e in model.effects}
 

@@ -18,7 +18,14 @@ from ..identify.polish import Fit
 from ..identify.prepare import Prepared
 from ..identify.solve import Solved
 from ..progress import ReportProgress
-from .assessment import FALSE_ALARM, REFIT_ONLY, TRIAL_SHARE, Assessment, familywise_p_value
+from .assessment import (
+    FALSE_ALARM,
+    REFIT_ONLY,
+    TRIAL_SHARE,
+    Assessment,
+    familywise_p_value,
+    has_axes_of,
+)
 from .compare import BIC_MARGIN, DECISIVE_RATIO, Comparison, Fitted, simplest_equivalent
 from .effect_relations import CONTAINS, are_rivals
 from .elimination import BackwardElimination
@@ -152,10 +159,15 @@ class StepwiseSelection:
     def _is_genuine_improvement(self, current: Model, found: Assessment, better: Model) -> bool:
         """Whether a better model does more than compensate for model-form error of the current one's effects.
 
-        It does if what was left is clearly something else, if the better one leaves little, or if it adds a refit-only
-        form.
+        It does if what was left is clearly something else, if the better one leaves little, if it adds a refit-only
+        form, or an effect on other axes that makes the unfiltered misfit decisively smaller.
         """
-        if (set(better.effects) - set(current.effects)) & set(REFIT_ONLY.values()):
+        added = set(better.effects) - set(current.effects)
+        if added & set(REFIT_ONLY.values()):
+            return True
+        if better.fit.fitness < current.fit.fitness / DECISIVE_RATIO and not any(
+            has_axes_of(current, EFFECTS[effect]) for effect in added
+        ):
             return True
         return found.exceeds_model_form_error(current) or self._leaves_little(current, better)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import attrs
 import numpy as np
@@ -11,8 +11,7 @@ from scipy import stats
 
 from ..compiled import free_memory_maps
 from ..effects import EFFECTS, ShaftCompliance
-from ..identify.identification import Identification, Role, RunFit
-from ..identify.noise import MIN_RELATIVE_NOISE
+from ..identify.identification import Identification
 from ..identify.prepare import prepare
 from ..identify.results import results_of
 from ..identify.solve import Solved, solve
@@ -26,7 +25,6 @@ from .diagnosis import (
     Detectable,
     Diagnosis,
     EffectFound,
-    Gap,
     LearnedCurve,
     Region,
     Verdict,
@@ -35,6 +33,7 @@ from .diagnosis import (
 )
 from .evidence import Block
 from .experiment import next_experiment
+from .gap import closed_fraction, gaps_by_role, gaps_of_runs
 from .library import Curve, Library
 from .model import model_of
 from .naming import Naming, StepwiseSelection
@@ -95,9 +94,9 @@ def diagnose(
         final = _identification(naming, solved)
     before, after = (electrical_misfit(m) for m in (selection.base, naming.chosen))
     verdict = "not_in_library" if breaks_electrical_equation(before, after) else _verdict(naming)
-    gaps = _gaps_of_runs(base, final, naming.noise_share if verdict == "not_in_library" else 1.0)
-    gaps_of_roles = _gaps_of_roles(gaps, base)
-    if unlike_held_out(gaps_of_roles):
+    gaps = gaps_of_runs(base, final, naming.noise_share if verdict == "not_in_library" else 1.0)
+    by_role = gaps_by_role(gaps, base)
+    if unlike_held_out(by_role):
         verdict = "not_in_library"
     curves_tell_more = verdict == "not_in_library" or naming.leaves_sensor_ripple
     seconds = {
@@ -110,9 +109,9 @@ def diagnose(
         verdict=verdict,
         effects=_effects(naming, final),
         where=_regions(naming),
-        gap=gaps_of_roles,
+        gap=by_role,
         gap_of_run=gaps,
-        closed_fraction=_closed_fraction(gaps_of_roles) if naming.chosen.effects else None,
+        closed_fraction=closed_fraction(by_role) if naming.chosen.effects else None,
         next_experiment=next_experiment(naming, given.training) if verdict == "ambiguous" else None,
         curves=_learned_curves(naming) if curves_tell_more else (),
         detectable=_detectable_effects(naming.chosen_screen),
@@ -289,71 +288,3 @@ def _detectable_effects(found: Screen) -> tuple[Detectable, ...]:
             unit = EFFECTS[candidate.effect].ranges[field].unit
             smallest[candidate.effect] = Detectable(candidate.effect, field, amplitude, unit)
     return tuple(smallest.values())
-
-
-def _gaps_of_runs(base: Identification, final: Identification, share: float) -> dict[str, Gap]:
-    """By run, the misfit before and after, over the noise.
-
-    The noise is the final model's residuals in the training runs times `share`, below 1 where part of them is not
-    noise, and at least `MIN_RELATIVE_NOISE` times what was measured; all as root mean squares of each channel.
-    """
-    noise = {
-        c: max(share * _rms_residual(final, c), MIN_RELATIVE_NOISE * _rms_signal(final, c))
-        for c in ("current", "speed")
-    }
-
-    def misfit(found: Identification, run: str) -> float:
-        ratios = [
-            getattr(found.fit[run], f"{c}_rmse") / noise[c]
-            for c in noise
-            if getattr(found.fit[run], f"{c}_rmse") is not None and noise[c]
-        ]
-        return float(np.sqrt(np.mean(np.square(ratios)))) if ratios else 1.0
-
-    gaps = {}
-    for run in base.fit:
-        before, after = misfit(base, run), misfit(final, run)
-        gaps[run] = Gap(before, after, min(1.0, after))
-    return gaps
-
-
-def _rms_residual(found: Identification, channel: str) -> float:
-    """Root mean square of a channel's residuals in the training runs."""
-    return _pooled_rms((getattr(f, f"{channel}_rmse"), len(f.time)) for f in _training_runs(found))
-
-
-def _rms_signal(found: Identification, channel: str) -> float:
-    """Root mean square of a channel in the training runs."""
-    values = ((getattr(f, channel), len(f.time)) for f in _training_runs(found))
-    return _pooled_rms((None if x is None else np.sqrt(np.nanmean(x**2)), n) for x, n in values)
-
-
-def _training_runs(found: Identification) -> list[RunFit]:
-    return [f for f in found.fit.values() if f.role == "train"]
-
-
-def _pooled_rms(runs: Iterable[tuple[float | None, int]]) -> float:
-    """Root mean square over several runs, each given by its own and its number of samples; zero if none has any."""
-    known = [(rms, samples) for rms, samples in runs if rms is not None]
-    samples = sum(n for _, n in known)
-    return float(np.sqrt(sum(x * x * n for x, n in known) / samples)) if samples else 0.0
-
-
-def _gaps_of_roles(gaps: Mapping[str, Gap], base: Identification) -> dict[Role, Gap]:
-    """The gaps of all training runs together, and of all hold-outs: root mean squares over the samples."""
-    gaps_of_roles: dict[Role, Gap] = {}
-    for role in ("train", "holdout"):
-        of_role = [(gaps[name], len(f.time)) for name, f in base.fit.items() if f.role == role]
-        if of_role:
-            weights = np.array([n for _, n in of_role], float)
-            squares = np.array([[g.before, g.after, g.floor] for g, _ in of_role]) ** 2
-            pooled = np.sqrt(weights @ squares / weights.sum())
-            gaps_of_roles[role] = Gap(*(float(x) for x in pooled))
-    return gaps_of_roles
-
-
-def _closed_fraction(gaps: Mapping[Role, Gap]) -> float | None:
-    """The share of the gap above its floor, in squares, that the effects close; of the hold-outs if there are any."""
-    gap = gaps.get("holdout") or gaps["train"]
-    open_before = gap.before**2 - gap.floor**2
-    return (gap.before**2 - gap.after**2) / open_before if open_before > 1e-9 else None

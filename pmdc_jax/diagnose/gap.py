@@ -1,0 +1,91 @@
+"""The gap between simulation and measurement: the misfit before and after effects were added, over the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..identify.identification import Identification, Role, RunFit
+from ..identify.noise import MIN_RELATIVE_NOISE, noise_of_sensor
+from .diagnosis import Gap
+
+CHANNELS = ("current", "speed")
+
+
+def gaps_of_runs(base: Identification, final: Identification, share: float) -> dict[str, Gap]:
+    """By run, the misfit before and after: root mean squares over both channels, each over its noise (`_noise`, to
+    which `share` belongs)."""
+    noise = {channel: _noise(final, channel, share) for channel in CHANNELS}
+
+    def misfit(found: Identification, run: str) -> float:
+        ratios = [
+            getattr(found.fit[run], f"{channel}_rmse") / noise[channel][run]
+            for channel in CHANNELS
+            if getattr(found.fit[run], f"{channel}_rmse") is not None and noise[channel][run]
+        ]
+        return float(np.sqrt(np.mean(np.square(ratios)))) if ratios else 1.0
+
+    gaps = {}
+    for run in base.fit:
+        before, after = misfit(base, run), misfit(final, run)
+        gaps[run] = Gap(before, after, min(1.0, after))
+    return gaps
+
+
+def gaps_by_role(gaps: Mapping[str, Gap], base: Identification) -> dict[Role, Gap]:
+    """The gaps of all training runs together, and of all hold-outs: root mean squares over the samples."""
+    by_role: dict[Role, Gap] = {}
+    for role in ("train", "holdout"):
+        of_role = [(gaps[name], len(f.time)) for name, f in base.fit.items() if f.role == role]
+        if of_role:
+            weights = np.array([n for _, n in of_role], float)
+            squares = np.array([[g.before, g.after, g.floor] for g, _ in of_role]) ** 2
+            by_role[role] = Gap(*np.sqrt(weights @ squares / weights.sum()).tolist())
+    return by_role
+
+
+def closed_fraction(gaps: Mapping[Role, Gap]) -> float | None:
+    """The share of the gap above its floor, in squares, that the effects close; of the hold-outs if there are any."""
+    gap = gaps.get("holdout") or gaps["train"]
+    open_before = gap.before**2 - gap.floor**2
+    return (gap.before**2 - gap.after**2) / open_before if open_before > 1e-9 else None
+
+
+def _noise(final: Identification, channel: str, share: float) -> dict[str, float]:
+    """By run, the noise of a channel (root mean square), zero where the runs tell nothing of it.
+
+    The final model's residuals in the training runs are noise, times `share`, below 1 where part of them is not. Their
+    white part, the sensor's, is not that of all runs together but each run's own, and may be larger in a hold-out. The
+    noise is at least `MIN_RELATIVE_NOISE` times what was measured.
+    """
+    training = {name: f for name, f in final.fit.items() if f.role == "train"}
+    white = {name: _white_noise(f, channel) for name, f in final.fit.items()}
+    left = {name: getattr(f, f"{channel}_rmse") for name, f in training.items()}
+    measured = {name: _rms(getattr(f, channel)) for name, f in training.items()}
+
+    def pooled(rms: Mapping[str, float | None]) -> float:
+        known = [(x, len(f.time)) for name, f in training.items() if (x := rms[name]) is not None]
+        samples = sum(n for _, n in known)
+        return float(np.sqrt(sum(x * x * n for x, n in known) / samples)) if samples else 0.0
+
+    of_all = pooled(white)
+    coloured = max((share * pooled(left)) ** 2 - of_all**2, 0.0)
+    least = MIN_RELATIVE_NOISE * pooled(measured)
+    return {
+        name: max(float(np.hypot(np.sqrt(coloured), of_all if own is None else own)), least)
+        for name, own in white.items()
+    }
+
+
+def _white_noise(fit: RunFit, channel: str) -> float | None:
+    """White noise in the residuals of a run's channel; None if it was not measured."""
+    measured, simulated = getattr(fit, channel), getattr(fit, f"{channel}_simulated")
+    if measured is None or simulated is None:
+        return None
+    return noise_of_sensor(measured, measured - simulated)
+
+
+def _rms(signal: np.ndarray | None) -> float | None:
+    """Root mean square of a signal without its gaps; None if there is none."""
+    return None if signal is None else float(np.sqrt(np.nanmean(np.square(signal))))
