@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
@@ -16,6 +17,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 CORES = os.cpu_count() or 1
+# Results that may wait to be used, to limit the memory
+MAX_AHEAD = 4
 
 _this_thread = threading.local()
 
@@ -37,15 +40,16 @@ def map_in_threads_until(
     return made
 
 
-def run_one_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
-    """Results of calls in their order, with the next call already running in another thread."""
-    waiting: Future[T] | None = None
+def run_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
+    """Results of calls in their order, with some of the next ones running in other threads: one for every core, but at
+    most `MAX_AHEAD`."""
+    waiting: deque[Future[T]] = deque()
     for call in calls:
-        before, waiting = waiting, submit(call)
-        if before is not None:
-            yield before.result()
-    if waiting is not None:
-        yield waiting.result()
+        waiting.append(submit(call))
+        if len(waiting) > min(CORES, MAX_AHEAD):
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
 
 
 def submit(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:

@@ -659,14 +659,13 @@ def test_the_first_order_response_matches_the_change_of_the_simulation(x64, name
 
 @pytest.mark.parametrize("group_size", [1, 4, 5, 32])
 def test_columns_are_the_same_in_groups_of_any_size(group_size):
-    rng = np.random.default_rng(3)
-    kicks, seen = rng.standard_normal((2, 10, 2, 3, 13))
-    changes = [Change(kicks[..., a:b], seen[..., a:b]) for a, b in ((0, 5), (5, 6), (6, 13))]
+    values = np.random.default_rng(3).standard_normal((10, 2, 3, 13)).astype(np.float32)
+    cuts = ((0, 5, False), (5, 6, False), (6, 8, True), (8, 13, False))
+    changes = [Change(values[..., a:b], by_sensor) for a, b, by_sensor in cuts]
     parts = list(_batches(changes, group_size))
-    assert all(part.kicks.shape[-1] == group_size for part, _ in parts)
-    for field, whole in (("kicks", kicks), ("seen", seen)):
-        together = [getattr(part, field)[..., :width] for part, width in parts]
-        np.testing.assert_array_equal(np.concatenate(together, -1), whole)
+    assert all(part.by_sensor or part.values.shape[-1] == group_size for part, _ in parts)
+    together = [part.values[..., :width] for part, width in parts]
+    np.testing.assert_array_equal(np.concatenate(together, -1), values)
 
 
 # --------------------------------------------------------------------------------- sets of effects

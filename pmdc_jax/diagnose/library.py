@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Float32
 
 from ..compiled import quickly_compiled
 from ..effects import EFFECTS, AbstractEffect
@@ -17,7 +17,7 @@ from ..identify.noise import common_divisor, is_coarse, quantum
 from ..motor import Motor
 from ..recording import Recording
 from ..simulate import Tape, free_run
-from ..threads import run_one_ahead
+from ..threads import run_ahead
 from .candidates import Candidate, Scales
 from .model import Model
 from .response import Outputs, Path, input_gains, kicks, sensor_changes
@@ -43,10 +43,11 @@ MAX_COLUMNS, MAX_NUMBERS = 32, 2**23
 
 
 class Change(NamedTuple):
-    """What a few candidates or curves change along a path, in current and speed: (samples, 2, blocks, columns)."""
+    """What a few candidates or curves change along a path, in current and speed: the state at the end of each sample,
+    or, by a sensor, what is recorded."""
 
-    kicks: np.ndarray  # change of the state at the end of each sample
-    seen: np.ndarray  # what is added directly to the recorded outputs
+    values: Float32[np.ndarray, "samples 2 blocks columns"]
+    by_sensor: bool = False
 
 
 def columns_at_once(tape: Tape) -> int:
@@ -122,7 +123,7 @@ class Library:
 
     def changes(self, tape: Tape, path: Path) -> Iterator[Change]:
         """What the candidates change along a path, in their order; a `Change` has some candidates of one effect."""
-        return run_one_ahead(self._change_calls(tape, path))
+        return run_ahead(self._change_calls(tape, path))
 
     def _change_calls(self, tape: Tape, path: Path) -> Iterator[Callable[[], Change]]:
         """Functions that compute the changes, each of as many columns as are simulated together."""
@@ -136,13 +137,14 @@ class Library:
                 parts = -(-len(settings) // columns_at_once(tape))
                 for part in np.array_split(np.arange(len(settings)), parts):
                     values = {f: np.array([settings[k][f] for k in part]) for f in settings[0]}
-                    arguments = (EFFECTS[name], values, self.bare, tape, path)
-                    yield partial(_change_per_unit, arguments, units[part])
+                    yield partial(
+                        _small_change, EFFECTS[name], values, units[part], self.bare, tape, path
+                    )
 
     def _simulated_change(self, shapes: Sequence[Candidate], tape: Tape) -> Change:
-        """What an effect at finite size changes, by full simulations."""
+        """What an effect at finite size changes in the records, by full simulations."""
         seen = np.stack([self._simulated_response(c, tape) for c in shapes], -1)
-        return Change(np.zeros_like(seen), seen)
+        return Change(seen.astype(np.float32), by_sensor=True)
 
     def _simulated_response(self, candidate: Candidate, tape: Tape) -> np.ndarray:
         """The response to a setting at finite size, simulated once and kept: (samples, 2, blocks)."""
@@ -179,30 +181,28 @@ def _measured_speeds(runs: Sequence[Recording]) -> list[np.ndarray]:
     return speeds + [np.gradient(run.angle) for run in runs if run.angle is not None]
 
 
-def _change_per_unit(arguments: tuple, units: np.ndarray) -> Change:
-    """The changes of `_small_changes`, each divided by its unit."""
-    return Change(*(np.asarray(x) / units for x in _small_changes(*arguments)))
+def _small_change(effect: type[AbstractEffect], *arguments: Any) -> Change:
+    """What small settings of an effect change, divided by their units; `arguments` as of `_change_per_unit`."""
+    values = np.asarray(_change_per_unit(effect, *arguments))
+    return Change(values, by_sensor=effect.equation == "sensor")
 
 
 @quickly_compiled
-def _small_changes(
+def _change_per_unit(
     effect: type[AbstractEffect],
     settings: Mapping[str, Array | np.ndarray],
+    units: Float[Array | np.ndarray, " columns"],
     bare: Motor,
     tape: Tape,
     path: Path,
-) -> tuple[Array, Array]:
-    """Kicks, and what is added to the outputs, by small settings of one effect; the last axis is the setting."""
+) -> Float32[Array, "samples 2 blocks columns"]:
+    """The kicks, or changes by sensors, of settings of one effect; each divided by its unit, in single precision."""
+    change = sensor_changes if effect.equation == "sensor" else kicks
 
-    def change(values: Mapping[str, Float[Array | np.ndarray, ""]]) -> tuple[Outputs, Outputs]:
-        motor = bare.with_effects([effect(**values)])
-        if effect.equation == "sensor":
-            seen = sensor_changes(motor, bare, tape, path)
-            return jnp.zeros_like(seen), seen
-        kicked = kicks(motor, bare, tape, path)
-        return kicked, jnp.zeros_like(kicked)
+    def per_unit(values: Mapping[str, Array | np.ndarray], unit: Array | np.ndarray) -> Outputs:
+        return change(bare.with_effects([effect(**values)]), bare, tape, path) / unit
 
-    return jax.vmap(change, out_axes=-1)(settings)
+    return jax.vmap(per_unit, out_axes=-1)(settings, units).astype(jnp.float32)
 
 
 def curves_along(library: Library, tape: Tape, path: Path) -> tuple[list[Curve], Iterator[Change]]:
@@ -263,15 +263,14 @@ def _wave_curve(equation: str, periods: float) -> Curve:
 
 def _change_by_input(gain: np.ndarray, shape: Callable[[], np.ndarray]) -> Change:
     """What a voltage or torque of unknown shape changes; `gain` as of `input_gains`."""
-    kick = gain[..., None] * shape()[:, None]
-    return Change(kick, np.zeros_like(kick))
+    shapes = shape().astype(np.float32)
+    return Change(gain[..., None].astype(np.float32) * shapes[:, None])
 
 
 def _sensor_ripple(speed: np.ndarray, phase: np.ndarray) -> Change:
     """What a ripple of the speed sensor in proportion to the speed changes."""
-    ripple = speed[..., None] * _wave(phase)
-    seen = np.stack([np.zeros_like(ripple), ripple], axis=1)
-    return Change(np.zeros_like(seen), seen)
+    ripple = (speed[..., None] * _wave(phase)).astype(np.float32)
+    return Change(np.stack([np.zeros_like(ripple), ripple], axis=1), by_sensor=True)
 
 
 def _direction(speed: np.ndarray, tape: Tape) -> np.ndarray:

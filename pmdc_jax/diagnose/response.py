@@ -126,7 +126,8 @@ def respond(
         sample: tuple[Float[Array | np.ndarray, "2 blocks columns"], Float[Array, " blocks"]],
     ) -> tuple[Columns, Columns]:
         kick, held = sample
-        after = jnp.einsum("ijb,jbc->ibc", transition, x) + kick
+        # written out here and below: XLA multiplies such small matrices slowly
+        after = transition[:, 0, :, None] * x[0] + transition[:, 1, :, None] * x[1] + kick
         # a rotor that sticks keeps no change of speed
         return after.at[1].multiply(1.0 - held[:, None]), x
 
@@ -146,7 +147,7 @@ def respond(
 
     blocks = (jnp.asarray(tape.begins), free_end.transpose(1, 0, 2), end.transpose(1, 0, 2))
     starts = jax.lax.scan(next_block, jnp.zeros((2, kicks.shape[3])), blocks)[1]
-    response = forced + jnp.einsum("sibj,bjc->sibc", free, starts)
+    response = forced + free[..., :1] * starts[:, 0] + free[..., 1:] * starts[:, 1]
     if propagator.mean is None:
         return response
     # a kick builds up evenly over its sample: half of it is in the mean

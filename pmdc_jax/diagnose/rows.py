@@ -7,7 +7,7 @@ samples fit into memory.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 
 from ..compiled import compiled
-from ..identify.generalised_least_squares import series_of
 from ..identify.noise_model import Series, Whitener
 from ..motor import Motor
 from ..simulate import Tape
@@ -82,10 +81,11 @@ def gather_rows(
     ]
     first = 0
     for change, width in _batches(changes, columns_at_once(tape)):
-        response = np.asarray(_response(bare, tape, path, change))[..., :width]
+        seen = _seen(bare, tape, path, change)
         for run, rows in zip(model.training, rows_of_runs, strict=True):
-            signal = response.transpose(2, 1, 0, 3)
-            rows.columns[..., first : first + width] = series_of(tape, run, signal).values
+            _, outputs = rows.fit.residual.kind
+            part = seen[tape.blocks_of(run)].reshape(-1, *seen.shape[2:])
+            rows.columns[..., first : first + width] = part[:, outputs[0] : outputs[-1] + 1, :width]
         first += width
     return rows_of_runs
 
@@ -97,33 +97,48 @@ def _late_readings(fit: RunSeries) -> Float[np.ndarray, "samples outputs outputs
     return change[..., None] * np.eye(change.shape[1])
 
 
+def _seen(
+    bare: Motor, tape: Tape, path: Path, change: Change
+) -> Float32[np.ndarray, "blocks samples 2 columns"]:
+    """What a change makes of the recorded outputs of the motor without effects; of a setting that cannot be simulated,
+    zero."""
+    if change.by_sensor:
+        is_finite = np.isfinite(change.values).all((0, 1, 2))
+        return np.where(is_finite, change.values, 0).transpose(2, 0, 1, 3)
+    return np.asarray(_response(bare, tape, path, change.values))
+
+
 @compiled
-def _response(bare: Motor, tape: Tape, path: Path, change: Change) -> Float32[Array, "..."]:
-    """The response of the motor without effects to a change, in single precision."""
-    response = respond(bare, tape, path, change.kicks) + change.seen
-    # a setting that cannot be simulated gets a column of zeros
+def _response(
+    bare: Motor, tape: Tape, path: Path, kicks: Float32[np.ndarray, "samples 2 blocks columns"]
+) -> Float32[Array, "blocks samples 2 columns"]:
+    """The response to kicks of the motor without effects."""
+    response = respond(bare, tape, path, kicks.astype(jnp.result_type(float)))
     is_finite = jnp.all(jnp.isfinite(response), (0, 1, 2))
-    return jnp.where(is_finite, response, 0.0).astype(jnp.float32)
+    return jnp.where(is_finite, response, 0.0).astype(jnp.float32).transpose(2, 0, 1, 3)
 
 
 def _batches(changes: Iterable[Change], size: int) -> Iterator[tuple[Change, int]]:
-    """The changes in batches of `size` columns, so that the response is compiled once, each with the number of its
-    columns that count; the last batch is padded with zeros."""
-    waiting: list[Change] = []
-    count = 0
+    """The changes of the state in batches of `size` columns, so that the response is compiled once, each with the
+    number of its columns that count: the last ones before changes by sensors, which pass as they are, are zeros."""
+    waiting: list[np.ndarray] = []
     for change in changes:
-        waiting.append(change)
-        count += change.kicks.shape[-1]
-        while count >= size:
-            together = _concatenated(waiting)
-            yield Change(*(x[..., :size] for x in together)), size
-            waiting = [Change(*(x[..., size:] for x in together))]
-            count -= size
+        if change.by_sensor:
+            yield from _last_batch(waiting, size)
+            yield change, change.values.shape[-1]
+            waiting = []
+            continue
+        waiting.append(change.values)
+        while sum(values.shape[-1] for values in waiting) >= size:
+            together = np.concatenate(waiting, -1)
+            yield Change(together[..., :size]), size
+            waiting = [together[..., size:]]
+    yield from _last_batch(waiting, size)
+
+
+def _last_batch(waiting: list[np.ndarray], size: int) -> Iterator[tuple[Change, int]]:
+    """What is waiting, if anything, padded with zeros to `size` columns."""
+    count = sum(values.shape[-1] for values in waiting)
     if count:
-        padding = [(0, 0)] * 3 + [(0, size - count)]
-        yield Change(*(np.pad(x, padding) for x in _concatenated(waiting))), count
-
-
-def _concatenated(changes: Sequence[Change]) -> Change:
-    """One change with the columns of several."""
-    return Change(*(np.concatenate(parts, -1) for parts in zip(*changes, strict=True)))
+        padding = np.zeros((*waiting[0].shape[:-1], size - count), np.float32)
+        yield Change(np.concatenate([*waiting, padding], -1)), count
