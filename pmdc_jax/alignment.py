@@ -14,6 +14,7 @@ MAX_SHIFT = 20  # samples, between channels
 SHIFTS = sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs)
 MAX_MISFIT_RATIO = 0.3  # a shift must leave less than this share of the misfit without one
 BEFORE_EDGE = 40  # samples
+LATE_SPEED = ("speed_sensor_delay", "speed_sensor_lag")  # effects
 AFTER_EDGE = 100  # samples, including that of the voltage edge
 
 
@@ -38,7 +39,8 @@ def shifted_channels(run: Recording) -> Iterator[Finding]:
     when = "late" if shift > 0 else "early"
     what += f" about {abs(shift)} samples ({abs(shift) * run.sample_time:.3g} s) {when}"
     mend = "Shift the data back, or record all channels with the same clock and filter"
-    yield Finding(run.name, column, "warning", what, "at voltage edges", mend)
+    effects = LATE_SPEED if column == "speed" and shift > 0 else ()
+    yield Finding(run.name, column, "warning", what, "at voltage edges", mend, effects)
 
 
 def slow_sampling(run: Recording) -> Iterator[Finding]:

@@ -31,7 +31,8 @@ class Finding:
     """Something about the data that a user should know before a fit.
 
     **Fields**: `run`; `column`, None for the run as a whole; `severity`: an "error" makes a fit meaningless, a
-    "warning" may spoil it; `what` is wrong; `where`, the place in the data; `mend`, the remedy.
+    "warning" may spoil it; `what` is wrong; `where`, the place in the data; `mend`, the remedy; `modelled_by`, the
+    effects of a motor that make it harmless.
     """
 
     run: str
@@ -40,6 +41,7 @@ class Finding:
     what: str
     where: str
     mend: str
+    modelled_by: tuple[str, ...] = ()
 
 
 class Averaging(NamedTuple):

@@ -12,6 +12,7 @@ from attrs import evolve
 from rich.console import Console
 from test_report import Page, fake_identification, partial_identification
 
+from pmdc_jax.alignment import LATE_SPEED
 from pmdc_jax.diagnose.diagnosis import (
     Detectable,
     Diagnosis,
@@ -24,6 +25,7 @@ from pmdc_jax.diagnose.diagnosis import (
 )
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate
+from pmdc_jax.recording import Finding
 from pmdc_jax.report import notation
 from pmdc_jax.report.diagnosis import write_diagnosis
 from pmdc_jax.report.diagnosis_figures import averages
@@ -284,6 +286,7 @@ def test_json_has_the_documented_keys(case):
     found = diagnosis_json(diagnosis)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert found["verdict"] == case
+    assert found["summary"] == verdict_sentences(diagnosis)
     assert set(found) >= {
         "parameters",
         "unidentified_directions",
@@ -312,6 +315,17 @@ def test_json_contains_the_values():
     assert found["next_experiment"] is None
     assert set(diagnosis_json(ambiguous())["next_experiment"]) == {"why", "description", "power"}
     assert diagnosis_json(not_in_library())["curves"][0]["value"] == [0.0, 0.001, -0.03, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("effect", "warns"), [("speed_sensor_delay", False), ("coulomb_friction", True)]
+)
+def test_a_warning_is_not_repeated_for_a_motor_with_the_effect_of_which_it_warns(effect, warns):
+    finding = Finding("run", "speed", "warning", "late", "at edges", "shift", LATE_SPEED)
+    values = dict.fromkeys(EFFECTS[effect].ranges, 0.01)
+    motor = named().final.motor.with_effects([EFFECTS[effect](**values)])
+    found = named(final=evolve(named().final, findings=(finding,), motor=motor))
+    assert ("The data check warns" in words(found)) == warns
 
 
 def test_json_has_null_for_unknown_values():

@@ -6,7 +6,6 @@ import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from attrs import evolve
 from pmdc_jax import files
 from pmdc_jax.errors import InputError
 from pmdc_jax.identify.identification import Direction, Estimate, Identification, RunFit, Search
+from pmdc_jax.motor import Motor
 from pmdc_jax.recording import Finding
 from pmdc_jax.report import figures, notation
 from pmdc_jax.report.identification import write_report
@@ -97,7 +97,7 @@ def fake_identification(samples: int = 3000, **changes) -> Identification:
     ):
         correlation[row, column] = correlation[column, row] = value
     fields = {
-        "motor": SimpleNamespace(**TRUTH),
+        "motor": Motor(**TRUTH),
         "parameters": {
             name: Estimate(
                 value=value * (1 + 0.5 * relative[name]),

@@ -13,6 +13,8 @@ from attrs import asdict
 from ..files import write_text
 from ..identify.identification import Estimate, Identification, RunFit, Search
 from ..recording import Finding
+from .summary import summary
+from .verdict import verdict_sentences
 
 if TYPE_CHECKING:
     from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, NextExperiment
@@ -40,12 +42,14 @@ def identification_json(identification: Identification) -> dict[str, Any]:
             },
             "findings": [_finding(finding) for finding in identification.findings],
             "messages": list(identification.messages),
+            "summary": summary(identification),
         }
     )
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """A diagnosis as plain dictionaries: `identification_json` of the completed motor, and what was missing."""
+    """A diagnosis as plain dictionaries: `identification_json` of the completed motor, and what was missing; the
+    summary is that of the diagnosis."""
     before = diagnosis.base.parameters.items()
     gap = {role: _gap(diagnosis.gap.get(role)) for role in ("train", "holdout")}
     found = {
@@ -59,6 +63,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "detectable": [asdict(one) for one in diagnosis.detectable],
         "p_nothing_missing": diagnosis.p_nothing,
         "electrical_misfit": diagnosis.electrical_misfit,
+        "summary": verdict_sentences(diagnosis),
         "before": {"parameters": {name: _estimate(estimate) for name, estimate in before}},
     }
     return identification_json(diagnosis.final) | _plain(found)

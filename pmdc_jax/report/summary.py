@@ -43,7 +43,12 @@ def summary(identification: Identification) -> list[str]:
 
 def cautions(identification: Identification) -> list[str]:
     """What the recordings cannot tell, and where the numbers are not to be trusted."""
-    warnings = [one for one in identification.findings if one.severity == "warning"]
+    modelled = {effect.name for effect in identification.motor.effects}
+    warnings = [
+        one
+        for one in identification.findings
+        if one.severity == "warning" and not modelled & set(one.modelled_by)
+    ]
     doubted = dict.fromkeys(one.column or f"run {one.run}" for one in warnings)
     sentences = []
     if doubted:
