@@ -110,7 +110,10 @@ def _seen(
 
 @compiled
 def _response(
-    bare: Motor, tape: Tape, path: Path, kicks: Float32[np.ndarray, "samples 2 blocks columns"]
+    bare: Motor,
+    tape: Tape,
+    path: Path,
+    kicks: Float32[Array | np.ndarray, "samples 2 blocks columns"],
 ) -> Float32[Array, "blocks samples 2 columns"]:
     """The response to kicks of the motor without effects."""
     response = respond(bare, tape, path, kicks.astype(jnp.result_type(float)))
