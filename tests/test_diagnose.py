@@ -179,6 +179,9 @@ def test_a_decisive_effect_on_other_axes_is_no_model_form_error(added, misfit, i
     selection._leaves_little = lambda current, better: False
     found = Mock(spec=Assessment, exceeds_model_form_error=lambda model: False)
     assert selection._is_genuine_improvement(current, found, better) == is_genuine
+    # the first effect has no other beside it, whose formula may be wrong
+    current.effects = ()
+    assert not selection._is_genuine_improvement(current, found, better)
 
 
 @pytest.mark.parametrize("leaves_little", [True, False])

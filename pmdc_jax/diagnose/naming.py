@@ -165,9 +165,9 @@ class StepwiseSelection:
         added = set(better.effects) - set(current.effects)
         if added & set(REFIT_ONLY.values()):
             return True
-        if better.fit.fitness < current.fit.fitness / DECISIVE_RATIO and not any(
-            has_axes_of(current, EFFECTS[effect]) for effect in added
-        ):
+        decisive = better.fit.fitness < current.fit.fitness / DECISIVE_RATIO
+        on_other_axes = not any(has_axes_of(current, EFFECTS[effect]) for effect in added)
+        if current.effects and decisive and on_other_axes:
             return True
         return found.exceeds_model_form_error(current) or self._leaves_little(current, better)
 

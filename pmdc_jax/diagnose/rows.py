@@ -25,9 +25,10 @@ from .response import Path, respond
 
 # Samples that are whitened at once, to limit the memory
 CHUNK = 2048
-# Standard deviation of how late the readings of a channel are, in sampling intervals: converters read one channel after
-# the other, and simulators go in small steps
+# Standard deviation of how late the speed is read, in sampling intervals: converters read one channel after the other,
+# and simulators go in small steps
 TIMING_ERROR = 0.03
+SPEED = 1  # index of the output
 
 
 class Rows(NamedTuple):
@@ -35,14 +36,14 @@ class Rows(NamedTuple):
     errors; A and rad/s."""
 
     fit: RunSeries
-    late: Float[np.ndarray, "samples outputs outputs"]  # by output, if that is an interval late
+    late: Float[np.ndarray, "samples outputs 1"]
     columns: Float[np.ndarray, "samples outputs columns"]
     rounding: Float[np.ndarray, "samples outputs draws"]
 
     def white(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
         """Whitened rows, `CHUNK` samples at a time; columns in the order that `gather_evidence` expects.
 
-        The last rows of the first run say that no reading is late, to within `TIMING_ERROR`.
+        The last row of the first run says that no reading is late, to within `TIMING_ERROR`.
         """
         shared, own, residual, _ = self.fit
         columns = (
@@ -59,9 +60,8 @@ class Rows(NamedTuple):
             values = np.concatenate([x[part] for x in columns], axis=-1)
             yield whiten(run, Series(values, residual.known[part], residual.kind))
         if run == 0:
-            outputs, parameters = self.late.shape[-1], shared.values.shape[-1]
             width = sum(x.shape[-1] for x in columns)
-            yield np.eye(outputs, width, parameters) / TIMING_ERROR
+            yield np.eye(1, width, shared.values.shape[-1]) / TIMING_ERROR
 
 
 def gather_rows(
@@ -90,11 +90,12 @@ def gather_rows(
     return rows_of_runs
 
 
-def _late_readings(fit: RunSeries) -> Float[np.ndarray, "samples outputs outputs"]:
-    """What changes where one output is read a sampling interval late; the last axis is the output."""
-    simulated = fit.simulated.values
+def _late_readings(fit: RunSeries) -> Float[np.ndarray, "samples outputs 1"]:
+    """What changes where the speed is read a sampling interval late. The current is not: for that the library has no
+    effect, so that it must remain visible."""
+    simulated, (_, outputs) = fit.simulated.values, fit.residual.kind
     change = -np.diff(simulated, axis=0, prepend=simulated[:1])
-    return change[..., None] * np.eye(change.shape[1])
+    return (change * (np.array(outputs) == SPEED))[..., None]
 
 
 def _seen(
