@@ -336,7 +336,7 @@ def test_a_load_that_exceeds_friction_is_named_with_it():
 
 @pytest.mark.slow
 def test_a_seizing_bearing_is_not_named_coulomb_friction():
-    """Torque noise is slow too, but does not reverse with the direction of motion. 0.04 N m are just not significant."""
+    """Torque noise is slow too, but does not reverse with the motion. A torque of 0.04 N m is just not significant."""
     plant = Plant(**PAPER, seizing_Nm=0.05, seizing_from_s=1.0)
     found = diagnose(recorded_from(plant, 6, WITH_TORQUE_NOISE))
     assert found.verdict == "not_in_library"
