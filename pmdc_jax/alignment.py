@@ -14,8 +14,9 @@ MAX_SHIFT = 20  # samples, between channels
 SHIFTS = sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs)
 MAX_MISFIT_RATIO = 0.3  # a shift must leave less than this share of the misfit without one
 BEFORE_EDGE = 40  # samples
-LATE_SPEED = ("speed_sensor_delay", "speed_sensor_lag")  # effects
 AFTER_EDGE = 100  # samples, including that of the voltage edge
+# The effects that make a late speed harmless
+LATE_SPEED = ("speed_sensor_delay", "speed_sensor_lag")
 
 
 def shifted_channels(run: Recording) -> Iterator[Finding]:

@@ -17,16 +17,20 @@ def run_fit(role: str, misfit: float, noise: float, seed: int) -> RunFit:
     """A run without current: a slow misfit and white noise of the speed, root mean squares in rad/s."""
     left = misfit * np.sqrt(2) * np.sin(3 * TIME)
     left = left + noise * np.random.default_rng(seed).standard_normal(len(TIME))
-    return Mock(
-        spec=RunFit,
+    return RunFit(
         role=role,
+        current_rmse=None,
+        speed_rmse=float(np.sqrt(np.mean(left**2))),
+        current_fit_percent=None,
+        speed_fit_percent=None,
+        load_offset=None,
         time=TIME,
+        voltage=None,
         current=None,
         current_simulated=None,
-        current_rmse=None,
         speed=100 + left,
         speed_simulated=np.full(len(TIME), 100.0),
-        speed_rmse=float(np.sqrt(np.mean(left**2))),
+        load=None,
     )
 
 

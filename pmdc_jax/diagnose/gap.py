@@ -80,10 +80,8 @@ def _noise(final: Identification, channel: str, share: float) -> dict[str, float
 
 def _white_noise(fit: RunFit, channel: str) -> float | None:
     """White noise in the residuals of a run's channel; None if it was not measured."""
-    measured, simulated = getattr(fit, channel), getattr(fit, f"{channel}_simulated")
-    if measured is None or simulated is None:
-        return None
-    return noise_of_sensor(measured, measured - simulated)
+    left = fit.residual(channel)
+    return None if left is None else noise_of_sensor(getattr(fit, channel), left)
 
 
 def _rms(signal: np.ndarray | None) -> float | None:

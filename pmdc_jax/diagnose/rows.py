@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 
 from ..compiled import compiled
+from ..identify.generalised_least_squares import series_of
 from ..identify.noise_model import Series, Whitener
 from ..motor import Motor
 from ..simulate import Tape
@@ -83,9 +84,8 @@ def gather_rows(
     for change, width in _batches(changes, columns_at_once(tape)):
         seen = _seen(bare, tape, path, change)
         for run, rows in zip(model.training, rows_of_runs, strict=True):
-            _, outputs = rows.fit.residual.kind
-            part = seen[tape.blocks_of(run)].reshape(-1, *seen.shape[2:])
-            rows.columns[..., first : first + width] = part[:, outputs[0] : outputs[-1] + 1, :width]
+            in_time = series_of(tape, run, seen).values
+            rows.columns[..., first : first + width] = in_time[..., :width]
         first += width
     return rows_of_runs
 
@@ -100,12 +100,12 @@ def _late_readings(fit: RunSeries) -> Float[np.ndarray, "samples outputs 1"]:
 
 def _seen(
     bare: Motor, tape: Tape, path: Path, change: Change
-) -> Float32[np.ndarray, "blocks samples 2 columns"]:
+) -> Float32[np.ndarray, "blocks 2 samples columns"]:
     """What a change makes of the recorded outputs of the motor without effects; of a setting that cannot be simulated,
     zero."""
     if change.by_sensor:
         is_finite = np.isfinite(change.values).all((0, 1, 2))
-        return np.where(is_finite, change.values, 0).transpose(2, 0, 1, 3)
+        return np.where(is_finite, change.values, 0).transpose(2, 1, 0, 3)
     return np.asarray(_response(bare, tape, path, change.values))
 
 
@@ -115,11 +115,11 @@ def _response(
     tape: Tape,
     path: Path,
     kicks: Float32[Array | np.ndarray, "samples 2 blocks columns"],
-) -> Float32[Array, "blocks samples 2 columns"]:
+) -> Float32[Array, "blocks 2 samples columns"]:
     """The response to kicks of the motor without effects."""
     response = respond(bare, tape, path, kicks.astype(jnp.result_type(float)))
     is_finite = jnp.all(jnp.isfinite(response), (0, 1, 2))
-    return jnp.where(is_finite, response, 0.0).astype(jnp.float32).transpose(2, 0, 1, 3)
+    return jnp.where(is_finite, response, 0.0).astype(jnp.float32).transpose(2, 1, 0, 3)
 
 
 def _batches(changes: Iterable[Change], size: int) -> Iterator[tuple[Change, int]]:

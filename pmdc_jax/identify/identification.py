@@ -61,6 +61,11 @@ class RunFit:
     speed_simulated: np.ndarray
     load: np.ndarray | None
 
+    def residual(self, channel: str) -> np.ndarray | None:
+        """Measured minus simulated "speed" or "current"; None if it was not recorded."""
+        measured, simulated = getattr(self, channel), getattr(self, f"{channel}_simulated")
+        return None if measured is None or simulated is None else np.asarray(measured - simulated)
+
 
 @frozen
 class Search:

@@ -274,8 +274,8 @@ def _measured_and_residuals(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """An output as measured and its residuals, in every training run that has it."""
     runs = [f for f in fit.values() if f.role == "train"]
-    pairs = [(getattr(f, name), getattr(f, f"{name}_simulated")) for f in runs]
-    return [(m, m - s) for m, s in pairs if m is not None and s is not None]
+    pairs = [(getattr(f, name), f.residual(name)) for f in runs]
+    return [(measured, left) for measured, left in pairs if left is not None]
 
 
 def _large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:

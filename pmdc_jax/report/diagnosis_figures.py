@@ -18,7 +18,6 @@ from .figures import (
     SIMULATED,
     envelope,
     mark_noise,
-    residual,
     style,
 )
 
@@ -96,14 +95,14 @@ def residual_figure(
     before: RunFit, after: RunFit, noise: Mapping[str, float | None], points: int
 ) -> go.Figure | None:
     """Free-run residuals over time, of the motor without and with the effects; None without any output."""
-    channels = [one for one in RESIDUALS if residual(before, one) is not None]
+    channels = [one for one in RESIDUALS if before.residual(one) is not None]
     if not channels:
         return None
     figure = make_subplots(rows=len(channels), cols=1, shared_xaxes=True, vertical_spacing=0.05)
     for row, channel in enumerate(channels, start=1):
         title, column = RESIDUALS[channel]
         for name, fit, colour in (("before", before, BEFORE), ("after", after, AFTER)):
-            left = residual(fit, channel)
+            left = fit.residual(channel)
             if left is None:
                 continue
             time, values = envelope(fit.time, left, points)
@@ -143,7 +142,7 @@ def averages(
     fits: Mapping[str, RunFit], variable: str, channel: str
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Mean variable and mean residual of all runs together, in bins of equally many samples; None without data."""
-    pairs = [(_values(fit, variable), residual(fit, channel)) for fit in fits.values()]
+    pairs = [(_values(fit, variable), fit.residual(channel)) for fit in fits.values()]
     there = [(x, r) for x, r in pairs if x is not None and r is not None]
     if not there:
         return None

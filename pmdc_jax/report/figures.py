@@ -197,14 +197,8 @@ def _panels(fit: RunFit, noise: Mapping[str, float | None]) -> list[_Panel]:
 
 def _residual_panel(fit: RunFit, channel: str, noise: Mapping[str, float | None]) -> _Panel:
     title, column = RESIDUALS[channel]
-    line = _line("residual", residual(fit, channel), RESIDUAL, 0.7)
+    line = _line("residual", fit.residual(channel), RESIDUAL, 0.7)
     return _Panel(title, 0.55, [line], noise.get(column))
-
-
-def residual(fit: RunFit, channel: str) -> np.ndarray | None:
-    """Measured minus simulated "speed" or "current"; None if it was not recorded."""
-    measured, simulated = getattr(fit, channel), getattr(fit, f"{channel}_simulated")
-    return None if measured is None or simulated is None else np.asarray(measured - simulated)
 
 
 def _line(
