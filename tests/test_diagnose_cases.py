@@ -148,7 +148,13 @@ def test_a_current_that_is_read_late_is_no_shaft(coulomb_Nm):
     found = diagnose(runs)
     names = {effect.name for effect in found.effects}
     assert "shaft_compliance" not in names
-    assert found.verdict == "not_in_library" or (coulomb_Nm and names == {"coulomb_friction"})
+    assert names == ({"coulomb_friction"} if coulomb_Nm else set())
+    assert found.verdict == ("named" if coulomb_Nm else "not_in_library")
+    clearest = found.curves[0]
+    assert (clearest.equation, clearest.variable) == ("sensor", "current_rate")
+    # the mean age of the samples in the filter's output
+    late = -clearest.value[-1] / clearest.x[-1]
+    assert late == pytest.approx(1e-3 * decay / (1 - decay), rel=0.1)
 
 
 def by_euler_steps(run: Recording, steps: int, rng: np.random.Generator) -> Recording:

@@ -105,10 +105,10 @@ class Assessment(NamedTuple):
         within = self.unexplained < OWN_MODEL_FORM_SHARE
         return self._belongs_to(model) or bool(own_curve and within)
 
-    def is_sensor_ripple(self) -> bool:
-        """Whether the clearest signal is a ripple of the speed sensor over the rotor angle."""
+    def is_sensor_error(self) -> bool:
+        """Whether the clearest signal is an error of a sensor that no effect of the library has."""
         clearest = self.clearest.term
-        return isinstance(clearest, Curve) and clearest.is_sensor_ripple
+        return isinstance(clearest, Curve) and clearest.equation == "sensor"
 
     def unfiltered_signals(self) -> list[Signal]:
         """The candidates' signals with their gains on the unfiltered residuals."""

@@ -55,7 +55,9 @@ class LearnedCurve:
 
     equation: str
     variable: str
-    unit: str  # of `value`: "N m" opposing motion, "V" at the terminals, or "" for a share of the speed that is read
+    # of `value`: "N m" opposing motion, "V" at the terminals, "A" of the current that is read, or "" for a share of the
+    # speed that is read
+    unit: str
     x: np.ndarray
     value: np.ndarray
     stderr: np.ndarray
@@ -105,7 +107,7 @@ class Diagnosis:
     # of the gap, in squares, on hold-outs where there are any; None without effects or gap
     closed_fraction: float | None
     next_experiment: NextExperiment | None  # for the verdict "ambiguous", where a run was found
-    # what is left, for the verdict "not_in_library" or where it is a ripple of the speed sensor
+    # what is left, for the verdict "not_in_library" or where it is an error of a sensor
     curves: tuple[LearnedCurve, ...]
     detectable: tuple[Detectable, ...]
     base: Identification  # without effects

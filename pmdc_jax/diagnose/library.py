@@ -28,6 +28,7 @@ CURVE_VARIABLES = {
     "mechanical": ("speed", "current", "time"),
     "electrical": ("current", "speed", "voltage", "time"),
 }
+CURVE_UNITS = {"mechanical": "N m", "electrical": "V"}
 # Knots of a curve over speed, current or voltage, and over the time of each run
 KNOTS, KNOTS_IN_TIME = 9, 7
 # Periods per turn of the rotor of a torque that is periodic behind a gear; so dense that neighbours differ by half a
@@ -56,10 +57,11 @@ def columns_at_once(tape: Tape) -> int:
 
 
 class Curve(NamedTuple):
-    """An unknown term of one equation: piecewise linear in one variable, or a sinusoid of the angle."""
+    """An unknown term: piecewise linear in one variable, or a sinusoid of the angle."""
 
-    equation: str  # "mechanical", "electrical", or "sensor" for the reading of the speed, as a share of it
+    equation: str  # "mechanical", "electrical", or "sensor" for what a sensor misreads
     variable: str
+    unit: str
     knots: np.ndarray
     per_run: bool = False  # every run has a curve of its own
     # (knots, columns): values of the columns at the knots; None where these are hat functions, one per knot
@@ -77,12 +79,12 @@ class Curve(NamedTuple):
     @property
     def is_angle_wave(self) -> bool:
         """Whether it is a sinusoid of the angle."""
-        return self.shapes is not None
+        return self.variable == "angle"
 
     @property
     def is_sensor_ripple(self) -> bool:
-        """Whether it is a ripple of the speed sensor over the rotor angle."""
-        return self.equation == "sensor"
+        """Whether it is a ripple of the speed sensor over the rotor angle, as a share of the speed."""
+        return self.equation == "sensor" and self.is_angle_wave
 
     @property
     def periods(self) -> float:
@@ -106,8 +108,10 @@ class Library:
         self.bare = jax.tree.map(jnp.asarray, base.motor)
         self.scales = _scales(base)
         tape = base.given.problem.tape
-        measured = bool(np.any(np.asarray(tape.weight)[base.given.problem.fitted_blocks, 0]))
-        has_current = measured or bool(np.any(np.asarray(tape.drive.current) > 0))
+        self.measures_current = bool(
+            np.any(np.asarray(tape.weight)[base.given.problem.fitted_blocks, 0])
+        )
+        has_current = self.measures_current or bool(np.any(np.asarray(tape.drive.current) > 0))
         observable = {e for e, effect in EFFECTS.items() if has_current or not effect.needs_current}
         self.candidates = [c for c in all_candidates(self.scales) if c.effect in observable]
         # the errors of a coarse encoder last long enough to look like a voltage that changes over time
@@ -208,6 +212,8 @@ def _change_per_unit(
 def curves_along(library: Library, tape: Tape, path: Path) -> tuple[list[Curve], Iterator[Change]]:
     """The curves over all variables of all equations, the sinusoids of the angle, and what each changes."""
     terms = [*_equation_curves(library, tape, path), *_angle_waves(library, tape, path)]
+    if library.measures_current:
+        terms.append(_late_current(tape, path))
     return [curve for curve, _ in terms], (change() for _, change in terms)
 
 
@@ -234,11 +240,12 @@ def _equation_curves(library: Library, tape: Tape, path: Path) -> Iterator[Term]
             knots = np.linspace(0, 1, KNOTS_IN_TIME) if in_time else _knots(x, weight)
             hats = partial(_hats, x, knots)
             is_noise = in_time and equation == "electrical" and library.has_input_noise
-            curve = Curve(equation, variable, knots, in_time, is_noise=is_noise)
+            unit = CURVE_UNITS[equation]
+            curve = Curve(equation, variable, unit, knots, in_time, is_noise=is_noise)
             yield curve, partial(_change_by_input, gain, hats)
             if in_time and equation == "mechanical":
                 turning = partial(_hats, x, knots, _direction(known["speed"], tape))
-                reversing = Curve(equation, variable, knots, in_time, reverses=True)
+                reversing = Curve(equation, variable, unit, knots, in_time, reverses=True)
                 yield reversing, partial(_change_by_input, gain, turning)
 
 
@@ -249,16 +256,29 @@ def _angle_waves(library: Library, tape: Tape, path: Path) -> Iterator[Term]:
     torque = np.asarray(input_gains(library.bare, tape)[1])
     for periods in PERIODS_BEHIND_GEAR:
         wave = partial(_wave, periods * angle)
-        yield _wave_curve("mechanical", periods), partial(_change_by_input, torque, wave)
+        yield _wave_curve("mechanical", "N m", periods), partial(_change_by_input, torque, wave)
     of_rotor = [c.columns[0]["periods"] for c in library.candidates if c.effect == "cogging_torque"]
     for periods in of_rotor:
-        yield _wave_curve("sensor", periods), partial(_sensor_ripple, speed, periods * angle)
+        yield _wave_curve("sensor", "", periods), partial(_sensor_ripple, speed, periods * angle)
 
 
-def _wave_curve(equation: str, periods: float) -> Curve:
+def _late_current(tape: Tape, path: Path) -> Term:
+    """A current that is read late, as behind a filter: an error in proportion to its rate of change."""
+    current = np.asarray(path.current).T
+    before = np.append(current.flat[0], current.flat[:-1]).reshape(current.shape)
+    before[:, 0] = np.where(tape.begins, current[:, 0], before[:, 0])
+    rate = ((current - before) / np.asarray(tape.sample_time)[tape.grid][:, None]).T
+    largest = float(np.quantile(np.abs(rate), 0.95)) + 1e-9
+    ends = np.array([-largest, largest])
+    curve = Curve("sensor", "current_rate", "A", ends, shapes=ends[:, None])
+    values = np.stack([rate, np.zeros_like(rate)], axis=1)[..., None].astype(np.float32)
+    return curve, lambda: Change(values, by_sensor=True)
+
+
+def _wave_curve(equation: str, unit: str, periods: float) -> Curve:
     """A sinusoid of the angle with its own phase in every run, over one period."""
     angle = np.linspace(0, 2 * np.pi / periods, KNOTS_IN_PERIOD)
-    return Curve(equation, "angle", angle, True, _wave(periods * angle))
+    return Curve(equation, "angle", unit, angle, True, _wave(periods * angle))
 
 
 def _change_by_input(gain: np.ndarray, shape: Callable[[], np.ndarray]) -> Change:

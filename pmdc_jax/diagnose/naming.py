@@ -69,7 +69,7 @@ class Naming(NamedTuple):
     p_nothing: float  # p-value of the evidence if nothing were missing
     p_nothing_more: float  # p-value of what is left if nothing more were missing
     may_be_model_form_error: bool  # what is left, of the chosen effects
-    leaves_sensor_ripple: bool  # whether what is left is most like that
+    leaves_sensor_error: bool  # whether what is left is most like that
     # root mean square of the chosen one's residuals beyond all curves, over that of all; 1 if nothing more is missing
     noise_share: float
     p_without: dict[str, float]  # by effect of the chosen model: p-value of the data without it
@@ -210,12 +210,12 @@ class StepwiseSelection:
         return self._if_little_is_left(current, found, _of_largest_gain(others))
 
     def _is_room_for_another(self, current: Model, found: Assessment) -> bool:
-        """Whether one more effect may be missing, rather than model-form error or a ripple of the speed sensor."""
+        """Whether one more effect may be missing, rather than model-form error or an error of a sensor."""
         return (
             len(current.effects) < MAX_EFFECTS
             and found.p_value < FALSE_ALARM
             and not found.may_be_model_form_error(current)
-            and not found.is_sensor_ripple()
+            and not found.is_sensor_error()
         )
 
     def _if_little_is_left(
@@ -279,7 +279,7 @@ class StepwiseSelection:
             p_nothing=base.p_value,
             p_nothing_more=found.p_value,
             may_be_model_form_error=found.may_be_model_form_error(current),
-            leaves_sensor_ripple=more_missing and found.is_sensor_ripple(),
+            leaves_sensor_error=more_missing and found.is_sensor_error(),
             noise_share=np.sqrt(share_beyond_curves(found.screen)) if more_missing else 1.0,
             p_without=p_values_without(current, found.screen.white, self.refits, self.comparison),
             final_fit=final_fit(current, self.comparison.filter_of(current)),

@@ -31,7 +31,7 @@ from .diagnosis import (
     breaks_electrical_equation,
     unlike_held_out,
 )
-from .evidence import Block
+from .evidence import MIN_EIGENVALUE, Block
 from .experiment import next_experiment
 from .gap import closed_fraction, gaps_by_role, gaps_of_runs
 from .library import Curve, Library
@@ -41,8 +41,6 @@ from .signals import Screen, log_p_value
 
 # A knot of a curve is part of a region if its misfit is so many standard errors
 REGION_Z = 4.0
-# Units of the curves of each equation; that of a sensor is a share of the speed
-CURVE_UNITS = {"mechanical": "N m", "electrical": "V", "sensor": ""}
 # An effect with a smaller p-value without it is kept even if the runs give no interval of any of its parameters
 CERTAIN_P_VALUE = 1e-30
 # ... and one whose interval of the amplitude reaches down to this share of the estimate may be absent
@@ -98,7 +96,7 @@ def diagnose(
     by_role = gaps_by_role(gaps, base)
     if unlike_held_out(by_role):
         verdict = "not_in_library"
-    curves_tell_more = verdict == "not_in_library" or naming.leaves_sensor_ripple
+    curves_tell_more = verdict == "not_in_library" or naming.leaves_sensor_error
     seconds = {
         "identify": identified - began,
         "name": named - identified,
@@ -204,7 +202,7 @@ def _regions(naming: Naming) -> tuple[Region, ...]:
     base = found.evidence.regress().squares
     regions = []
     for curve, block in zip(found.curves, found.curve_blocks, strict=True):
-        if curve.per_run:
+        if curve.per_run or curve.equation == "sensor":
             continue
         gain = base - found.evidence.regress([block]).squares
         if log_p_value(gain, found.evidence.degrees_of_freedom(block)) > np.log(1e-4):
@@ -250,7 +248,8 @@ def _learned_curves(naming: Naming) -> tuple[LearnedCurve, ...]:
     learned = []
     for curve, block in zip(found.curves, found.curve_blocks, strict=True):
         # directions that the motor's own parameters can imitate are no part of the curve
-        fit = found.evidence.regress([block], min_eigenvalue=1e-3)
+        least = 1e-3 if curve.order > 1 else MIN_EIGENVALUE
+        fit = found.evidence.regress([block], min_eigenvalue=least)
         log_p = log_p_value(base - fit.squares, found.evidence.degrees_of_freedom(block))
         value, error = fit.coefficients[0], fit.errors[0]
         if curve.per_run:  # of the run that shows it most clearly
@@ -259,7 +258,7 @@ def _learned_curves(naming: Naming) -> tuple[LearnedCurve, ...]:
         estimated = LearnedCurve(
             curve.equation,
             curve.variable,
-            CURVE_UNITS[curve.equation],
+            curve.unit,
             curve.knots,
             curve.values(value),
             curve.errors(error),

@@ -26,10 +26,9 @@ from .response import Path, respond
 
 # Samples that are whitened at once, to limit the memory
 CHUNK = 2048
-# Standard deviation of how late the speed is read, in sampling intervals: converters read one channel after the other,
-# and simulators go in small steps
-TIMING_ERROR = 0.03
-SPEED = 1  # index of the output
+# Standard deviations of how late current and speed are read, in sampling intervals: converters read one channel after
+# the other, and simulators go in small steps. Smaller for the current, so that a filtered one remains visible
+TIMING_ERRORS = 0.01, 0.03
 
 
 class Rows(NamedTuple):
@@ -37,14 +36,14 @@ class Rows(NamedTuple):
     errors; A and rad/s."""
 
     fit: RunSeries
-    late: Float[np.ndarray, "samples outputs 1"]
+    late: Float[np.ndarray, "samples outputs 2"]
     columns: Float[np.ndarray, "samples outputs columns"]
     rounding: Float[np.ndarray, "samples outputs draws"]
 
     def white(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
         """Whitened rows, `CHUNK` samples at a time; columns in the order that `gather_evidence` expects.
 
-        The last row of the first run says that no reading is late, to within `TIMING_ERROR`.
+        The last rows of the first run say that no output is read late, to within `TIMING_ERRORS`.
         """
         shared, own, residual, _ = self.fit
         columns = (
@@ -61,8 +60,9 @@ class Rows(NamedTuple):
             values = np.concatenate([x[part] for x in columns], axis=-1)
             yield whiten(run, Series(values, residual.known[part], residual.kind))
         if run == 0:
-            width = sum(x.shape[-1] for x in columns)
-            yield np.eye(1, width, shared.values.shape[-1]) / TIMING_ERROR
+            width, first = sum(x.shape[-1] for x in columns), shared.values.shape[-1]
+            late = slice(first, first + self.late.shape[-1])
+            yield np.eye(width)[late] / np.array(TIMING_ERRORS)[:, None]
 
 
 def gather_rows(
@@ -90,12 +90,11 @@ def gather_rows(
     return rows_of_runs
 
 
-def _late_readings(fit: RunSeries) -> Float[np.ndarray, "samples outputs 1"]:
-    """What changes where the speed is read a sampling interval late. The current is not: for that the library has no
-    effect, so that it must remain visible."""
+def _late_readings(fit: RunSeries) -> Float[np.ndarray, "samples outputs 2"]:
+    """What changes where the current, or the speed, is read a sampling interval late."""
     simulated, (_, outputs) = fit.simulated.values, fit.residual.kind
     change = -np.diff(simulated, axis=0, prepend=simulated[:1])
-    return (change * (np.array(outputs) == SPEED))[..., None]
+    return change[..., None] * np.eye(2)[list(outputs)]
 
 
 def _seen(

@@ -68,9 +68,9 @@ def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
 
 
 def _is_definite(curve: Signal) -> bool:
-    """Whether noise can hardly look like a curve: one that all runs share, or the ripple of a sensor."""
+    """Whether noise can hardly look like a curve: one that all runs share, or an error of a sensor."""
     assert isinstance(curve.term, Curve)
-    return not curve.term.per_run or curve.term.is_sensor_ripple
+    return not curve.term.per_run or curve.term.equation == "sensor"
 
 
 def _without_clearest(found: Screen, rows: Sequence[Rows]) -> list[Series]:

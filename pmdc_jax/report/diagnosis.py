@@ -184,7 +184,8 @@ def _clearest_misfit(diagnosis: Diagnosis) -> tuple[str, str]:
 
 
 def _curve(curve: LearnedCurve) -> dict[str, Any]:
-    where = {"sensor": "speed reading"}.get(curve.equation, f"{curve.equation} equation")
+    reading = "current reading" if curve.unit == "A" else "speed reading"
+    where = reading if curve.equation == "sensor" else f"{curve.equation} equation"
     return {
         "title": f"{'friction' if curve.reverses else where} over"
         f" {AXIS_TITLES.get(curve.variable, curve.variable)}",

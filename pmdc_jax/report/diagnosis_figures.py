@@ -27,6 +27,7 @@ AFTER = SIMULATED
 AXIS_TITLES = {
     "speed": "speed [rad/s]",
     "current": "current [A]",
+    "current_rate": "rate of change of the current [A/s]",
     "voltage": "voltage [V]",
     "angle": "angle [rad]",
     "time": "fraction of the run",
@@ -175,11 +176,12 @@ def curve_figure(curve: LearnedCurve) -> go.Figure:
     style(figure, height=300)
     figure.update_xaxes(title_text=AXIS_TITLES.get(curve.variable, curve.variable))
     titles = {
-        "mechanical": "friction [N·m]" if curve.reverses else "torque [N·m]",
-        "electrical": "voltage [V]",
-        "sensor": "fraction of the speed",
+        "N m": "friction [N·m]" if curve.reverses else "torque [N·m]",
+        "V": "voltage [V]",
+        "A": "error of the current [A]",
+        "": "fraction of the speed",
     }
-    title = titles[curve.equation]
+    title = titles[curve.unit]
     figure.update_yaxes(title_text=title, zeroline=True, zerolinecolor=INK)
     return figure
 

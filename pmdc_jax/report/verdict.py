@@ -109,7 +109,7 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
         sentences.append("Something is missing that no effect of the library explains.")
     if diagnosis.curves:
         sentences.append(_curve_sentence(diagnosis.curves[0]))
-    # a misread speed leaves the electrical equation unbalanced, too
+    # a misread current or speed leaves the electrical equation unbalanced, too
     misread = any(curve.equation == "sensor" for curve in diagnosis.curves[:1])
     if diagnosis.breaks_electrical_equation and not misread:
         sentences.append(
@@ -137,6 +137,14 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
 def _curve_sentence(curve: LearnedCurve) -> str:
     """What the clearest unknown term looks like."""
     chance = p_value_words(curve.p_value)
+    if curve.variable == "current_rate":
+        late = -curve.value[-1] / curve.x[-1]
+        when = "late" if late > 0 else "early"
+        return (
+            f"Estimated from the data, it looks most like a current that is read {when}, by"
+            f" {value_with_unit(abs(late), 's')} ({chance}): current, voltage and speed are not filtered alike. Record"
+            " all of them unfiltered, or filter all in the same way."
+        )
     if curve.equation == "sensor":
         times, share = 2 * np.pi / curve.x[-1], 100 * float(np.max(np.abs(curve.value)))
         return (
