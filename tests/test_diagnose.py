@@ -194,7 +194,7 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
         "brush_voltage_drop": 5.0,
     }
     found = assessment_of(gains, unexplained=np.inf)
-    found.p_value, found.may_be_model_form_error, found.is_sensor_ripple = (
+    found.p_value, found.may_be_model_form_error, found.is_sensor_error = (
         0.0,
         lambda model: False,
         lambda: False,
