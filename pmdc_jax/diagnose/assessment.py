@@ -108,7 +108,7 @@ class Assessment(NamedTuple):
     def is_sensor_error(self) -> bool:
         """Whether the clearest signal is an error of a sensor that no effect of the library has."""
         clearest = self.clearest.term
-        return isinstance(clearest, Curve) and clearest.equation == "sensor"
+        return isinstance(clearest, Curve) and clearest.is_sensor_error
 
     def unfiltered_signals(self) -> list[Signal]:
         """The candidates' signals with their gains on the unfiltered residuals."""

@@ -82,9 +82,14 @@ class Curve(NamedTuple):
         return self.variable == "angle"
 
     @property
+    def is_sensor_error(self) -> bool:
+        """Whether it is an error of a sensor that no effect of the library has."""
+        return self.equation == "sensor"
+
+    @property
     def is_sensor_ripple(self) -> bool:
         """Whether it is a ripple of the speed sensor over the rotor angle, as a share of the speed."""
-        return self.equation == "sensor" and self.is_angle_wave
+        return self.is_sensor_error and self.is_angle_wave
 
     @property
     def periods(self) -> float:

@@ -202,7 +202,7 @@ def _regions(naming: Naming) -> tuple[Region, ...]:
     base = found.evidence.regress().squares
     regions = []
     for curve, block in zip(found.curves, found.curve_blocks, strict=True):
-        if curve.per_run or curve.equation == "sensor":
+        if curve.per_run or curve.is_sensor_error:
             continue
         gain = base - found.evidence.regress([block]).squares
         if log_p_value(gain, found.evidence.degrees_of_freedom(block)) > np.log(1e-4):

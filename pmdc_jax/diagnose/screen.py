@@ -70,7 +70,7 @@ def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
 def _is_definite(curve: Signal) -> bool:
     """Whether noise can hardly look like a curve: one that all runs share, or an error of a sensor."""
     assert isinstance(curve.term, Curve)
-    return not curve.term.per_run or curve.term.equation == "sensor"
+    return not curve.term.per_run or curve.term.is_sensor_error
 
 
 def _without_clearest(found: Screen, rows: Sequence[Rows]) -> list[Series]:
