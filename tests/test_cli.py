@@ -327,20 +327,10 @@ def test_demo_refuses_a_file_as_folder(faked, capsys, tmp_path):
     assert faked.identify is None
 
 
-def test_a_short_computation_prints_no_progress_without_a_terminal(faked, capsys):
+def test_no_progress_is_printed_without_a_terminal(faked, capsys):
     assert cli.main(["identify", "a.csv"]) == 0
     faked.identify[1]["progress"]("searching", fitness=1.0)
     assert capsys.readouterr().err == ""
-
-
-def test_a_long_computation_prints_progress_now_and_then_without_a_terminal(monkeypatch, capsys):
-    seconds = iter([0.0, 14.0, 16.0, 16.0, 17.0])
-    monkeypatch.setattr(terminal, "SECONDS_BETWEEN_LINES", 15.0)
-    monkeypatch.setattr(terminal, "monotonic", lambda: next(seconds))
-    with terminal.progress() as report:
-        for doing in ("checking", "searching", "refining"):
-            report(doing, 12.3456)
-    assert capsys.readouterr().err == "after 16 s: searching, best fitness 12.35\n"
 
 
 def test_progress_is_shown_on_a_terminal(monkeypatch, capsys):

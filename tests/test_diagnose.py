@@ -731,7 +731,7 @@ def model_at(coordinates: list[float], effects: tuple[str, ...] = (), **missing:
     run = evolve(recording("run", columns), load=None, **missing)
     given = prepare([run], [], effects=[EFFECTS[e] for e in effects], unloaded=True)
     start = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1))))
-    point = Optimum(start, np.inf, (), False)
+    point = Optimum(start, np.inf, ())
     return model_of(effects, given, polish(given.problem, point, steps=0))
 
 

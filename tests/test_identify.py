@@ -34,8 +34,8 @@ from pmdc_jax.identify.noise_model import whitener
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.polish import fit_run_unknowns, polish
 from pmdc_jax.identify.prepare import prepare
-from pmdc_jax.identify.problem import Problem, Unknowns, _evaluated, evaluate
-from pmdc_jax.identify.refine import Optimum, refine
+from pmdc_jax.identify.problem import Problem, Unknowns, _evaluated, evaluate, normal_matrix
+from pmdc_jax.identify.refine import CONVERGED_DISTANCE, Optimum, refine
 from pmdc_jax.identify.results import results_of
 from pmdc_jax.identify.rotor_angle import with_rotor_angle
 from pmdc_jax.identify.search import METHODS, SearchResult, search
@@ -173,7 +173,7 @@ def test_a_bound_along_an_unidentifiable_direction_is_not_reported(x64):
     at = np.array(best.unknowns.coordinates)
     down = given.problem.parameters.lower[names.index("Kt")] - at[names.index("Kt")]
     at[[names.index(name) for name in ("Kt", "J", "f")]] += down
-    held = Optimum(best.unknowns._replace(coordinates=jnp.asarray(at)), best.fitness, (3,), True)
+    held = Optimum(best.unknowns._replace(coordinates=jnp.asarray(at)), best.fitness, (3,), 0.0)
     assert names[3] == "Kt"
     polished = polish(given.problem, held)
     assert polished.at_bound == (3,)
@@ -638,7 +638,7 @@ def test_the_rotor_angle_is_that_of_the_true_speed_not_of_a_slow_sensor(x64, sen
     coordinates = [np.log(values[n]) if log else values[n] for n, log in logs]
     local = np.array([[truth["current_A"][0], speed[0], 0.0, 0.0, 0.0]])
     unknowns = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.asarray(local).T))
-    fit = polish(given.problem, Optimum(unknowns, np.inf, (), False), steps=0)
+    fit = polish(given.problem, Optimum(unknowns, np.inf, ()), steps=0)
     turn = np.asarray(with_rotor_angle(given.problem, fit).tape.turn).reshape(-1)
     angle = cumulative_simpson(speed, x=time, initial=0.0)
     angle_found = np.concatenate([[0.0], np.cumsum(turn)])[: len(angle)]
@@ -654,6 +654,18 @@ def test_a_refinement_with_too_few_steps_has_not_converged(x64, runs):
     far = optimum._replace(unknowns=start_at(problem, 1.3))
     assert not polish(problem, far, steps=1).optimum.converged
     assert polish(problem, optimum, steps=12).optimum.converged
+
+
+@pytest.mark.parametrize("standard_errors", [0.1, 2.0])
+def test_a_refinement_tells_how_far_it_ended_from_the_minimum(x64, runs, standard_errors):
+    problem = problem_of(runs)
+    best = polish(problem, refine(problem, start_at(problem)))
+    curvature = normal_matrix(best.evaluation, problem.tape, problem.fitted_runs)[0, 0]
+    away = best.coordinates.at[0].add(standard_errors / jnp.sqrt(curvature))
+    start = best.optimum._replace(unknowns=best.unknowns._replace(coordinates=away))
+    ended = polish(problem, start, steps=1).optimum
+    assert ended.distance == pytest.approx(standard_errors, rel=0.05)
+    assert ended.converged == (standard_errors < CONVERGED_DISTANCE)
 
 
 def test_a_failed_simulation_is_no_optimum(x64, runs):
@@ -993,7 +1005,7 @@ def test_a_population_finds_backlash_that_a_gradient_misses():
         names = [f"gear_backlash.{field}" for field in error]
         columns = jnp.array([problem.parameters.names.index(name) for name in names])
         moved = truth.coordinates.at[columns].add(jnp.log(jnp.array([*error.values()])))
-        poor = Optimum(truth._replace(coordinates=moved), np.inf, (), False)
+        poor = Optimum(truth._replace(coordinates=moved), np.inf, ())
         start = polish(problem, poor, steps=0)
         search_factors = dict(zip(names, factors.values(), strict=True))
         by_gradient = polish(problem, poor)

@@ -111,7 +111,7 @@ def fake_identification(samples: int = 3000, **changes) -> Identification:
         "unidentified_directions": (),
         "fit": {name: fake_run(name, rng, samples) for name in INPUTS},
         "noise": NOISE,
-        "converged": True,
+        "distance": 0.01,
         "seed": 0,
         "seconds": {"total": 3.21, "search": 1.1, "refine": 0.4},
         "search": fake_search(rng),
@@ -149,7 +149,7 @@ def partial_identification() -> Identification:
             "speed only": evolve(complete.fit["drive"], role="train", **no_current),
         },
         noise={"current_A": None, "speed_rad_s": 0.6},
-        converged=False,
+        distance=np.inf,
         findings=(
             Finding(
                 "prbs", "current_A", "warning", "saturated at 60 A", "2.31 s to 2.35 s", "Widen it"
@@ -321,6 +321,8 @@ def test_summary_states_what_was_identified_and_how_well_it_fits():
     assert "No run was held out" in sentences
     assert "L is at the bound" in sentences
     assert "did not converge" in sentences
+    sentences = " ".join(summary(fake_identification(distance=1.34)))
+    assert "stalled up to 1.3 standard errors" in sentences
 
 
 def test_summary_lists_the_columns_with_warnings_of_the_data_check():

@@ -274,8 +274,8 @@ def _late_current(tape: Tape, path: Path) -> Term:
     before[:, 0] = np.where(tape.begins, current[:, 0], before[:, 0])
     rate = ((current - before) / np.asarray(tape.sample_time)[tape.grid][:, None]).T
     largest = float(np.quantile(np.abs(rate), 0.95)) + 1e-9
-    ends = np.array([-largest, largest])
-    curve = Curve("sensor", "current_rate", "A", ends, shapes=ends[:, None])
+    knots = np.array([-largest, 0, largest])
+    curve = Curve("sensor", "current_rate", "A", knots, shapes=knots[:, None])
     values = np.stack([rate, np.zeros_like(rate)], axis=1)[..., None].astype(np.float32)
     return curve, lambda: Change(values, by_sensor=True)
 

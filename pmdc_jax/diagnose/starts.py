@@ -101,7 +101,7 @@ class Starts:
         coordinates = self._coordinates(parameters, current, values, changes)
         inside = np.clip(coordinates, parameters.lower, parameters.upper)
         turned = runs._replace(angle=runs.angle + angles)
-        return Start(given, Optimum(Unknowns(jnp.asarray(inside), turned), np.inf, (), False))
+        return Start(given, Optimum(Unknowns(jnp.asarray(inside), turned), np.inf, ()))
 
     def _coordinates(
         self,

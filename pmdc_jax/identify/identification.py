@@ -10,6 +10,7 @@ from attrs import field, frozen
 
 from ..motor import Motor
 from ..recording import Finding
+from .refine import CONVERGED_DISTANCE
 
 Status = Literal["identified", "at_bound", "tied", "not_identifiable", "known"]
 Role = Literal["train", "holdout"]
@@ -88,7 +89,8 @@ class Identification:
     unidentified_directions: tuple[Direction, ...]
     fit: Mapping[str, RunFit]
     noise: Mapping[str, float | None]  # current_A, speed_rad_s
-    converged: bool
+    # predicted from the gradient: how far the best fit is from where the refinement ended, in standard errors
+    distance: float
     seed: int
     seconds: Mapping[str, float]
     search: Search
@@ -101,3 +103,8 @@ class Identification:
     doubts: tuple[str, ...] = ()  # those messages which say that the model lacks something
     # RMS of the residuals over their white noise, for outputs (current, speed) for which it is large
     missed: Mapping[str, float] = field(factory=dict)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the refinement ended near the best fit, by the gradient."""
+        return self.distance <= CONVERGED_DISTANCE

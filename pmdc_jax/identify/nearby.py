@@ -58,7 +58,7 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     for rank in TRIED_RANKS:
         coordinates[places] = found.candidates[rank]
         unknowns = fit.unknowns._replace(coordinates=jnp.asarray(coordinates))
-        best = polish(problem, Optimum(unknowns, np.inf, (), False), steps=0).optimum
+        best = polish(problem, Optimum(unknowns, np.inf, ()), steps=0).optimum
         if np.isfinite(best.fitness):
             return best
     return fit.optimum

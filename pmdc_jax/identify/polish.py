@@ -31,12 +31,9 @@ from .refine import Optimum
 # kinks, at which the linearised model predicts a larger reduction than there is
 PATIENCE, MIN_COST_DECREASE = 5, 1e-5
 # Gauss-Newton steps at most, and the predicted reduction of the sum of squares, in noise variances, below which no
-# step is taken: the square of 0.03 standard errors
+# step is taken: the square of 0.045 standard errors
 MAX_STEPS = 20
-TOLERANCE = 1e-3
-# Predicted reduction that still counts as converged where no step lowers the sum of squares, at the kinks of dry
-# elements: the square of 0.3 standard errors
-KINK_TOLERANCE = 0.1
+TOLERANCE = 2e-3
 # Initial twists tried for a run, as shares of the gear's backlash, from where the load presses the teeth
 BACKLASH_STARTS = np.linspace(-1.0, 1.0, 9)
 # Initial rotor angles tried per period of an angle-dependent torque (the shortest one), and at most
@@ -83,13 +80,12 @@ def polish(
 ) -> Fit:
     """Gauss-Newton iterations in which each output is weighted by the standard deviation of its own residuals.
 
-    Convergence is judged by the gradient: no step within the bounds is predicted to lower the sum of squares by more
-    than `tolerance`, in noise variances (`KINK_TOLERANCE` where no step that lowers it is found). A coordinate held at
-    a bound is released where the gradient points back inside. `known` is the evaluation at the start, if there is one
-    already.
+    It ends where no step within the bounds is predicted to lower the sum of squares by more than `tolerance`, in noise
+    variances, or none is found that lowers it. A coordinate held at a bound is released where the gradient points back
+    inside. `known` is the evaluation at the start, if there is one already.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
-    held, converged = set(start.at_bound), False
+    held = set(start.at_bound)
     best = trial = _evaluate_weighted(problem, start.unknowns, known)
     step, share, gain = np.zeros(len(flatten(start.unknowns))), 1.0, np.inf
     costs = [best.cost]
@@ -103,7 +99,7 @@ def polish(
             coordinates = np.asarray(best.unknowns.coordinates)
             held = {k for k in held if (best.matrix[k, -1] > 0) == (coordinates[k] <= low[k])}
             step, gain = gauss_newton_step(best.matrix, held, len(low))
-            if converged := gain <= tolerance * _residual_variance(problem, best):
+            if gain <= tolerance * _residual_variance(problem, best):
                 break
         elif share > 1e-3:
             share /= 4  # the last step was too long
@@ -117,8 +113,8 @@ def polish(
         moved[: len(low)] = inside
         trial = _evaluate_weighted(problem, unflatten(problem, jnp.asarray(moved)))
         costs.append(min(trial.cost, best.cost))
-    converged = converged or gain <= KINK_TOLERANCE * _residual_variance(problem, best)
-    optimum = Optimum(best.unknowns, best.fitness, tuple(sorted(held)), bool(converged))
+    distance = float(np.sqrt(gain / _residual_variance(problem, best)))
+    optimum = Optimum(best.unknowns, best.fitness, tuple(sorted(held)), distance)
     return Fit(optimum, best.evaluation, best.noise)
 
 
@@ -146,8 +142,8 @@ class _WeightedPoint(NamedTuple):
 def _residual_variance(problem: Problem, best: _WeightedPoint) -> float:
     """Mean square of the weighted residuals. Unless they are whitened it is at least 1, the noise they are weighted by:
     fitted to a simulation without noise they are next to nothing."""
-    mean = best.matrix[-1, -1] / problem.most_samples
-    return mean if problem.whitening is not None else max(mean, 1.0)
+    mean = best.matrix[-1, -1] / max(float(np.sum(problem.samples)), 1.0)
+    return max(mean, 1e-300 if problem.whitening is not None else 1.0)
 
 
 def reweighted(problem: Problem, fit: Fit) -> Evaluation:

@@ -67,7 +67,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
         unidentified_directions=explain_directions(info.unseen, parameters, training),
         fit=fit,
         noise={"current_A": noise["current"], "speed_rad_s": noise["speed"]},
-        converged=best.converged,
+        distance=best.distance,
         seed=solved.seed,
         seconds=solved.seconds,
         search=solved.search,

@@ -20,6 +20,8 @@ MODEL_ASSUMPTION = (
 )
 # an RMS residual up to this multiple of the noise counts as noise: the RMS of few samples scatters as much
 MAX_NOISE_RATIO = 1.25
+# A refinement that stalls within so many standard errors of the best fit has found it all the same
+MAX_STALLED_DISTANCE = 3.0
 
 
 def status_word(status: str) -> str:
@@ -64,10 +66,17 @@ def cautions(identification: Identification) -> list[str]:
         who = f"{enumerate_words(at_bound)} {'are' if len(at_bound) > 1 else 'is'}"
         sentences.append(f"{who} at the bound of the search range: a limit, not an estimate.")
     if not identification.converged:
-        sentences.append(
-            "The refinement did not converge: treat all results with care, or try another seed."
-        )
+        sentences.append(_unconverged_sentence(identification.distance))
     return sentences
+
+
+def _unconverged_sentence(distance: float) -> str:
+    if distance > MAX_STALLED_DISTANCE:
+        return "The refinement did not converge: treat all results with care, or try another seed."
+    return (
+        f"The refinement stalled up to {distance:.2g} standard errors from the best fit, as it may where dry friction"
+        " sticks and slips: the intervals may be too narrow by as much."
+    )
 
 
 def runs_in_order(identification: Identification) -> list[tuple[str, RunFit]]:

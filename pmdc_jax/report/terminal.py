@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from time import monotonic
 
 from attrs import evolve
 from rich.console import Console, Group, OverflowMethod, RenderableType
@@ -13,14 +12,13 @@ from rich.table import Table
 from rich.text import Text
 
 from ..identify.identification import Estimate, Identification
-from ..progress import ReportProgress
+from ..progress import ReportProgress, silent
 from ..recording import Finding
 from .notation import enumerate_words, percent, significant, write_estimate
 from .summary import role_word, runs_in_order, status_word, summary
 
 STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
 SEVERITY_STYLES = {"error": "red", "warning": "yellow"}
-SECONDS_BETWEEN_LINES = 15.0  # at least, of progress where standard error is no terminal
 PIPE_WIDTH = 100  # without a terminal, rich would fold tables at 80 columns
 
 
@@ -64,10 +62,10 @@ def identification_tables(identification: Identification) -> RenderableType:
 
 @contextmanager
 def progress() -> Iterator[ReportProgress]:
-    """A live progress line on standard error; if that is no terminal, a line every `SECONDS_BETWEEN_LINES` or more."""
+    """A live progress line on standard error; none if that is no terminal."""
     console = console_for(stderr=True)
     if not console.is_terminal:
-        yield _progress_lines(console)
+        yield silent
         return
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as display:
@@ -75,27 +73,10 @@ def progress() -> Iterator[ReportProgress]:
 
         def report(doing: str, fitness: float | None = None, fraction: float | None = None) -> None:
             done, total = (None, None) if fraction is None else (fraction, 1.0)
-            text = _progress_text(doing, fitness)
-            display.update(task, description=text, completed=done, total=total)
+            known = "" if fitness is None else f", best fitness {significant(fitness, 4)}"
+            display.update(task, description=doing + known, completed=done, total=total)
 
         yield report
-
-
-def _progress_lines(console: Console) -> ReportProgress:
-    began = last = monotonic()
-
-    def report(doing: str, fitness: float | None = None, fraction: float | None = None) -> None:
-        nonlocal last
-        del fraction
-        if monotonic() - last > SECONDS_BETWEEN_LINES:
-            last = monotonic()
-            console.print(Text(f"after {last - began:.0f} s: {_progress_text(doing, fitness)}"))
-
-    return report
-
-
-def _progress_text(doing: str, fitness: float | None) -> str:
-    return doing if fitness is None else f"{doing}, best fitness {significant(fitness, 4)}"
 
 
 def parameter_table(identification: Identification) -> Table:
