@@ -949,15 +949,17 @@ def test_bad_arguments_are_refused(runs, call, expected):
         call(runs)
 
 
-def behind_a_gear(gap: float, load: float, twist: float = 0.0) -> tuple[Problem, Unknowns]:
+def behind_a_gear(
+    gap: float, load: float, twist: float = 0.0, Kt: float = PAPER.Kt, **options: object
+) -> tuple[Problem, Unknowns]:
     """The problem of one run with gear backlash, and the true coordinates, with all unknowns of the run at zero."""
     gear = {"stiffness": 500.0, "damping": 0.1, "load_share": 0.4, "gap_rad": gap}
     driven = vb.prbs(np.random.default_rng(0), 1.0)
-    motor = {name: getattr(PAPER, name) for name in PARAMETERS}
+    motor = {name: getattr(PAPER, name) for name in PARAMETERS} | {"Kt": Kt}
     plant = Plant(**motor, **gear)
     seen = simulate(plant, driven.time, driven.voltage, driven.load + load, twist=twist)
     run = Recording("gear", driven.time, driven.voltage, seen[:, 0], seen[:, 1])
-    given = prepare([run], [], effects=[EFFECTS["gear_backlash"]], unloaded=not load)
+    given = prepare([run], [], effects=[EFFECTS["gear_backlash"]], unloaded=not load, **options)
     names = ("stiffness_Nm_rad", "damping_Nms_rad", "load_share", "gap_rad")
     truth = {**motor, **dict(zip(names, gear.values(), strict=True))}
     named = [truth[name.removeprefix("gear_backlash.")] for name in given.problem.parameters.names]
@@ -997,11 +999,14 @@ def test_a_run_may_begin_anywhere_in_the_backlash(twist):
     assert fitted < 1.01 * least
 
 
-def test_a_population_finds_backlash_that_a_gradient_misses():
+@pytest.mark.parametrize(
+    "options", [{}, {"tie": [("Kt", "Kb")], "known": {"R": PAPER.R}, "Kt": PAPER.Kb}]
+)
+def test_a_population_finds_backlash_that_a_gradient_misses(options):
     factors = {"gap_rad": 10.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2}
     error = {"gap_rad": 0.3, "stiffness_Nm_rad": 0.2, "damping_Nms_rad": 3.0, "load_share": 1.5}
     with jax.enable_x64(True):
-        problem, truth = behind_a_gear(gap=0.3, load=0.0)
+        problem, truth = behind_a_gear(gap=0.3, load=0.0, **options)
         names = [f"gear_backlash.{field}" for field in error]
         columns = jnp.array([problem.parameters.names.index(name) for name in names])
         moved = truth.coordinates.at[columns].add(jnp.log(jnp.array([*error.values()])))

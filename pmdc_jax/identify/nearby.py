@@ -32,8 +32,9 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     **Returns**: the best point at which the problem can be evaluated; that of the fit, if there is none.
     """
     parameters, coordinates = problem.parameters, np.array(fit.coordinates)
-    values = {name: parameters.value(name, coordinates) for name in parameters.names}
-    bounds = {name: (value, value) for name, value in values.items() if name in PARAMETERS}
+    every = dict.fromkeys((*PARAMETERS, *parameters.known, *parameters.names))
+    values = {name: parameters.value(name, coordinates) for name in every}
+    bounds = {name: (values[name], values[name]) for name in PARAMETERS}
     for name, factor in factors.items():
         effect, _, field = name.partition(".")
         limits = next(e for e in parameters.effects if e.name == effect).ranges[field]
@@ -41,9 +42,8 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
             max(values[name] / factor, limits.lower),
             min(values[name] * factor, limits.upper),
         )
-    known = {name: float(value) for name, value in parameters.known.items()}
-    known |= {name: value for name, value in values.items() if name not in factors}
-    free = Parameters.of(bounds, parameters.effects, known, parameters.ties)
+    known = {name: value for name, value in values.items() if name not in factors}
+    free = Parameters.of(bounds, parameters.effects, known)
     # a fit that cannot be simulated has no finite noise
     noise = np.where(np.isfinite(fit.noise), fit.noise, problem.noise)
     found = search(

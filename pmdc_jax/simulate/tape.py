@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
@@ -81,59 +81,28 @@ class Tape(eqx.Module):
         rises = straight or any(recording.resampled_from is not None for recording in recordings)
         averaged = any(recording.averaging is not None for recording in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
+        sample_times, drives, free = (np.array(each) for each in zip(*grids, strict=True))
         empty_runs = _power_of_two(len(runs)) - len(runs)
-        blocks = _round_up(sum(run.blocks for run in runs) + empty_runs)
-        tape = {
-            "value": np.zeros((blocks, BLOCK)),
-            "load": np.zeros((blocks, BLOCK)),
-            "measured": np.zeros((blocks, 2, BLOCK)),
-            "weight": np.zeros((blocks, 2, BLOCK)),
-            "turn": np.full((blocks, BLOCK), np.nan),
-            "rise": np.zeros((blocks, BLOCK)) if rises else None,
-            "run": np.full(blocks, len(runs) + empty_runs - 1),
-            "begins": np.zeros(blocks, bool),
-            "grid": np.full(blocks, grids.index(runs[-1].grid)),
-        }
-        first = 0
-        for index, run in enumerate(runs):
-            part = slice(first, first + run.blocks)
-            tape["value"][part] = run.to_blocks(run.value, hold=True)
-            tape["load"][part] = run.to_blocks(run.load, hold=True)
-            for channel, samples in enumerate((run.current, run.speed)):
-                missing = np.isnan(samples)
-                tape["measured"][part, channel] = run.to_blocks(np.where(missing, 0.0, samples))
-                tape["weight"][part, channel] = run.to_blocks(np.where(missing, 0.0, 1.0))
-            if rises:
-                tape["rise"][part] = run.to_blocks(run.rise)
-            if follow:
-                tape["turn"][part] = run.to_blocks(run.turn(), hold=True)
-            tape["run"][part], tape["grid"][part] = index, grids.index(run.grid)
-            tape["begins"][first] = True
-            first += run.blocks
-        tape["run"][first : first + empty_runs] = np.arange(len(runs), len(runs) + empty_runs)
-        # every block of padding begins anew, so that joining the blocks never waits for it
-        tape["begins"][first:], tape["turn"][first:] = True, 0.0
 
         def of_runs(values: Iterable[float | Sequence[float]]) -> np.ndarray:
             known = np.array(list(values))
             return np.append(known, np.zeros((empty_runs, *known.shape[1:]), known.dtype), axis=0)
 
-        kinds, free = np.array([drive for _, drive, _ in grids]), np.array([f for *_, f in grids])
         return cls(
-            **tape,
-            sample_time=np.array([sample_time for sample_time, *_ in grids]),
+            **_laid_in_blocks(runs, grids, empty_runs, rises, follow),
+            sample_time=sample_times,
             drive=Drive(
-                *(np.where(kinds == kind, 1.0, 0.0) for kind in Drive._fields[:3]),
+                *(np.where(drives == kind, 1.0, 0.0) for kind in Drive._fields[:3]),
                 free=np.where(free, 1.0, 0.0),
             ),
-            initial=np.array([run.initial for run in runs] + empty_runs * [(0.0, 0.0)]),
+            initial=of_runs(run.initial for run in runs),
             averaging=of_runs(r.averaging or (0.0, 0.0) for r in recordings) if averaged else None,
             load_unknown=of_runs(
                 r.load is None and not unloaded and not r.held for r in recordings
             ),
             angle=of_runs(_first(r.angle) for r in recordings),
             angle_known=of_runs(r.angle is not None for r in recordings),
-            longest=2.0 ** math.ceil(math.log2(max(s for s, *_ in grids) / 1e-3) - 1e-6) * 1e-3,
+            longest=2.0 ** math.ceil(math.log2(sample_times.max() / 1e-3) - 1e-6) * 1e-3,
         )
 
     @property
@@ -198,6 +167,10 @@ class Tape(eqx.Module):
         return float(self.sample_time[self.grid_of(run)])
 
 
+# Sample time in s, what drives the motor, and whether the rotor is free
+Grid = tuple[float, str, bool]
+
+
 class _Run:
     """One recording as the tape needs it: drive, load, measurements and initial state."""
 
@@ -223,7 +196,7 @@ class _Run:
             self.rise = np.diff(value, append=value[-1]) if linear else np.zeros(self.length)
             self.value = value + self.rise / 2
         # rounded: two runs of one clock must share a grid even if their time stamps differ in the last bits
-        self.grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held)
+        self.grid: Grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held)
         self.initial = (_first(self.current), _first(self.speed))
 
     def turn(self) -> np.ndarray:
@@ -237,6 +210,50 @@ class _Run:
     def to_blocks(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
         padding = self.blocks * BLOCK - self.length
         return np.pad(samples, (0, padding), mode="edge" if hold else "constant").reshape(-1, BLOCK)
+
+
+def _laid_in_blocks(
+    runs: Sequence[_Run], grids: Sequence[Grid], empty_runs: int, rises: bool, follow: bool
+) -> dict[str, Any]:
+    """The fields of a tape that have a row for each block: the runs, `empty_runs` of one block, then padding."""
+    blocks = _round_up(sum(run.blocks for run in runs) + empty_runs)
+    value, load = np.zeros((2, blocks, BLOCK))
+    measured, weight = np.zeros((2, blocks, 2, BLOCK))
+    turn = np.full((blocks, BLOCK), np.nan)
+    rise = np.zeros((blocks, BLOCK)) if rises else None
+    of_run = np.full(blocks, len(runs) + empty_runs - 1)
+    begins = np.zeros(blocks, bool)
+    of_grid = np.full(blocks, grids.index(runs[-1].grid))
+    first = 0
+    for index, run in enumerate(runs):
+        part = slice(first, first + run.blocks)
+        value[part] = run.to_blocks(run.value, hold=True)
+        load[part] = run.to_blocks(run.load, hold=True)
+        for channel, samples in enumerate((run.current, run.speed)):
+            missing = np.isnan(samples)
+            measured[part, channel] = run.to_blocks(np.where(missing, 0.0, samples))
+            weight[part, channel] = run.to_blocks(np.where(missing, 0.0, 1.0))
+        if rise is not None:
+            rise[part] = run.to_blocks(run.rise)
+        if follow:
+            turn[part] = run.to_blocks(run.turn(), hold=True)
+        of_run[part], of_grid[part] = index, grids.index(run.grid)
+        begins[first] = True
+        first += run.blocks
+    of_run[first : first + empty_runs] = np.arange(len(runs), len(runs) + empty_runs)
+    # every block of padding begins anew, so that joining the blocks never waits for it
+    begins[first:], turn[first:] = True, 0.0
+    return {
+        "value": value,
+        "load": load,
+        "measured": measured,
+        "weight": weight,
+        "turn": turn,
+        "rise": rise,
+        "run": of_run,
+        "begins": begins,
+        "grid": of_grid,
+    }
 
 
 def _first(samples: np.ndarray | None) -> float:
