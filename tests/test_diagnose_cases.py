@@ -360,3 +360,29 @@ def test_an_eccentric_weight_behind_a_gear_is_not_in_the_library():
     assert {curve.variable for curve in found.curves[:1]} == {"angle"}
     turn = found.curves[0].x[-1] / (2 * np.pi)
     assert turn == pytest.approx(11.6, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "friction"),
+    [
+        ("R", 1.1, 0.08),
+        pytest.param("J", 1.6, 0.0, marks=pytest.mark.slow),
+        pytest.param("f", 1.5, 0.0, marks=pytest.mark.slow),
+        pytest.param("Kb", 0.97, 0.0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_parameter_that_differs_in_one_run_is_told(name, factor, friction):
+    """The residuals are far above the noise, but no term that the runs share explains them."""
+    changed = {**PAPER, name: factor * PAPER[name]}
+    one, other = (vb.BenchMotor(**m, coulomb_Nm=friction) for m in (PAPER, changed))
+    driven = 2 if name != "J" else 0  # the loaded run determines all but the inertia
+    apart = attrs.evolve(recorded(other, 5, NOISE)[driven], name="apart")
+    found = diagnose([*recorded(one, 4, NOISE), apart])
+    assert found.verdict == "not_in_library"
+    assert [effect.name for effect in found.effects] == ["coulomb_friction"] * (friction > 0)
+    assert found.varies is not None
+    assert found.varies.name == name
+    by_run = {run: one.value for run, one in found.varies.by_run.items()}
+    others = [value for run, value in by_run.items() if run != "apart"]
+    # to first order, and relative to a value that all runs share
+    assert by_run["apart"] / np.mean(others) == pytest.approx(factor, rel=0.06)

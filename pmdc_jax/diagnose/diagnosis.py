@@ -26,6 +26,8 @@ MAX_HOLDOUT_RATIO = 2.5
 MAX_HOLDOUT_GROWTH = 1.1
 # Misfit of one fitted run over the largest of all others above which something happened in that run alone
 OUTLIER_RATIO = 5.0
+# ... and above which noise does not explain that it differs, even if it explains all that is left
+MAX_NOISE_RATIO = 10.0
 
 
 @frozen
@@ -63,6 +65,25 @@ class LearnedCurve:
     stderr: np.ndarray
     p_value: float
     reverses: bool  # changes sign with the direction of motion, as friction does
+
+
+@frozen
+class ValueByRun:
+    """The value of a parameter in one run alone, SI, and its standard error."""
+
+    value: float
+    stderr: float
+
+
+@frozen
+class VaryingParameter:
+    """A parameter of the motor that differs from run to run."""
+
+    name: str
+    unit: str
+    by_run: Mapping[str, ValueByRun]  # of the runs that determine it, at least two
+    p_value: float  # of the data if it were the same in all runs
+    also_possible: tuple[str, ...] = ()  # parameters whose variation would explain the runs as well
 
 
 @frozen
@@ -119,6 +140,7 @@ class Diagnosis:
     seconds: Mapping[str, float]  # time taken: "identify", "name", "total"
     # whether what the final motor leaves is no more than noise may
     leaves_noise: bool = True
+    varies: VaryingParameter | None = None  # what differs from run to run, if that is what is left
 
     @property
     def rivals(self) -> list[list[str]]:
@@ -140,13 +162,23 @@ class Diagnosis:
     def run_apart(self) -> tuple[str, float] | None:
         """The fitted run whose misfit is far larger than that of any other, and how many times; None without one, or if
         all that is left is white noise, which may be larger in one run."""
-        fitted = [name for name, fit in self.final.fit.items() if fit.role == "train"]
         leaves_more = self.final.missed or not self.leaves_noise or self.verdict == "not_in_library"
-        if len(fitted) < 3 or not leaves_more:
-            return None
-        *_, second, worst = sorted(fitted, key=lambda name: self.gap_of_run[name].after)
-        ratio = self.gap_of_run[worst].after / max(self.gap_of_run[second].after, 1e-300)
-        return (worst, ratio) if ratio > OUTLIER_RATIO else None
+        name, ratio = _largest_misfit(self.gap_of_run, self.final)
+        return (name, ratio) if leaves_more and ratio > OUTLIER_RATIO else None
+
+
+def is_disturbed(gap_of_run: Mapping[str, Gap], final: Identification) -> bool:
+    """Whether something happened in one fitted run that noise does not explain."""
+    return bool(final.missed) and _largest_misfit(gap_of_run, final)[1] > MAX_NOISE_RATIO
+
+
+def _largest_misfit(gap_of_run: Mapping[str, Gap], final: Identification) -> tuple[str, float]:
+    """The fitted run with the largest misfit, and its ratio to the largest of all others: 1 for less than three."""
+    fitted = [name for name, fit in final.fit.items() if fit.role == "train"]
+    if len(fitted) < 3:
+        return fitted[0], 1.0
+    *_, second, worst = sorted(fitted, key=lambda name: gap_of_run[name].after)
+    return worst, gap_of_run[worst].after / max(gap_of_run[second].after, 1e-300)
 
 
 def breaks_electrical_equation(before: float, after: float) -> bool:

@@ -27,6 +27,8 @@ from .assessment import (
     has_axes_of,
 )
 from .compare import BIC_MARGIN, DECISIVE_RATIO, Comparison, Fitted, simplest_equivalent
+from .constancy import share_beyond_variation, varying_parameter
+from .diagnosis import VaryingParameter
 from .effect_relations import CONTAINS, are_rivals
 from .elimination import BackwardElimination
 from .library import Library
@@ -70,11 +72,15 @@ class Naming(NamedTuple):
     p_nothing_more: float  # p-value of what is left if nothing more were missing
     may_be_model_form_error: bool  # what is left, of the chosen effects
     leaves_sensor_error: bool  # whether what is left is most like that
-    # root mean square of the chosen one's residuals beyond all curves, over that of all; 1 if nothing more is missing
+    # root mean square of the chosen one's residuals beyond all curves, or beyond what varies from run to run, over that
+    # of all; 1 if nothing more is missing
     noise_share: float
     p_without: dict[str, float]  # by effect of the chosen model: p-value of the data without it
     final_fit: tuple[Prepared, Fit]  # of the chosen model
     line: Line | None  # a steady oscillation that the chosen model does not have
+    varies: (
+        VaryingParameter | None
+    )  # the parameter that differs from run to run, if that is what is left
 
 
 class StepwiseSelection:
@@ -270,7 +276,10 @@ class StepwiseSelection:
     def _naming(self, current: Model) -> Naming:
         """The naming with a model as the chosen one."""
         base, found = self.assess(self.base), self.assess(current)
-        more_missing = found.p_value < FALSE_ALARM
+        more_missing, varies = found.p_value < FALSE_ALARM, varying_parameter(current, found)
+        noise_share = share_beyond_curves(found.screen) if more_missing else 1.0
+        if varies:
+            noise_share = share_beyond_variation(found.screen, current, varies.name)
         return Naming(
             chosen=current,
             rivals=rivals_of(current, found, self.refits, self.comparison),
@@ -280,10 +289,11 @@ class StepwiseSelection:
             p_nothing_more=found.p_value,
             may_be_model_form_error=found.may_be_model_form_error(current),
             leaves_sensor_error=more_missing and found.is_sensor_error(),
-            noise_share=np.sqrt(share_beyond_curves(found.screen)) if more_missing else 1.0,
+            noise_share=np.sqrt(noise_share),
             p_without=p_values_without(current, found.screen.white, self.refits, self.comparison),
             final_fit=final_fit(current, self.comparison.filter_of(current)),
             line=line_of(current),
+            varies=varies,
         )
 
     def _trials(self, current: Model, found: Assessment) -> list[Model | None]:

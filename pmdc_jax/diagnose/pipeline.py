@@ -29,6 +29,7 @@ from .diagnosis import (
     Region,
     Verdict,
     breaks_electrical_equation,
+    is_disturbed,
     unlike_held_out,
 )
 from .evidence import MIN_EIGENVALUE, Block
@@ -92,7 +93,11 @@ def diagnose(
         final = _identification(naming, solved)
     before, after = (electrical_misfit(m) for m in (selection.base, naming.chosen))
     verdict = "not_in_library" if breaks_electrical_equation(before, after) else _verdict(naming)
-    gaps = gaps_of_runs(base, final, naming.noise_share if verdict == "not_in_library" else 1.0)
+    leaves_more = verdict == "not_in_library" or naming.varies
+    gaps = gaps_of_runs(base, final, naming.noise_share if leaves_more else 1.0)
+    if verdict == "none_detected" and is_disturbed(gaps, final):
+        # what is left is then no noise but that of the sensors
+        verdict, gaps = "not_in_library", gaps_of_runs(base, final, share=0.0)
     by_role = gaps_by_role(gaps, base)
     if unlike_held_out(by_role):
         verdict = "not_in_library"
@@ -120,6 +125,7 @@ def diagnose(
         electrical_misfit_before=before,
         seconds=seconds,
         leaves_noise=naming.p_nothing_more >= FALSE_ALARM,
+        varies=naming.varies,
     )
 
 
@@ -174,7 +180,7 @@ def _verdict(naming: Naming) -> Verdict:
     if naming.line is not None:
         return "not_in_library"
     if naming.p_nothing >= FALSE_ALARM:
-        return "none_detected"
+        return "not_in_library" if naming.varies else "none_detected"
     if naming.p_nothing_more < FALSE_ALARM and not naming.may_be_model_form_error:
         return "not_in_library"
     if not naming.chosen.effects:

@@ -141,11 +141,7 @@ def _signal(
     found: Screen, term: Candidate | Curve, block: Block, gain: float, common: float = 0.0
 ) -> Signal:
     """The signal of one block, its p-value corrected for rounding, slow noise and the gain that is `common`."""
-    dispersion = found.evidence.rounding_dispersion(block)
-    if found.torque_drift is not None and _is_slow_torque(term):
-        dispersion = max(dispersion, _dispersion_beside(found, block, found.torque_drift))
-    if found.voltage_noise is not None and _is_voltage(term):
-        dispersion = max(dispersion, _dispersion_beside(found, block, found.voltage_noise))
+    dispersion = dispersion_by_noise(found, block, _is_slow_torque(term), _is_voltage(term))
     degrees_of_freedom = found.evidence.degrees_of_freedom(block)
     log_p = log_p_value(max(gain - common, 0.0) / dispersion, degrees_of_freedom)
     return Signal(gain, log_p, term, block)
@@ -194,6 +190,18 @@ def _is_slow_torque(term: Candidate | Curve) -> bool:
         effect = EFFECTS[term.effect]
         return effect.equation == "mechanical" and not effect.states
     return term.equation == "mechanical" and term.variable in ("speed", "current")
+
+
+def dispersion_by_noise(
+    found: Screen, block: Block, slow_torque: bool = True, voltage: bool = True
+) -> float:
+    """Overdispersion of a block by rounding and, if they may look like it, by slow torque noise and by noise of the
+    recorded voltage."""
+    dispersion = found.evidence.rounding_dispersion(block)
+    for noise, alike in ((found.torque_drift, slow_torque), (found.voltage_noise, voltage)):
+        if noise is not None and alike:
+            dispersion = max(dispersion, _dispersion_beside(found, block, noise))
+    return dispersion
 
 
 def _dispersion_beside(found: Screen, block: Block, noise: Block) -> float:

@@ -59,6 +59,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "gap": {**gap, "closed_fraction": diagnosis.closed_fraction},
         "gap_of_run": {run: _gap(one) for run, one in diagnosis.gap_of_run.items()},
         "next_experiment": _experiment(diagnosis.next_experiment),
+        "varies": asdict(diagnosis.varies) if diagnosis.varies else None,
         "curves": [asdict(curve) for curve in diagnosis.curves],
         "detectable": [asdict(one) for one in diagnosis.detectable],
         "p_nothing_missing": diagnosis.p_nothing,

@@ -13,6 +13,7 @@ from ..diagnose.diagnosis import (
     EffectFound,
     LearnedCurve,
     Region,
+    VaryingParameter,
     unlike_held_out,
     worse_held_out,
 )
@@ -105,13 +106,15 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
         found = _capitalised(_effects_in_words(diagnosis))
         verb, added = ("explain", "were") if len(diagnosis.effects) > 1 else ("explains", "was")
         sentences.append(f"{found} {verb} part of this and {added} added to the model{rest}.")
-    else:
+    elif not diagnosis.varies:
         sentences.append("Something is missing that no effect of the library explains.")
-    if diagnosis.curves:
+    if diagnosis.varies:
+        sentences.append(_varying_sentence(diagnosis.varies))
+    elif diagnosis.curves:
         sentences.append(_curve_sentence(diagnosis.curves[0]))
     # a misread current or speed leaves the electrical equation unbalanced, too
     misread = any(curve.equation == "sensor" for curve in diagnosis.curves[:1])
-    if diagnosis.breaks_electrical_equation and not misread:
+    if diagnosis.breaks_electrical_equation and not (misread or diagnosis.varies):
         sentences.append(
             "From sample to sample the current deviates from the prediction by voltage and speed by"
             f" {significant(diagnosis.electrical_misfit)} times what the sensor noise explains, which no torque"
@@ -323,6 +326,8 @@ def _gap_sentence(diagnosis: Diagnosis) -> str:
 
 
 def _formula_sentence(diagnosis: Diagnosis) -> str:
+    if diagnosis.varies:
+        return f"Not only noise is left. {_varying_sentence(diagnosis.varies)}"
     if diagnosis.leaves_noise or not diagnosis.effects:
         return ""
     if diagnosis.curves:
@@ -334,12 +339,13 @@ def _formula_sentence(diagnosis: Diagnosis) -> str:
 
 
 def _slow_rest_sentence(diagnosis: Diagnosis) -> str:
-    """A warning that what counts as noise exceeds the white noise of the sensors; empty where it does not."""
+    """A warning that what counts as noise exceeds the white noise of the sensors; empty where it does not, or where
+    something differs from run to run."""
     rest = [
         f"{significant(times)} times the white noise of the {name}"
         for name, times in diagnosis.final.missed.items()
     ]
-    if not rest:
+    if not rest or diagnosis.varies:
         return ""
     return (
         f"The remaining residual was treated as noise, but is {enumerate_words(rest)}: a fluctuating torque may cause"
@@ -347,9 +353,35 @@ def _slow_rest_sentence(diagnosis: Diagnosis) -> str:
     )
 
 
+# What makes a parameter of a motor differ from run to run
+REASONS = {
+    "R": "a warmer winding or another cable",
+    "L": "another current or another cable",
+    "Kb": "warmer magnets, or a sensor with another gain",
+    "Kt": "warmer magnets, or a sensor with another gain",
+    "J": "another inertia on the shaft",
+    "f": "warmer bearings, or another load",
+}
+
+
+def _varying_sentence(varies: VaryingParameter) -> str:
+    """What differs from run to run, and why it may."""
+    values = {run: one.value for run, one in varies.by_run.items()}
+    ends = [
+        f"{value_with_unit(values[run], varies.unit)} in the run {run}"
+        for run in (min(values, key=values.__getitem__), max(values, key=values.__getitem__))
+    ]
+    other = f" (or {enumerate_words(varies.also_possible)})" if varies.also_possible else ""
+    return (
+        f"{varies.name}{other} is not the same in all runs: about {ends[0]}, {ends[1]}"
+        f" ({p_value_words(varies.p_value)}), as {REASONS[varies.name]} would make it. Record all runs in one state of"
+        " the motor, or identify those of each state separately."
+    )
+
+
 def _run_apart_sentence(diagnosis: Diagnosis) -> str:
-    """Which single run holds what is left; empty if all do, or if nothing is left."""
-    if diagnosis.run_apart is None:
+    """Which single run holds what is left; empty if all do, if nothing is left, or if a parameter differs there."""
+    if diagnosis.run_apart is None or diagnosis.varies:
         return ""
     name, ratio = diagnosis.run_apart
     return (
