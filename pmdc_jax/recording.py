@@ -241,6 +241,7 @@ def _faults_of_time(time: np.ndarray) -> Iterator[Fault]:
         what = f"time goes backwards, from {before} s to {now} s"
         mend = "A file holds one run: split it, or sort the lines"
     else:
-        what = f"the time stamp {now} s is repeated ({(steps == 0).sum()} repetitions in all)"
+        others = int(np.sum(steps == 0)) - 1
+        what = f"the time stamp {now} s is repeated" + (f", as are {others} more" if others else "")
         mend = "Export time with more digits, or delete repeated lines"
     yield Fault("time", row, what, mend)

@@ -325,6 +325,16 @@ def test_summary_states_what_was_identified_and_how_well_it_fits():
     assert "stalled up to 1.3 standard errors" in sentences
 
 
+@pytest.mark.parametrize(("ratio", "status"), [(30, "at_bound"), (1.2, "identified"), (30, "tied")])
+def test_summary_doubts_constants_that_no_motor_has(ratio, status):
+    complete = fake_identification()
+    Kb = complete.parameters["Kb"]
+    Kt = evolve(Kb, value=ratio * Kb.value, status=status)
+    found = evolve(complete, parameters={**complete.parameters, "Kt": Kt})
+    doubted = "Kt is 30.0 times Kb" in " ".join(summary(found))
+    assert doubted == (ratio == 30 and status != "tied")
+
+
 def test_summary_lists_the_columns_with_warnings_of_the_data_check():
     finding = Finding("loaded", "current", "warning", "as if in mA", "whole run", "Mend it")
     (message,) = (

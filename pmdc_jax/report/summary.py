@@ -20,6 +20,8 @@ MODEL_ASSUMPTION = (
 )
 # an RMS residual up to this multiple of the noise counts as noise: the RMS of few samples scatters as much
 MAX_NOISE_RATIO = 1.25
+# Kt / Kb, and its inverse, of a motor at most: iron loss and brushes make them differ by some percent
+MAX_CONSTANT_RATIO = 1.5
 # A refinement that stalls within so many standard errors of the best fit has found it all the same
 MAX_STALLED_DISTANCE = 3.0
 
@@ -65,9 +67,28 @@ def cautions(identification: Identification) -> list[str]:
     if at_bound:
         who = f"{enumerate_words(at_bound)} {'are' if len(at_bound) > 1 else 'is'}"
         sentences.append(f"{who} at the bound of the search range: a limit, not an estimate.")
+    sentences.append(_unequal_constants_sentence(identification.parameters))
     if not identification.converged:
         sentences.append(_unconverged_sentence(identification.distance))
-    return sentences
+    return [sentence for sentence in sentences if sentence]
+
+
+def _unequal_constants_sentence(parameters: Mapping[str, Estimate]) -> str:
+    """A warning that Kt and Kb differ by more than any motor's; empty where they do not, or are tied."""
+    estimated = {
+        name: one.value
+        for name, one in parameters.items()
+        if one.value and one.status in ("identified", "at_bound")
+    }
+    if not {"Kt", "Kb"} <= estimated.keys():
+        return ""
+    ratio = estimated["Kt"] / estimated["Kb"]
+    if 1 / MAX_CONSTANT_RATIO < ratio < MAX_CONSTANT_RATIO:
+        return ""
+    return (
+        f"Kt is {significant(ratio)} times Kb, though in SI units the two are nearly equal in every motor: check the"
+        " unit and the sign of the load torque. A brake opposes motion: in reverse, its torque is negative."
+    )
 
 
 def _unconverged_sentence(distance: float) -> str:
