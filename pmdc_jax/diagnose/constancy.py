@@ -9,11 +9,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
+from ..identify.identification import Estimate
 from ..identify.parameters import unit_of
 from ..motor import PARAMETERS
 from .assessment import FALSE_ALARM, Assessment
-from .diagnosis import ValueByRun, VaryingParameter
+from .diagnosis import VaryingParameter
 from .evidence import Block
 from .model import Model
 from .signals import Screen, dispersion_by_noise, log_p_value
@@ -32,7 +34,7 @@ class _Variation(NamedTuple):
     name: str
     gain: float  # decrease of the squared white residuals
     log_p: float  # natural logarithm of the p-value of such a gain by noise
-    by_run: dict[str, ValueByRun]  # of the runs that determine it
+    by_run: dict[str, Estimate]  # of the runs that determine it
 
 
 def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | None:
@@ -46,7 +48,6 @@ def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | Non
     best, *others = clear
     return VaryingParameter(
         best.name,
-        unit_of(best.name),
         best.by_run,
         min(1.0, len(variations) * float(np.exp(best.log_p))),
         tuple(v.name for v in others if v.gain > ALTERNATIVE_SHARE * best.gain),
@@ -60,39 +61,48 @@ def share_beyond_variation(found: Screen, model: Model, name: str) -> float:
 
 
 def _variations(model: Model, found: Screen) -> list[_Variation]:
-    names, runs = model.given.problem.parameters.names, model.given.training
-    before, freedom = found.evidence.regress().squares, len(runs) - 1
-    variations = []
-    for k, name in enumerate(names):
-        if freedom < 1 or name not in PARAMETERS or k in model.fit.at_bound:
-            continue
-        block = _own_in_every_run(model, name)
-        fit = found.evidence.regress([block])
-        gain = max(before - fit.squares, 0.0)
-        log_p = log_p_value(gain / dispersion_by_noise(found, block), freedom)
-        by_run = _determined(fit.coefficients[0][:, 0], fit.errors[0][:, 0])
-        value = np.exp(float(model.fit.coordinates[k]))
-        values = {
-            runs[run].name: ValueByRun(value * np.exp(change), value * np.exp(change) * error)
-            for run, (change, error) in by_run.items()
-        }
-        variations.append(_Variation(name, gain, log_p, values))
-    return variations
+    several = len(model.given.training) > 1 and not model.is_exact
+    names = model.given.problem.parameters.names if several else ()
+    return [
+        _variation(model, found, name)
+        for k, name in enumerate(names)
+        if name in PARAMETERS and k not in model.fit.at_bound
+    ]
+
+
+def _variation(model: Model, found: Screen, name: str) -> _Variation:
+    block, runs = _own_in_every_run(model, name), model.given.training
+    fit = found.evidence.regress([block])
+    gain = max(found.evidence.regress().squares - fit.squares, 0.0)
+    log_p = log_p_value(gain / dispersion_by_noise(found, block), len(runs) - 1)
+    changes, errors = fit.coefficients[0][:, 0], fit.errors[0][:, 0]
+    common = model.given.problem.parameters.value(name, np.asarray(model.fit.coordinates))
+    by_run = {
+        runs[run].name: _estimate(name, common, float(changes[run]), float(errors[run]))
+        for run in _determined(changes, errors)
+    }
+    return _Variation(name, gain, log_p, by_run)
 
 
 def _own_in_every_run(model: Model, name: str) -> Block:
     return Block((model.given.problem.parameters.names.index(name),), per_run=True)
 
 
-def _determined(changes: np.ndarray, errors: np.ndarray) -> dict[int, tuple[float, float]]:
-    """Change and standard error by run, of those runs that determine the parameter (`MAX_ERROR_SHARE`)."""
+def _determined(changes: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """The runs that determine the parameter (`MAX_ERROR_SHARE`)."""
     seen = errors > 0
     largest = np.ptp(changes[seen]) if seen.any() else 0.0
-    kept = np.flatnonzero(seen & (errors < MAX_ERROR_SHARE * largest))
-    return {int(run): (float(changes[run]), float(errors[run])) for run in kept}
+    return np.flatnonzero(seen & (errors < MAX_ERROR_SHARE * largest))
+
+
+def _estimate(name: str, common: float, change: float, error: float) -> Estimate:
+    """From the change of the logarithm in one run, and its standard error."""
+    reach = stats.norm.ppf(0.975) * error
+    value, low, high = (float(common * np.exp(change + x)) for x in (0.0, -reach, reach))
+    return Estimate(value, value * error, (low, high), unit_of(name), "identified")
 
 
 def _change(variation: _Variation) -> float:
     """The largest value of any run over the smallest, less one."""
-    values = [one.value for one in variation.by_run.values()]
+    values = [one.value for one in variation.by_run.values() if one.value]
     return max(values) / min(values) - 1 if len(values) > 1 else 0.0

@@ -68,20 +68,11 @@ class LearnedCurve:
 
 
 @frozen
-class ValueByRun:
-    """The value of a parameter in one run alone, SI, and its standard error."""
-
-    value: float
-    stderr: float
-
-
-@frozen
 class VaryingParameter:
     """A parameter of the motor that differs from run to run."""
 
     name: str
-    unit: str
-    by_run: Mapping[str, ValueByRun]  # of the runs that determine it, at least two
+    by_run: Mapping[str, Estimate]  # to first order, of the runs that determine it, at least two
     p_value: float  # of the data if it were the same in all runs
     also_possible: tuple[str, ...] = ()  # parameters whose variation would explain the runs as well
 

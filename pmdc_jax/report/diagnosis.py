@@ -5,7 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, LearnedCurve, NextExperiment, Region
+from ..diagnose.diagnosis import (
+    Diagnosis,
+    EffectFound,
+    Gap,
+    LearnedCurve,
+    NextExperiment,
+    Region,
+    VaryingParameter,
+)
 from ..effects import EFFECTS
 from .diagnosis_figures import (
     AXIS_TITLES,
@@ -64,6 +72,7 @@ def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
         gap_figure=figure_json(gap_figure(_gap_by_run(diagnosis))),
         residuals=_residuals(diagnosis),
         against=_residual_over_variable(diagnosis),
+        varies=_varies(diagnosis.varies),
         curves=[_curve(curve) for curve in diagnosis.curves],
         drifts=_drifts(diagnosis),
         detectable=_detectable(diagnosis),
@@ -78,8 +87,11 @@ def _tiles(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     error = significant(gap.before)
     if diagnosis.effects:
         error += f" → {significant(gap.after)}"
-    chance = p_value_words(diagnosis.p_nothing)
-    tiles = [("Verdict", VERDICTS[diagnosis.verdict], f"no missing effect: {chance}")]
+    chance = f"no missing effect: {p_value_words(diagnosis.p_nothing)}"
+    if diagnosis.varies and not diagnosis.effects:
+        varies = diagnosis.varies
+        chance = f"{varies.name} the same in all runs: {p_value_words(varies.p_value)}"
+    tiles = [("Verdict", VERDICTS[diagnosis.verdict], chance)]
     tiles.append((f"{role_word(role).capitalize()} error", error, "times the noise"))
     if diagnosis.effects and diagnosis.closed_fraction is not None:
         tiles.append(("Gap closed", percent(100 * diagnosis.closed_fraction), ""))
@@ -204,6 +216,16 @@ def _drifts(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         }
         for one in (drifts(diagnosis) if diagnosis.effects else ())
     ]
+
+
+def _varies(varies: VaryingParameter | None) -> dict[str, Any] | None:
+    if varies is None:
+        return None
+    return {
+        "name": varies.name,
+        "chance": p_value_words(varies.p_value),
+        "by_run": [(run, write_estimate(estimate)) for run, estimate in varies.by_run.items()],
+    }
 
 
 def _detectable(diagnosis: Diagnosis) -> list[tuple[str, str]]:

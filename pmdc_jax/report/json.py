@@ -17,7 +17,7 @@ from .summary import summary
 from .verdict import verdict_sentences
 
 if TYPE_CHECKING:
-    from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, NextExperiment
+    from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, NextExperiment, VaryingParameter
 
 
 def identification_json(identification: Identification) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "gap": {**gap, "closed_fraction": diagnosis.closed_fraction},
         "gap_of_run": {run: _gap(one) for run, one in diagnosis.gap_of_run.items()},
         "next_experiment": _experiment(diagnosis.next_experiment),
-        "varies": asdict(diagnosis.varies) if diagnosis.varies else None,
+        "varies": _varying(diagnosis.varies),
         "curves": [asdict(curve) for curve in diagnosis.curves],
         "detectable": [asdict(one) for one in diagnosis.detectable],
         "p_nothing_missing": diagnosis.p_nothing,
@@ -98,6 +98,17 @@ def _effect(effect: EffectFound) -> dict[str, Any]:
         "parameters": {name: _estimate(one) for name, one in effect.parameters.items()},
         "p_value": effect.p_value,
         "also_possible": list(effect.also_possible),
+    }
+
+
+def _varying(varies: VaryingParameter | None) -> dict[str, Any] | None:
+    if varies is None:
+        return None
+    return {
+        "parameter": varies.name,
+        "by_run": {run: _estimate(one) for run, one in varies.by_run.items()},
+        "p_value": varies.p_value,
+        "also_possible": list(varies.also_possible),
     }
 
 

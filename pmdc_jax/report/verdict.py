@@ -366,10 +366,10 @@ REASONS = {
 
 def _varying_sentence(varies: VaryingParameter) -> str:
     """What differs from run to run, and why it may."""
-    values = {run: one.value for run, one in varies.by_run.items()}
+    by_size = sorted(varies.by_run, key=lambda run: varies.by_run[run].value or 0.0)
     ends = [
-        f"{value_with_unit(values[run], varies.unit)} in the run {run}"
-        for run in (min(values, key=values.__getitem__), max(values, key=values.__getitem__))
+        f"{_value_in_words(varies.by_run[run])} in the run {run}"
+        for run in (by_size[0], by_size[-1])
     ]
     other = f" (or {enumerate_words(varies.also_possible)})" if varies.also_possible else ""
     return (
