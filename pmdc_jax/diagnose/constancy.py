@@ -6,13 +6,17 @@ Chow, "Tests of equality between sets of coefficients in two linear regressions"
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy import stats
 
 from ..identify.identification import Estimate
 from ..identify.parameters import unit_of
+from ..identify.polish import fit_run_unknowns, squares_of_runs
 from ..motor import PARAMETERS
 from .assessment import FALSE_ALARM, Assessment
 from .diagnosis import VaryingParameter
@@ -34,23 +38,39 @@ class _Variation(NamedTuple):
     name: str
     gain: float  # decrease of the squared white residuals
     log_p: float  # natural logarithm of the p-value of such a gain by noise
-    by_run: dict[str, Estimate]  # of the runs that determine it
+    common: Float[np.ndarray, " parameters"]  # the search coordinates of all other parameters
+    own: dict[int, float]  # its own coordinate in each of the runs that determine it
+    errors: dict[int, float]  # their standard errors
+
+    @property
+    def change(self) -> float:
+        """The largest value of any run over the smallest, less one."""
+        return float(np.exp(np.ptp([*self.own.values()]))) - 1 if self.own else 0.0
 
 
 def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | None:
-    """The parameter whose variation from run to run explains most of what a model leaves; None if no variation is
-    significant, or if a candidate or a curve explains more."""
+    """The parameter of the motor whose variation from run to run explains most of what a model leaves.
+
+    None if no variation is significant, if a candidate, a curve or a varying parameter of an effect explains more, or
+    if a simulation with the values found fits the runs no better.
+    """
     variations = sorted(_variations(model, found.screen), key=lambda v: -v.gain)
     limit = np.log(FALSE_ALARM / max(len(variations), 1))
-    clear = [v for v in variations if v.log_p < limit and _change(v) > MIN_CHANGE]
+    clear = [v for v in variations if v.log_p < limit and v.change > MIN_CHANGE]
     if not clear or clear[0].gain < found.clearest.gain:
         return None
     best, *others = clear
+    if best.name not in PARAMETERS or not _fits_better(model, best):
+        return None
+    alike = [v.name for v in others if v.gain > ALTERNATIVE_SHARE * best.gain]
     return VaryingParameter(
         best.name,
-        best.by_run,
+        {
+            model.given.training[run].name: _estimate(best.name, own, best.errors[run])
+            for run, own in best.own.items()
+        },
         min(1.0, len(variations) * float(np.exp(best.log_p))),
-        tuple(v.name for v in others if v.gain > ALTERNATIVE_SHARE * best.gain),
+        tuple(name for name in alike if name in PARAMETERS),
     )
 
 
@@ -61,48 +81,55 @@ def share_beyond_variation(found: Screen, model: Model, name: str) -> float:
 
 
 def _variations(model: Model, found: Screen) -> list[_Variation]:
-    several = len(model.given.training) > 1 and not model.is_exact
-    names = model.given.problem.parameters.names if several else ()
+    parameters = model.given.problem.parameters
+    if len(model.given.training) < 2 or model.is_exact:
+        return []
     return [
         _variation(model, found, name)
-        for k, name in enumerate(names)
-        if name in PARAMETERS and k not in model.fit.at_bound
+        for k, name in enumerate(parameters.names)
+        if parameters.logarithmic[k] and k not in model.fit.at_bound
     ]
 
 
 def _variation(model: Model, found: Screen, name: str) -> _Variation:
-    block, runs = _own_in_every_run(model, name), model.given.training
+    block = _own_in_every_run(model, name)
     fit = found.evidence.regress([block])
     gain = max(found.evidence.regress().squares - fit.squares, 0.0)
-    log_p = log_p_value(gain / dispersion_by_noise(found, block), len(runs) - 1)
+    freedom = len(model.given.training) - 1
+    log_p = log_p_value(gain / dispersion_by_noise(found, block), freedom)
+    common = np.asarray(model.fit.coordinates) + fit.parameter_changes
     changes, errors = fit.coefficients[0][:, 0], fit.errors[0][:, 0]
-    common = model.given.problem.parameters.value(name, np.asarray(model.fit.coordinates))
-    by_run = {
-        runs[run].name: _estimate(name, common, float(changes[run]), float(errors[run]))
-        for run in _determined(changes, errors)
-    }
-    return _Variation(name, gain, log_p, by_run)
+    known = errors > 0
+    largest = np.ptp(changes[known]) if known.any() else 0.0
+    runs = np.flatnonzero(known & (errors < MAX_ERROR_SHARE * largest)).tolist()
+    own = {run: float(model.fit.coordinates[block.columns[0]] + changes[run]) for run in runs}
+    return _Variation(name, gain, log_p, common, own, {run: float(errors[run]) for run in runs})
 
 
 def _own_in_every_run(model: Model, name: str) -> Block:
     return Block((model.given.problem.parameters.names.index(name),), per_run=True)
 
 
-def _determined(changes: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """The runs that determine the parameter (`MAX_ERROR_SHARE`)."""
-    seen = errors > 0
-    largest = np.ptp(changes[seen]) if seen.any() else 0.0
-    return np.flatnonzero(seen & (errors < MAX_ERROR_SHARE * largest))
+def _fits_better(model: Model, found: _Variation) -> bool:
+    """Whether the runs are simulated with less error if each has its own value: far from the common one, the first
+    order may mislead."""
+    problem = replace(model.given.problem, noise=jnp.asarray(model.fit.noise))
+    place = problem.parameters.names.index(found.name)
+
+    def squares(coordinates: np.ndarray) -> np.ndarray:
+        unknowns = model.fit.unknowns._replace(coordinates=jnp.asarray(coordinates))
+        return squares_of_runs(problem, fit_run_unknowns(problem, unknowns)[1])
+
+    before, difference = squares(np.asarray(model.fit.coordinates)), 0.0
+    for run, own in found.own.items():
+        coordinates = found.common.copy()
+        coordinates[place] = own
+        of_tape = model.training[run]
+        difference += squares(coordinates)[of_tape] - before[of_tape]
+    return bool(difference < 0)
 
 
-def _estimate(name: str, common: float, change: float, error: float) -> Estimate:
-    """From the change of the logarithm in one run, and its standard error."""
+def _estimate(name: str, logarithm: float, error: float) -> Estimate:
     reach = stats.norm.ppf(0.975) * error
-    value, low, high = (float(common * np.exp(change + x)) for x in (0.0, -reach, reach))
+    value, low, high = (float(np.exp(logarithm + x)) for x in (0.0, -reach, reach))
     return Estimate(value, value * error, (low, high), unit_of(name), "identified")
-
-
-def _change(variation: _Variation) -> float:
-    """The largest value of any run over the smallest, less one."""
-    values = [one.value for one in variation.by_run.values() if one.value]
-    return max(values) / min(values) - 1 if len(values) > 1 else 0.0

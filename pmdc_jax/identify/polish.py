@@ -216,14 +216,14 @@ def _best_run_unknowns(
     tried = [unknowns.runs, *trials]
 
     def squares(runs: RunUnknowns) -> Float[np.ndarray, " runs"]:
-        return _squares_of_runs(problem, evaluate(problem, unknowns._replace(runs=runs)))
+        return squares_of_runs(problem, evaluate(problem, unknowns._replace(runs=runs)))
 
     best, each = np.argmin(map_in_threads(squares, tried), axis=0), np.arange(problem.tape.runs)
     runs = jax.tree.map(lambda *values: jnp.stack(values)[best, each], *tried)
     return unknowns._replace(runs=runs)
 
 
-def _squares_of_runs(problem: Problem, evaluation: Evaluation) -> Float[np.ndarray, " runs"]:
+def squares_of_runs(problem: Problem, evaluation: Evaluation) -> Float[np.ndarray, " runs"]:
     """Sum of squared residuals of each run; infinite where its simulation fails."""
     with np.errstate(over="ignore", invalid="ignore"):
         of_block = np.square(np.asarray(evaluation.residuals)).sum((1, 2))
@@ -255,7 +255,7 @@ def fit_run_unknowns(
         trial = RunUnknowns(*(x + share * change for x, change in changes))
         reached = evaluate(fixed, unknowns._replace(runs=trial))
         # false where the trial cannot be simulated
-        better = _squares_of_runs(problem, reached) <= _squares_of_runs(problem, best)
+        better = squares_of_runs(problem, reached) <= squares_of_runs(problem, best)
         share = np.where(better, 1.0, share / 4)
         unknowns = unknowns._replace(runs=_select_runs(jnp.asarray(better), trial, unknowns.runs))
         best = _select_blocks(jnp.asarray(better[run]), reached, best)
