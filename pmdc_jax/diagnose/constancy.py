@@ -24,9 +24,9 @@ from .evidence import Block
 from .model import Model
 from .signals import Screen, dispersion_by_noise, log_p_value
 
-# Least change of a parameter from run to run that counts: those of simulators and clocks look like smaller ones
-MIN_CHANGE = 0.01
-# A run determines a parameter if its standard error there is below this share of the change from run to run
+# Least range of a parameter's logarithm over the runs that counts: errors of simulators and clocks look like smaller ones
+MIN_RANGE = 0.01
+# A run determines a parameter if its standard error there is below this share of the range over all runs
 MAX_ERROR_SHARE = 0.3
 # Parameters that gain at least this share of what the best one does may vary in its place
 ALTERNATIVE_SHARE = 0.9
@@ -43,9 +43,9 @@ class _Variation(NamedTuple):
     errors: dict[int, float]  # their standard errors
 
     @property
-    def change(self) -> float:
-        """The largest value of any run over the smallest, less one."""
-        return float(np.exp(np.ptp([*self.own.values()]))) - 1 if self.own else 0.0
+    def range(self) -> float:
+        """The largest coordinate of any run less the smallest."""
+        return float(np.ptp([*self.own.values()])) if self.own else 0.0
 
 
 def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | None:
@@ -56,7 +56,7 @@ def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | Non
     """
     variations = sorted(_variations(model, found.screen), key=lambda v: -v.gain)
     limit = np.log(FALSE_ALARM / max(len(variations), 1))
-    clear = [v for v in variations if v.log_p < limit and v.change > MIN_CHANGE]
+    clear = [v for v in variations if v.log_p < limit and v.range > MIN_RANGE]
     if not clear or clear[0].gain < found.clearest.gain:
         return None
     best, *others = clear
