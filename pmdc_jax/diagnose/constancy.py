@@ -24,12 +24,12 @@ from .evidence import Block
 from .model import Model
 from .signals import Screen, dispersion_by_noise, log_p_value
 
-# Least range of a parameter's logarithm over the runs that counts: errors of simulators and clocks look like smaller ones
+# Least range of a parameter's logarithm over the runs that counts: errors of simulators and clocks look like less
 MIN_RANGE = 0.01
 # A run determines a parameter if its standard error there is below this share of the range over all runs
 MAX_ERROR_SHARE = 0.3
 # Parameters that gain at least this share of what the best one does may vary in its place
-ALTERNATIVE_SHARE = 0.9
+ALTERNATIVE_SHARE = 0.7
 
 
 class _Variation(NamedTuple):
@@ -51,18 +51,18 @@ class _Variation(NamedTuple):
 def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | None:
     """The parameter of the motor whose variation from run to run explains most of what a model leaves.
 
-    None if no variation is significant, if a candidate, a curve or a varying parameter of an effect explains more, or
-    if a simulation with the values found fits the runs no better.
+    None if no variation is significant, if a candidate or a curve explains more, if a parameter of an effect may vary
+    instead, whose formula is then not quite the motor's, or if a simulation with the values found fits no better.
     """
     variations = sorted(_variations(model, found.screen), key=lambda v: -v.gain)
     limit = np.log(FALSE_ALARM / max(len(variations), 1))
     clear = [v for v in variations if v.log_p < limit and v.range > MIN_RANGE]
     if not clear or clear[0].gain < found.clearest.gain:
         return None
-    best, *others = clear
-    if best.name not in PARAMETERS or not _fits_better(model, best):
+    best, *others = (v for v in clear if v.gain > ALTERNATIVE_SHARE * clear[0].gain)
+    alternatives = tuple(v.name for v in others)
+    if not {best.name, *alternatives} <= PARAMETERS.keys() or not _fits_better(model, best):
         return None
-    alike = [v.name for v in others if v.gain > ALTERNATIVE_SHARE * best.gain]
     return VaryingParameter(
         best.name,
         {
@@ -70,7 +70,7 @@ def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | Non
             for run, own in best.own.items()
         },
         min(1.0, len(variations) * float(np.exp(best.log_p))),
-        tuple(name for name in alike if name in PARAMETERS),
+        alternatives,
     )
 
 
