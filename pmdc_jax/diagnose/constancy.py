@@ -74,12 +74,6 @@ def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | Non
     )
 
 
-def share_beyond_variation(found: Screen, model: Model, name: str) -> float:
-    """Share of a model's unfiltered squared residuals that remains where a parameter has a value in every run."""
-    block = _own_in_every_run(model, name)
-    return found.unfiltered.regress([block]).squares / found.unfiltered.regress().squares
-
-
 def _variations(model: Model, found: Screen) -> list[_Variation]:
     parameters = model.given.problem.parameters
     if len(model.given.training) < 2 or model.is_exact:
@@ -92,7 +86,7 @@ def _variations(model: Model, found: Screen) -> list[_Variation]:
 
 
 def _variation(model: Model, found: Screen, name: str) -> _Variation:
-    block = _own_in_every_run(model, name)
+    block = own_in_every_run(model, name)
     fit = found.evidence.regress([block])
     gain = max(found.evidence.regress().squares - fit.squares, 0.0)
     freedom = len(model.given.training) - 1
@@ -106,7 +100,8 @@ def _variation(model: Model, found: Screen, name: str) -> _Variation:
     return _Variation(name, gain, log_p, common, own, {run: float(errors[run]) for run in runs})
 
 
-def _own_in_every_run(model: Model, name: str) -> Block:
+def own_in_every_run(model: Model, name: str) -> Block:
+    """The block of a parameter with a value of its own in every run."""
     return Block((model.given.problem.parameters.names.index(name),), per_run=True)
 
 

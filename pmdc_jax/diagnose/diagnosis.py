@@ -27,7 +27,7 @@ MAX_HOLDOUT_GROWTH = 1.1
 # Misfit of one fitted run over the largest of all others above which something happened in that run alone
 OUTLIER_RATIO = 5.0
 # ... and above which noise does not explain that it differs, even if it explains all that is left
-MAX_NOISE_RATIO = 10.0
+DISTURBED_RATIO = 10.0
 
 
 @frozen
@@ -160,7 +160,7 @@ class Diagnosis:
 
 def is_disturbed(gap_of_run: Mapping[str, Gap], final: Identification) -> bool:
     """Whether something happened in one fitted run that noise does not explain."""
-    return bool(final.missed) and _largest_misfit(gap_of_run, final)[1] > MAX_NOISE_RATIO
+    return bool(final.missed) and _largest_misfit(gap_of_run, final)[1] > DISTURBED_RATIO
 
 
 def _largest_misfit(gap_of_run: Mapping[str, Gap], final: Identification) -> tuple[str, float]:

@@ -27,7 +27,7 @@ from .assessment import (
     has_axes_of,
 )
 from .compare import BIC_MARGIN, DECISIVE_RATIO, Comparison, Fitted, simplest_equivalent
-from .constancy import share_beyond_variation, varying_parameter
+from .constancy import own_in_every_run, varying_parameter
 from .diagnosis import VaryingParameter
 from .effect_relations import CONTAINS, are_rivals
 from .elimination import BackwardElimination
@@ -36,7 +36,7 @@ from .model import MAX_EFFECTS, Model, final_fit
 from .periodic import Line, line_of
 from .refits import Refits
 from .rivals import p_values_without, rivals_of
-from .screen import screen, share_beyond_curves
+from .screen import screen, share_beyond
 from .shortlist import (
     SHORTLIST,
     additional_effects,
@@ -78,9 +78,8 @@ class Naming(NamedTuple):
     p_without: dict[str, float]  # by effect of the chosen model: p-value of the data without it
     final_fit: tuple[Prepared, Fit]  # of the chosen model
     line: Line | None  # a steady oscillation that the chosen model does not have
-    varies: (
-        VaryingParameter | None
-    )  # the parameter that differs from run to run, if that is what is left
+    # the parameter that differs from run to run, if that is what is left
+    varies: VaryingParameter | None
 
 
 class StepwiseSelection:
@@ -277,9 +276,11 @@ class StepwiseSelection:
         """The naming with a model as the chosen one."""
         base, found = self.assess(self.base), self.assess(current)
         more_missing, varies = found.p_value < FALSE_ALARM, varying_parameter(current, found)
-        noise_share = share_beyond_curves(found.screen) if more_missing else 1.0
+        explained = []
         if varies:
-            noise_share = share_beyond_variation(found.screen, current, varies.name)
+            explained = [own_in_every_run(current, varies.name)]
+        elif more_missing:
+            explained = [block for block in found.screen.curve_blocks if not block.per_run]
         return Naming(
             chosen=current,
             rivals=rivals_of(current, found, self.refits, self.comparison),
@@ -289,7 +290,7 @@ class StepwiseSelection:
             p_nothing_more=found.p_value,
             may_be_model_form_error=found.may_be_model_form_error(current),
             leaves_sensor_error=more_missing and found.is_sensor_error(),
-            noise_share=np.sqrt(noise_share),
+            noise_share=np.sqrt(share_beyond(found.screen, explained)) if explained else 1.0,
             p_without=p_values_without(current, found.screen.white, self.refits, self.comparison),
             final_fit=final_fit(current, self.comparison.filter_of(current)),
             line=line_of(current),

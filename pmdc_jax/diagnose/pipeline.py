@@ -25,6 +25,7 @@ from .diagnosis import (
     Detectable,
     Diagnosis,
     EffectFound,
+    Gap,
     LearnedCurve,
     Region,
     Verdict,
@@ -93,11 +94,7 @@ def diagnose(
         final = _identification(naming, solved)
     before, after = (electrical_misfit(m) for m in (selection.base, naming.chosen))
     verdict = "not_in_library" if breaks_electrical_equation(before, after) else _verdict(naming)
-    leaves_more = verdict == "not_in_library" or naming.varies
-    gaps = gaps_of_runs(base, final, naming.noise_share if leaves_more else 1.0)
-    if verdict == "none_detected" and is_disturbed(gaps, final):
-        # what is left is then no noise but that of the sensors
-        verdict, gaps = "not_in_library", gaps_of_runs(base, final, share=0.0)
+    verdict, gaps = _judged_by_run(verdict, naming, base, final)
     by_role = gaps_by_role(gaps, base)
     if unlike_held_out(by_role):
         verdict = "not_in_library"
@@ -186,6 +183,18 @@ def _verdict(naming: Naming) -> Verdict:
     if not naming.chosen.effects:
         return "not_in_library"
     return "ambiguous" if naming.rivals else "named"
+
+
+def _judged_by_run(
+    verdict: Verdict, naming: Naming, base: Identification, final: Identification
+) -> tuple[Verdict, dict[str, Gap]]:
+    """The verdict, once the runs are compared, and the gap of each run over the noise that the verdict implies."""
+    leaves_more = verdict == "not_in_library" or naming.varies
+    gaps = gaps_of_runs(base, final, naming.noise_share if leaves_more else 1.0)
+    if verdict == "none_detected" and is_disturbed(gaps, final):
+        # what is left is then no noise but that of the sensors
+        return "not_in_library", gaps_of_runs(base, final, share=0.0)
+    return verdict, gaps
 
 
 def _effects(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:

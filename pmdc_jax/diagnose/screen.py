@@ -9,7 +9,7 @@ import numpy as np
 
 from ..identify.noise_model import Series, Whitener, scaling_whitener, whitener
 from ..simulate import UNKNOWNS_PER_RUN
-from .evidence import Evidence, consecutive_blocks, gather_evidence
+from .evidence import Block, Evidence, consecutive_blocks, gather_evidence
 from .library import Curve, Library, curves_along
 from .model import Model
 from .quantisation import ROUNDING_DRAWS
@@ -48,10 +48,9 @@ def screen(model: Model, library: Library) -> Screen:
     return found._replace(evidence=_evidence(rows, white), white=white)
 
 
-def share_beyond_curves(found: Screen) -> float:
-    """Share of a model's unfiltered squared residuals that remains after all curves shared by the runs."""
-    shared = [block for block in found.curve_blocks if not block.per_run]
-    return found.unfiltered.regress(shared).squares / found.unfiltered.regress().squares
+def share_beyond(found: Screen, blocks: Sequence[Block]) -> float:
+    """Share of a model's unfiltered squared residuals that remains after some blocks."""
+    return found.unfiltered.regress(blocks).squares / found.unfiltered.regress().squares
 
 
 def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:

@@ -32,7 +32,7 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     **Returns**: the best point at which the problem can be evaluated; that of the fit, if there is none.
     """
     parameters, coordinates = problem.parameters, np.array(fit.coordinates)
-    every = dict.fromkeys((*PARAMETERS, *parameters.known, *parameters.names))
+    every = (*PARAMETERS, *parameters.known, *parameters.names)
     values = {name: parameters.value(name, coordinates) for name in every}
     bounds = {name: (values[name], values[name]) for name in PARAMETERS}
     for name, factor in factors.items():
