@@ -17,6 +17,7 @@ from experiments.bench import recording
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import Diagnosis, diagnose
 from pmdc_jax.recording_file import read_recording
+from pmdc_jax.report.verdict import verdict_sentences
 
 
 def excitations(rng: np.random.Generator) -> dict[str, vb.Excitation]:
@@ -382,7 +383,11 @@ def test_a_parameter_that_differs_in_one_run_is_told(name, factor, friction):
     assert [effect.name for effect in found.effects] == ["coulomb_friction"] * (friction > 0)
     assert found.varies is not None
     assert found.varies.name == name
-    by_run = {run: one.value for run, one in found.varies.by_run.items()}
-    others = [value for run, value in by_run.items() if run != "apart"]
-    # to first order, and relative to a value that all runs share
-    assert by_run["apart"] / np.mean(others) == pytest.approx(factor, rel=0.06)
+    for run, one in found.varies.by_run.items():
+        truth = (changed if run == "apart" else PAPER)[name]
+        assert one.value == pytest.approx(truth, abs=4 * one.stderr)
+        assert one.stderr < 0.02 * truth
+    gap = found.gap_by_own_value["apart"]
+    assert gap.before > 2.5
+    assert gap.after == pytest.approx(1.0, abs=0.05)
+    assert "is not the same in all runs" in " ".join(verdict_sentences(found))

@@ -1,7 +1,8 @@
 """Parameters that are not the same in all runs, such as the resistance of a winding that was warmer in some of them.
 
 Each parameter of the motor is given a value of its own in every run, to first order: a score test of the hypothesis of
-Chow, "Tests of equality between sets of coefficients in two linear regressions", Econometrica 28 (1960) 591-605.
+Chow, "Tests of equality between sets of coefficients in two linear regressions", Econometrica 28 (1960) 591-605. The
+one that explains most is then fitted in full simulation.
 """
 
 from __future__ import annotations
@@ -9,15 +10,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
 
+from ..identify.by_run import FitByRun, errors_by_run, fit_by_run
 from ..identify.identification import Estimate
 from ..identify.parameters import unit_of
 from ..identify.polish import fit_run_unknowns, squares_of_runs
+from ..identify.results import run_fits
 from ..motor import PARAMETERS
+from ..simulate import RunUnknowns
 from .assessment import FALSE_ALARM, Assessment
 from .diagnosis import VaryingParameter
 from .evidence import Block
@@ -36,11 +40,10 @@ class _Variation(NamedTuple):
     """One parameter with a value of its own in every run."""
 
     name: str
-    gain: float  # decrease of the squared white residuals
+    gain: float  # to first order: decrease of the squared white residuals
     log_p: float  # natural logarithm of the p-value of such a gain by noise
     common: Float[np.ndarray, " parameters"]  # the search coordinates of all other parameters
     own: dict[int, float]  # its own coordinate in each of the runs that determine it
-    errors: dict[int, float]  # their standard errors
 
     @property
     def range(self) -> float:
@@ -61,16 +64,20 @@ def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | Non
         return None
     best, *others = (v for v in clear if v.gain > ALTERNATIVE_SHARE * clear[0].gain)
     alternatives = tuple(v.name for v in others)
-    if not {best.name, *alternatives} <= PARAMETERS.keys() or not _fits_better(model, best):
+    if not {best.name, *alternatives} <= PARAMETERS.keys():
         return None
+    fit = _fit(model, best)
+    by_run = {} if fit is None else _estimates_by_run(model, best, fit)
+    if fit is None or len(by_run) < 2:
+        return None
+    given, simulated = model.given, np.asarray(fit.evaluation.seen)
+    fits = run_fits(given.runs, given.roles, given.problem.tape, simulated, fit.runs)
     return VaryingParameter(
         best.name,
-        {
-            model.given.training[run].name: _estimate(best.name, own, best.errors[run])
-            for run, own in best.own.items()
-        },
+        by_run,
         min(1.0, len(variations) * float(np.exp(best.log_p))),
         alternatives,
+        {run.name: fits[run.name] for run in given.training},
     )
 
 
@@ -86,7 +93,7 @@ def _variations(model: Model, found: Screen) -> list[_Variation]:
 
 
 def _variation(model: Model, found: Screen, name: str) -> _Variation:
-    block = own_in_every_run(model, name)
+    block = _own_in_every_run(model, name)
     fit = found.evidence.regress([block])
     gain = max(found.evidence.regress().squares - fit.squares, 0.0)
     freedom = len(model.given.training) - 1
@@ -97,34 +104,62 @@ def _variation(model: Model, found: Screen, name: str) -> _Variation:
     largest = np.ptp(changes[known]) if known.any() else 0.0
     runs = np.flatnonzero(known & (errors < MAX_ERROR_SHARE * largest)).tolist()
     own = {run: float(model.fit.coordinates[block.columns[0]] + changes[run]) for run in runs}
-    return _Variation(name, gain, log_p, common, own, {run: float(errors[run]) for run in runs})
+    return _Variation(name, gain, log_p, common, own)
 
 
-def own_in_every_run(model: Model, name: str) -> Block:
+def _own_in_every_run(model: Model, name: str) -> Block:
     """The block of a parameter with a value of its own in every run."""
-    return Block((model.given.problem.parameters.names.index(name),), per_run=True)
+    return Block((_place(model, name),), per_run=True)
 
 
-def _fits_better(model: Model, found: _Variation) -> bool:
-    """Whether the runs are simulated with less error if each has its own value: far from the common one, the first
-    order may mislead."""
-    problem = replace(model.given.problem, noise=jnp.asarray(model.fit.noise))
-    place = problem.parameters.names.index(found.name)
-
-    def squares(coordinates: np.ndarray) -> np.ndarray:
-        unknowns = model.fit.unknowns._replace(coordinates=jnp.asarray(coordinates))
-        return squares_of_runs(problem, fit_run_unknowns(problem, unknowns)[1])
-
-    before, difference = squares(np.asarray(model.fit.coordinates)), 0.0
+def _fit(model: Model, found: _Variation) -> FitByRun | None:
+    """The model with a value of one parameter for every run, in full simulation from the first-order estimate; None if
+    that estimate makes the runs that determine it worse: far from the common value, the first order may mislead."""
+    problem = model.given.problem
+    place, tape = _place(model, found.name), problem.tape
+    coordinates = np.tile(found.common, (tape.runs, 1))
+    coordinates[:, place] = np.mean([*found.own.values()])
+    runs, difference = model.fit.unknowns.runs, 0.0
+    before = _squares(model, np.asarray(model.fit.coordinates))[1]
     for run, own in found.own.items():
-        coordinates = found.common.copy()
-        coordinates[place] = own
         of_tape = model.training[run]
-        difference += squares(coordinates)[of_tape] - before[of_tape]
-    return bool(difference < 0)
+        coordinates[of_tape, place] = own
+        fitted, squares = _squares(model, coordinates[of_tape])
+        runs = jax.tree.map(
+            lambda all_runs, new, k=of_tape: all_runs.at[k].set(new[k]), runs, fitted
+        )
+        difference += squares[of_tape] - before[of_tape]
+    if difference >= 0:
+        return None
+    return fit_by_run(problem, place, coordinates, runs, model.fit.at_bound)
 
 
-def _estimate(name: str, logarithm: float, error: float) -> Estimate:
-    reach = stats.norm.ppf(0.975) * error
+def _squares(
+    model: Model, coordinates: Float[np.ndarray, " parameters"]
+) -> tuple[RunUnknowns, Float[np.ndarray, " runs"]]:
+    """The best own unknowns of every run for these coordinates, and the sums of squares with them."""
+    problem = replace(model.given.problem, noise=jnp.asarray(model.fit.noise))
+    unknowns = model.fit.unknowns._replace(coordinates=jnp.asarray(coordinates))
+    fitted, evaluation = fit_run_unknowns(problem, unknowns)
+    return fitted.runs, squares_of_runs(problem, evaluation)
+
+
+def _estimates_by_run(model: Model, found: _Variation, fit: FitByRun) -> dict[str, Estimate]:
+    """The parameter in each run that determines it."""
+    given, place = model.given, _place(model, found.name)
+    errors, reaches = errors_by_run(given.problem, fit, place, model.fit.at_bound)
+    own = fit.coordinates[model.training, place]
+    return {
+        run.name: _estimate(found.name, *of_run)
+        for run, *of_run in zip(given.training, own, errors, reaches, strict=True)
+        if of_run[1] < MAX_ERROR_SHARE * found.range
+    }
+
+
+def _estimate(name: str, logarithm: float, error: float, reach: float) -> Estimate:
     value, low, high = (float(np.exp(logarithm + x)) for x in (0.0, -reach, reach))
     return Estimate(value, value * error, (low, high), unit_of(name), "identified")
+
+
+def _place(model: Model, name: str) -> int:
+    return model.given.problem.parameters.names.index(name)

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
-from attrs import frozen
+from attrs import field, frozen
 
-from ..identify.identification import Estimate, Identification, Role
+from ..identify.identification import Estimate, Identification, Role, RunFit
 
 Verdict = Literal["none_detected", "named", "ambiguous", "not_in_library"]
 
@@ -72,9 +72,10 @@ class VaryingParameter:
     """A parameter of the motor that differs from run to run."""
 
     name: str
-    by_run: Mapping[str, Estimate]  # to first order, of the runs that determine it, at least two
+    by_run: Mapping[str, Estimate]  # of the runs that determine it, at least two
     p_value: float  # of the data if it were the same in all runs
-    also_possible: tuple[str, ...] = ()  # parameters whose variation would explain the runs as well
+    also_possible: tuple[str, ...]  # parameters whose variation would explain the runs as well
+    fit: Mapping[str, RunFit]  # of every training run, simulated with its own value
 
 
 @frozen
@@ -132,6 +133,8 @@ class Diagnosis:
     # whether what the final motor leaves is no more than noise may
     leaves_noise: bool = True
     varies: VaryingParameter | None = None  # what differs from run to run, if that is what is left
+    # by training run: its misfit with a common value of what differs, and with its own
+    gap_by_own_value: Mapping[str, Gap] = field(factory=dict)
 
     @property
     def rivals(self) -> list[list[str]]:

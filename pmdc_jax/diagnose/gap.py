@@ -6,38 +6,41 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..identify.identification import Identification, Role, RunFit
+from ..identify.identification import Role, RunFit
 from ..identify.noise import MIN_RELATIVE_NOISE, noise_of_sensor
 from .diagnosis import Gap
 
 CHANNELS = ("current", "speed")
 
 
-def gaps_of_runs(base: Identification, final: Identification, share: float) -> dict[str, Gap]:
-    """By run, the misfit before and after: root mean squares over both channels, each over its noise (`_noise`, to
-    which `share` belongs)."""
-    noise = {channel: _noise(final, channel, share) for channel in CHANNELS}
+# Root mean square of the noise, by channel and by run; zero where the runs tell nothing of it
+Noise = Mapping[str, Mapping[str, float]]
+Fits = Mapping[str, RunFit]
 
-    def misfit(found: Identification, run: str) -> float:
+
+def gaps_of_runs(before: Fits, after: Fits, noise: Noise) -> dict[str, Gap]:
+    """By run, the misfit before and after: root mean squares over both channels, each over its noise."""
+
+    def misfit(run: str, fit: RunFit) -> float:
         ratios = [
-            getattr(found.fit[run], f"{channel}_rmse") / noise[channel][run]
+            getattr(fit, f"{channel}_rmse") / noise[channel][run]
             for channel in CHANNELS
-            if getattr(found.fit[run], f"{channel}_rmse") is not None and noise[channel][run]
+            if getattr(fit, f"{channel}_rmse") is not None and noise[channel][run]
         ]
         return float(np.sqrt(np.mean(np.square(ratios)))) if ratios else 1.0
 
     gaps = {}
-    for run in base.fit:
-        before, after = misfit(base, run), misfit(final, run)
-        gaps[run] = Gap(before, after, min(1.0, after))
+    for run in after:
+        one, other = misfit(run, before[run]), misfit(run, after[run])
+        gaps[run] = Gap(one, other, min(1.0, other))
     return gaps
 
 
-def gaps_by_role(gaps: Mapping[str, Gap], base: Identification) -> dict[Role, Gap]:
+def gaps_by_role(gaps: Mapping[str, Gap], fits: Fits) -> dict[Role, Gap]:
     """The gaps of all training runs together, and of all hold-outs: root mean squares over the samples."""
     by_role: dict[Role, Gap] = {}
     for role in ("train", "holdout"):
-        of_role = [(gaps[name], len(f.time)) for name, f in base.fit.items() if f.role == role]
+        of_role = [(gaps[name], len(f.time)) for name, f in fits.items() if f.role == role]
         if of_role:
             weights = np.array([n for _, n in of_role], float)
             squares = np.array([[g.before, g.after, g.floor] for g, _ in of_role]) ** 2
@@ -52,15 +55,19 @@ def closed_fraction(gaps: Mapping[Role, Gap]) -> float | None:
     return (gap.before**2 - gap.after**2) / open_before if open_before > 1e-9 else None
 
 
-def _noise(final: Identification, channel: str, share: float) -> dict[str, float]:
-    """By run, the noise of a channel (root mean square), zero where the runs tell nothing of it.
+def noise_of_runs(fits: Fits, share: float) -> Noise:
+    """The noise of every run, by the residuals of the final model.
 
-    The final model's residuals in the training runs are noise, times `share`, below 1 where part of them is not. Their
-    white part, the sensor's, is not that of all runs together but each run's own, and may be larger in a hold-out. The
-    noise is at least `MIN_RELATIVE_NOISE` times what was measured.
+    Its residuals in the training runs are noise, times `share`, below 1 where part of them is not. Their white part,
+    the sensor's, is not that of all runs together but each run's own, and may be larger in a hold-out. The noise is at
+    least `MIN_RELATIVE_NOISE` times what was measured.
     """
-    training = {name: f for name, f in final.fit.items() if f.role == "train"}
-    white = {name: _white_noise(f, channel) for name, f in final.fit.items()}
+    return {channel: _noise_of_runs(fits, channel, share) for channel in CHANNELS}
+
+
+def _noise_of_runs(fits: Fits, channel: str, share: float) -> dict[str, float]:
+    training = {name: f for name, f in fits.items() if f.role == "train"}
+    white = {name: _white_noise(f, channel) for name, f in fits.items()}
     left = {name: getattr(f, f"{channel}_rmse") for name, f in training.items()}
     measured = {name: _rms(getattr(f, channel)) for name, f in training.items()}
 

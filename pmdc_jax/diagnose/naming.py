@@ -27,7 +27,7 @@ from .assessment import (
     has_axes_of,
 )
 from .compare import BIC_MARGIN, DECISIVE_RATIO, Comparison, Fitted, simplest_equivalent
-from .constancy import own_in_every_run, varying_parameter
+from .constancy import varying_parameter
 from .diagnosis import VaryingParameter
 from .effect_relations import CONTAINS, are_rivals
 from .elimination import BackwardElimination
@@ -72,8 +72,7 @@ class Naming(NamedTuple):
     p_nothing_more: float  # p-value of what is left if nothing more were missing
     may_be_model_form_error: bool  # what is left, of the chosen effects
     leaves_sensor_error: bool  # whether what is left is most like that
-    # root mean square of the chosen one's residuals beyond all curves, or beyond what varies from run to run, over that
-    # of all; 1 if nothing more is missing
+    # root mean square of the chosen one's residuals beyond all curves over that of all; 1 if nothing more is missing
     noise_share: float
     p_without: dict[str, float]  # by effect of the chosen model: p-value of the data without it
     final_fit: tuple[Prepared, Fit]  # of the chosen model
@@ -275,12 +274,8 @@ class StepwiseSelection:
     def _naming(self, current: Model) -> Naming:
         """The naming with a model as the chosen one."""
         base, found = self.assess(self.base), self.assess(current)
-        more_missing, varies = found.p_value < FALSE_ALARM, varying_parameter(current, found)
-        explained = []
-        if varies:
-            explained = [own_in_every_run(current, varies.name)]
-        elif more_missing:
-            explained = [block for block in found.screen.curve_blocks if not block.per_run]
+        more_missing = found.p_value < FALSE_ALARM
+        curves = [block for block in found.screen.curve_blocks if not block.per_run]
         return Naming(
             chosen=current,
             rivals=rivals_of(current, found, self.refits, self.comparison),
@@ -290,11 +285,11 @@ class StepwiseSelection:
             p_nothing_more=found.p_value,
             may_be_model_form_error=found.may_be_model_form_error(current),
             leaves_sensor_error=more_missing and found.is_sensor_error(),
-            noise_share=np.sqrt(share_beyond(found.screen, explained)) if explained else 1.0,
+            noise_share=np.sqrt(share_beyond(found.screen, curves)) if more_missing else 1.0,
             p_without=p_values_without(current, found.screen.white, self.refits, self.comparison),
             final_fit=final_fit(current, self.comparison.filter_of(current)),
             line=line_of(current),
-            varies=varies,
+            varies=varying_parameter(current, found),
         )
 
     def _trials(self, current: Model, found: Assessment) -> list[Model | None]:

@@ -25,7 +25,6 @@ from .diagnosis import (
     Detectable,
     Diagnosis,
     EffectFound,
-    Gap,
     LearnedCurve,
     Region,
     Verdict,
@@ -35,7 +34,7 @@ from .diagnosis import (
 )
 from .evidence import MIN_EIGENVALUE, Block
 from .experiment import next_experiment
-from .gap import closed_fraction, gaps_by_role, gaps_of_runs
+from .gap import Noise, closed_fraction, gaps_by_role, gaps_of_runs, noise_of_runs
 from .library import Curve, Library
 from .model import model_of
 from .naming import Naming, StepwiseSelection
@@ -94,8 +93,9 @@ def diagnose(
         final = _identification(naming, solved)
     before, after = (electrical_misfit(m) for m in (selection.base, naming.chosen))
     verdict = "not_in_library" if breaks_electrical_equation(before, after) else _verdict(naming)
-    verdict, gaps = _judged_by_run(verdict, naming, base, final)
-    by_role = gaps_by_role(gaps, base)
+    verdict, noise = _judged_by_run(verdict, naming, base, final)
+    gaps = gaps_of_runs(base.fit, final.fit, noise)
+    by_role = gaps_by_role(gaps, base.fit)
     if unlike_held_out(by_role):
         verdict = "not_in_library"
     curves_tell_more = verdict == "not_in_library" or naming.leaves_sensor_error
@@ -123,6 +123,9 @@ def diagnose(
         seconds=seconds,
         leaves_noise=naming.p_nothing_more >= FALSE_ALARM,
         varies=naming.varies,
+        gap_by_own_value=(
+            gaps_of_runs(final.fit, naming.varies.fit, noise) if naming.varies else {}
+        ),
     )
 
 
@@ -187,14 +190,17 @@ def _verdict(naming: Naming) -> Verdict:
 
 def _judged_by_run(
     verdict: Verdict, naming: Naming, base: Identification, final: Identification
-) -> tuple[Verdict, dict[str, Gap]]:
-    """The verdict, once the runs are compared, and the gap of each run over the noise that the verdict implies."""
-    leaves_more = verdict == "not_in_library" or naming.varies
-    gaps = gaps_of_runs(base, final, naming.noise_share if leaves_more else 1.0)
+) -> tuple[Verdict, Noise]:
+    """The verdict, once the runs are compared, and the noise of each run that it implies."""
+    fits, share = final.fit, naming.noise_share if verdict == "not_in_library" else 1.0
+    if naming.varies:  # what its own value leaves of each run is noise
+        fits, share = {**fits, **naming.varies.fit}, 1.0
+    noise = noise_of_runs(fits, share)
+    gaps = gaps_of_runs(base.fit, final.fit, noise)
     if verdict == "none_detected" and is_disturbed(gaps, final):
         # what is left is then no noise but that of the sensors
-        return "not_in_library", gaps_of_runs(base, final, share=0.0)
-    return verdict, gaps
+        return "not_in_library", noise_of_runs(final.fit, share=0.0)
+    return verdict, noise
 
 
 def _effects(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:

@@ -148,7 +148,7 @@ def _residual_variance(problem: Problem, best: _WeightedPoint) -> float:
 
 def reweighted(problem: Problem, fit: Fit) -> Evaluation:
     """The evaluation at a fit to plain residuals, weighted as in a problem with another noise."""
-    return whitened(problem, _scaled(fit.evaluation, fit.noise / np.asarray(problem.noise)))
+    return whitened(problem, scaled(fit.evaluation, fit.noise / np.asarray(problem.noise)))
 
 
 def _evaluate_weighted(
@@ -157,9 +157,9 @@ def _evaluate_weighted(
     evaluation = evaluate(problem, unknowns) if known is None else known
     with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
         squares = np.square(np.asarray(evaluation.residuals)[problem.fitted_blocks]).sum((0, 2))
-        noise, stretch = _residual_noise(problem, squares)
-        scaled = _scaled(evaluation, stretch)
-        matrix = np.array(normal_matrix(scaled, problem.tape, problem.fitted_runs))
+        noise, stretch = residual_noise(problem, squares)
+        weighted = scaled(evaluation, stretch)
+        matrix = np.array(normal_matrix(weighted, problem.tape, problem.fitted_runs))
         if problem.whitening is not None:
             cost = float(np.log(np.maximum(squares.sum(), 1e-300)))
         else:
@@ -168,7 +168,7 @@ def _evaluate_weighted(
     fitness = float(squares.sum()) / problem.most_samples
     # a failed simulation is infinitely bad
     cost, fitness = (x if np.isfinite(x) else np.inf for x in (cost, fitness))
-    return _WeightedPoint(unknowns, scaled, noise, matrix, cost, fitness)
+    return _WeightedPoint(unknowns, weighted, noise, matrix, cost, fitness)
 
 
 def best_backlash_start(problem: Problem, unknowns: Unknowns, start: RunUnknowns) -> Unknowns:
@@ -258,7 +258,7 @@ def fit_run_unknowns(
         better = squares_of_runs(problem, reached) <= squares_of_runs(problem, best)
         share = np.where(better, 1.0, share / 4)
         unknowns = unknowns._replace(runs=_select_runs(jnp.asarray(better), trial, unknowns.runs))
-        best = _select_blocks(jnp.asarray(better[run]), reached, best)
+        best = select_blocks(jnp.asarray(better[run]), reached, best)
     return unknowns, best
 
 
@@ -269,15 +269,15 @@ def with_holdout_unknowns(problem: Problem, fit: Fit) -> Fit:
     unknowns, evaluation = fit_run_unknowns(problem, fit.unknowns)
     runs = _select_runs(problem.fitted_runs, fit.unknowns.runs, unknowns.runs)
     optimum = fit.optimum._replace(unknowns=unknowns._replace(runs=runs))
-    scaled = _scaled(evaluation, np.asarray(problem.noise) / fit.noise)
+    weighted = scaled(evaluation, np.asarray(problem.noise) / fit.noise)
     return Fit(
         optimum,
-        _select_blocks(jnp.asarray(problem.fitted_blocks), fit.evaluation, scaled),
+        select_blocks(jnp.asarray(problem.fitted_blocks), fit.evaluation, weighted),
         fit.noise,
     )
 
 
-def _scaled(evaluation: Evaluation, stretch: Float[np.ndarray, "2"]) -> Evaluation:
+def scaled(evaluation: Evaluation, stretch: Float[np.ndarray, "2"]) -> Evaluation:
     """Residuals and derivatives multiplied by a factor for each output."""
     return evaluation._replace(
         residuals=evaluation.residuals * stretch[:, None],
@@ -290,9 +290,7 @@ def _select_runs(chosen: Bool[Array, " runs"], one: RunUnknowns, other: RunUnkno
     return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), one, other)
 
 
-def _select_blocks(
-    blocks: Bool[Array, " blocks"], one: Evaluation, other: Evaluation
-) -> Evaluation:
+def select_blocks(blocks: Bool[Array, " blocks"], one: Evaluation, other: Evaluation) -> Evaluation:
     """`one` in the chosen blocks, `other` in the rest."""
     return jax.tree.map(jax.vmap(jnp.where), *(Evaluation(*3 * [blocks]), one, other))
 
@@ -320,7 +318,7 @@ def gauss_newton_step(matrix: np.ndarray, held: set[int], count: int) -> tuple[n
     return -(vectors @ shrunk) / lengths * moves, float(along @ shrunk)
 
 
-def _residual_noise(
+def residual_noise(
     problem: Problem, squares: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Standard deviation of the residuals of each output, and the old scale over the new; whitened ones keep theirs.

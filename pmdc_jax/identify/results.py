@@ -55,7 +55,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
     unknowns, ended = fit_run_unknowns(problem, best.unknowns)
-    fit = _run_fits(given.runs, given.roles, problem.tape, np.asarray(ended.seen), unknowns.runs)
+    fit = run_fits(given.runs, given.roles, problem.tape, np.asarray(ended.seen), unknowns.runs)
     names, covariance = parameters.with_tied(info.covariance)
     noise = {
         name: white_noise([left for _, left in _measured_and_residuals(fit, name)])
@@ -221,13 +221,14 @@ def _status(k: int, best: Optimum, info: Information) -> Status:
     return "identified"
 
 
-def _run_fits(
+def run_fits(
     runs: Sequence[Recording],
     roles: Sequence[Role],
     tape: Tape,
     simulated: np.ndarray,
     own: RunUnknowns,
 ) -> dict[str, RunFit]:
+    """The fit of each run: what was measured beside what was `simulated`, the outputs in the blocks of the tape."""
     # the speed as it was fitted: corrected for what the sensor added, without samples that do not count
     fitted = np.where(np.asarray(tape.weight) > 0, tape.measured, np.nan)[:, 1]
     fits = {}

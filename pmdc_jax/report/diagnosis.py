@@ -12,7 +12,6 @@ from ..diagnose.diagnosis import (
     LearnedCurve,
     NextExperiment,
     Region,
-    VaryingParameter,
 )
 from ..effects import EFFECTS
 from .diagnosis_figures import (
@@ -72,7 +71,7 @@ def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
         gap_figure=figure_json(gap_figure(_gap_by_run(diagnosis))),
         residuals=_residuals(diagnosis),
         against=_residual_over_variable(diagnosis),
-        varies=_varies(diagnosis.varies),
+        varies=_varies(diagnosis),
         curves=[_curve(curve) for curve in diagnosis.curves],
         drifts=_drifts(diagnosis),
         detectable=_detectable(diagnosis),
@@ -218,13 +217,18 @@ def _drifts(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     ]
 
 
-def _varies(varies: VaryingParameter | None) -> dict[str, Any] | None:
+def _varies(diagnosis: Diagnosis) -> dict[str, Any] | None:
+    varies = diagnosis.varies
     if varies is None:
         return None
+    estimates = {run: write_estimate(estimate) for run, estimate in varies.by_run.items()}
     return {
         "name": varies.name,
         "chance": p_value_words(varies.p_value),
-        "by_run": [(run, write_estimate(estimate)) for run, estimate in varies.by_run.items()],
+        "runs": [
+            (run, estimates.get(run), significant(gap.before), significant(gap.after))
+            for run, gap in diagnosis.gap_by_own_value.items()
+        ],
     }
 
 

@@ -17,7 +17,7 @@ from .summary import summary
 from .verdict import verdict_sentences
 
 if TYPE_CHECKING:
-    from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, NextExperiment, VaryingParameter
+    from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, NextExperiment
 
 
 def identification_json(identification: Identification) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "gap": {**gap, "closed_fraction": diagnosis.closed_fraction},
         "gap_of_run": {run: _gap(one) for run, one in diagnosis.gap_of_run.items()},
         "next_experiment": _experiment(diagnosis.next_experiment),
-        "varies": _varying(diagnosis.varies),
+        "varies": _varying(diagnosis),
         "curves": [asdict(curve) for curve in diagnosis.curves],
         "detectable": [asdict(one) for one in diagnosis.detectable],
         "p_nothing_missing": diagnosis.p_nothing,
@@ -101,7 +101,8 @@ def _effect(effect: EffectFound) -> dict[str, Any]:
     }
 
 
-def _varying(varies: VaryingParameter | None) -> dict[str, Any] | None:
+def _varying(diagnosis: Diagnosis) -> dict[str, Any] | None:
+    varies = diagnosis.varies
     if varies is None:
         return None
     return {
@@ -109,6 +110,7 @@ def _varying(varies: VaryingParameter | None) -> dict[str, Any] | None:
         "by_run": {run: _estimate(one) for run, one in varies.by_run.items()},
         "p_value": varies.p_value,
         "also_possible": list(varies.also_possible),
+        "gap_of_run": {run: _gap(one) for run, one in diagnosis.gap_by_own_value.items()},
     }
 
 

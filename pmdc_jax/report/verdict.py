@@ -109,7 +109,7 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
     elif not diagnosis.varies:
         sentences.append("Something is missing that no effect of the library explains.")
     if diagnosis.varies:
-        sentences.append(_varying_sentence(diagnosis.varies))
+        sentences.append(_varying_sentence(diagnosis, diagnosis.varies))
     elif diagnosis.curves:
         sentences.append(_curve_sentence(diagnosis.curves[0]))
     # a misread current or speed leaves the electrical equation unbalanced, too
@@ -327,7 +327,7 @@ def _gap_sentence(diagnosis: Diagnosis) -> str:
 
 def _formula_sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.varies:
-        return f"Not only noise is left. {_varying_sentence(diagnosis.varies)}"
+        return f"Not only noise is left. {_varying_sentence(diagnosis, diagnosis.varies)}"
     if diagnosis.leaves_noise or not diagnosis.effects:
         return ""
     if diagnosis.curves:
@@ -364,18 +364,20 @@ REASONS = {
 }
 
 
-def _varying_sentence(varies: VaryingParameter) -> str:
-    """What differs from run to run, and why it may."""
+def _varying_sentence(diagnosis: Diagnosis, varies: VaryingParameter) -> str:
+    """What differs from run to run, why it may, and how much of the gap a value for each run closes."""
     by_size = sorted(varies.by_run, key=lambda run: varies.by_run[run].value or 0.0)
     ends = [
         f"{_value_in_words(varies.by_run[run])} in the run {run}"
         for run in (by_size[0], by_size[-1])
     ]
     other = f" (or {enumerate_words(varies.also_possible)})" if varies.also_possible else ""
+    run, gap = max(diagnosis.gap_by_own_value.items(), key=lambda named: named[1].before)
     return (
-        f"{varies.name}{other} is not the same in all runs: about {ends[0]}, {ends[1]}"
-        f" ({p_value_words(varies.p_value)}), as {REASONS[varies.name]} would make it. Record all runs in one state of"
-        " the motor, or identify those of each state separately."
+        f"{varies.name}{other} is not the same in all runs: {ends[0]}, {ends[1]} ({p_value_words(varies.p_value)}),"
+        f" as {REASONS[varies.name]} would make it. With a value for each run, the error of the run {run} falls from"
+        f" {significant(gap.before)} to {significant(gap.after)} times the noise. Record all runs in one state of the"
+        " motor, or identify those of each state separately."
     )
 
 
