@@ -148,13 +148,28 @@ def respond(
     blocks = (jnp.asarray(tape.begins), free_end.transpose(1, 0, 2), end.transpose(1, 0, 2))
     starts = jax.lax.scan(next_block, jnp.zeros((2, kicks.shape[3])), blocks)[1]
     response = forced + free[..., :1] * starts[:, 0] + free[..., 1:] * starts[:, 1]
+    at_start, moving = response, 1.0 - stuck[:, :, None]
+    if propagator.reading is not None:
+        # a kick builds up evenly over its sample
+        part, share = propagator.reading
+        response = jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start) + share * kicks
+        response = response.at[:, 1].multiply(moving)
     if propagator.mean is None:
         return response
-    # a kick builds up evenly over its sample: half of it is in the mean
-    transition_of_mean = propagator.mean.transition[1]
-    mean = jnp.einsum("jsb,sjbc->sbc", transition_of_mean, response) + kicks[:, 1] / 2
-    moving = mean * (1.0 - stuck[:, :, None])
-    seen = jnp.concatenate([response, moving[:, None]], 1)
+
+    def mean_speed(
+        within: Propagator, share: Scalars | float
+    ) -> Float[Array, "samples blocks columns"]:
+        """Over a share of each sample, of a kick that builds up evenly."""
+        assert within.mean is not None
+        by_start = jnp.einsum("jsb,sjbc->sbc", within.mean.transition[1], at_start)
+        return (by_start + share / 2 * kicks[:, 1]) * moving
+
+    seen = [response, mean_speed(propagator, 1.0)[:, None]]
+    if propagator.reading is not None:
+        part, share = propagator.reading
+        seen.append(share * mean_speed(part, share)[:, None])
+    seen = jnp.concatenate(seen, 1)
     report = partial(_reported_samples_first, motor, tape)
     return jax.vmap(report, in_axes=-1, out_axes=-1)(seen)
 

@@ -58,6 +58,11 @@ class Prepared(NamedTuple):
         """Whether the voltages are linear from sample to sample instead of held."""
         return self.timing is not None and self.timing.straight
 
+    @property
+    def reading(self) -> float | None:
+        """The share of each sample after which its outputs are read, if not at its start."""
+        return None if self.timing is None else self.timing.reading
+
     def with_tape(self, **fields: Array | None) -> Prepared:
         """The same runs with some fields of the tape replaced."""
         tape = replace(self.problem.tape, **fields)

@@ -21,14 +21,16 @@ CHI2_MEDIAN = 0.4549
 
 
 def rotor_outputs(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
-    """Simulated current and speed of the rotor itself, A and rad/s, without sensor effects and averaging."""
+    """Simulated current and speed of the rotor itself, A and rad/s, at the start of each sample, without sensor effects
+    and averaging."""
     effects, tape = problem.parameters.effects, problem.tape
-    if tape.averaging is None and all(effect.equation != "sensor" for effect in effects):
+    as_seen = tape.averaging is None and tape.reading is None
+    if as_seen and all(effect.equation != "sensor" for effect in effects):
         return fit.evaluation.seen
     unknowns = fit.unknowns
     motor = problem.parameters(unknowns.coordinates)
     bare = motor.with_effects(effect for effect in motor.effects if effect.equation != "sensor")
-    return free_run(bare, replace(tape, averaging=None), unknowns.runs)
+    return free_run(bare, replace(tape, averaging=None, reading=None), unknowns.runs)
 
 
 def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:

@@ -20,6 +20,7 @@ from .corrections.input_timing import (
     negative_log_likelihood_within,
     with_timing,
 )
+from .corrections.reading_time import with_fitted_reading
 from .corrections.speed_averaging import with_averaging, with_evident_averaging
 from .corrections.step_times import with_step_times
 from .corrections.uneven_sampling import with_even_clock
@@ -69,7 +70,7 @@ def solve(
     others = [_corrected(*search_and_refine(runs, search, seed, progress)) for runs in retimed]
     found = []
     for runs, result in [(given, solved), *others]:
-        runs, fit = with_step_times(runs, result.fit)
+        runs, fit = with_fitted_reading(*with_step_times(runs, result.fit))
         found.append((runs, result._replace(fit=fit)))
     if not others:
         return found[0]
@@ -107,7 +108,7 @@ def search_and_refine(
     began = time.perf_counter()
     report = progress or silent
     problem = given.problem
-    searching = Tape.from_recordings(given.training, straight=given.straight)
+    searching = Tape.from_recordings(given.training, straight=given.straight, reading=given.reading)
     noise, parameters = np.asarray(problem.noise), _searched_parameters(given)
 
     def run_search(seed: int) -> SearchResult:

@@ -102,6 +102,20 @@ def _sensed_speed(
     return jnp.where(over_last[block], mean, speed)
 
 
+def _when_read(
+    motors: Motor,
+    propagator: Propagator,
+    acting: Input,
+    state: State,
+    steps: int | Int[Array, ""] = 1,
+) -> State:
+    """The state when the outputs of a sample are read, from that at its start."""
+    if propagator.reading is None:
+        return state
+    part, share = propagator.reading
+    return held_step_and_mean(motors, part, acting.part(share / 2, share), state, steps)[0]
+
+
 # State of the motors, and their squared errors of current and speed so far
 Gathered = tuple[State, tuple[Scalars, ...]]
 
@@ -183,11 +197,10 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
         ) -> tuple[Gathered, None]:
             state, errors = carry
             value, load, measured, weight = samples
-            after, mean = held_step_and_mean(motors, propagator, Input(drive, value, load), state)
-            seen = (
-                state.current,
-                _sensed_speed(state.speed, mean and mean.speed, over_last, block),
-            )
+            acting = Input(drive, value, load)
+            after, mean = held_step_and_mean(motors, propagator, acting, state)
+            read = _when_read(motors, propagator, acting, state)
+            seen = (read.current, _sensed_speed(read.speed, mean and mean.speed, over_last, block))
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
@@ -255,7 +268,7 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
                 weight = (weight[0], jnp.where(inside, speed_weights[late], 0.0))
             acting = Input(drive, value, load)
             after, mean = held_step_and_mean(motors, propagator, acting, state, steps)
-            current, speed = motors.sensors(state)
+            current, speed = motors.sensors(_when_read(motors, propagator, acting, state, steps))
             mean_speed = mean and motors.sensors(mean)[1]
             seen = (current, _sensed_speed(speed, mean_speed, over_last, block))
             errors = tuple(

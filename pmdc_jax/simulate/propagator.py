@@ -66,8 +66,8 @@ class MeanPropagator(NamedTuple):
     last: Matrix | None = None  # h (4 phi_4 - phi_3)
 
 
-class SensorInstant(NamedTuple):
-    """The instant within each sample at which a delayed sensor sees the speed."""
+class Instant(NamedTuple):
+    """An instant within each sample."""
 
     propagator: Propagator  # one of the equal steps up to that instant
     share: Scalars  # of the sample up to that instant, 0 < share <= 1
@@ -86,7 +86,8 @@ class Propagator(NamedTuple):
     without_contact: Propagator | None = None  # the same while the teeth do not touch
     # h (phi_2 - phi_1 / 2)(A h): effect of a drive's rise within a step, beyond that of its mean
     ramp: Matrix | None = None
-    sensor_instant: SensorInstant | None = None  # for a delayed sensor
+    reading: Instant | None = None  # when the outputs are read, if not at the start of a sample
+    speed_seen: Instant | None = None  # when a delayed sensor sees the speed
     mean: MeanPropagator | None = None  # for a speed that is reported as a mean
 
 
@@ -198,19 +199,24 @@ def _linear_part(motor: Motor, drive: Drive) -> tuple[Matrix, Float[Array, "n 2 
 
 def grid_propagators(motor: Motor, tape: Tape) -> Propagator:
     """The propagators of one step on every grid of the tape, stacked along the first axis."""
-    steps, delay = steps_in_sample(motor, tape), motor.speed_delay()
+    steps, delay, reading = steps_in_sample(motor, tape), motor.speed_delay(), tape.reading
 
     def of_grid(g: int) -> Propagator:
         sample = jnp.asarray(tape.sample_time)[g]
         drive = Drive(*(jnp.asarray(share)[g] for share in tape.drive))
         options = (tape.rise is not None, tape.averaging is not None)
+
+        def instant(share: Scalars) -> Instant:
+            share = share * jnp.ones_like(motor.R)
+            return Instant(make_propagator(motor, share * sample / steps, drive, *options), share)
+
         propagator = make_propagator(motor, sample / steps, drive, *options)
-        if delay is None:
-            return propagator
-        samples = jnp.asarray(delay / sample)
-        share = 1 - (samples - jnp.floor(samples))
-        part = make_propagator(motor, share * sample / steps, drive, *options)
-        return propagator._replace(sensor_instant=SensorInstant(part, share))
+        if reading is not None:
+            propagator = propagator._replace(reading=instant(reading))
+        if delay is not None:
+            behind = jnp.asarray(delay / sample - (0.0 if reading is None else reading))
+            propagator = propagator._replace(speed_seen=instant(1 - (behind - jnp.floor(behind))))
+        return propagator
 
     grids = map(of_grid, range(tape.sample_time.shape[0]))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *grids)

@@ -1,5 +1,5 @@
-"""Reported outputs of a simulated motor: a speed may be delayed by its sensor, or be a mean over a sample, as
-differences of angles are."""
+"""Reported outputs of a simulated motor: they may be read some time after the voltage of their sample was applied; a
+speed may be delayed by its sensor, or be a mean over a sample, as differences of angles are."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from ..effects.base import Scalars, State
 from ..motor import Motor
-from .propagator import Propagator
+from .propagator import Instant, Propagator
 from .solver import Input, held_step_and_mean
 from .tape import BLOCK, Tape
 
@@ -21,30 +21,40 @@ def outputs(
     steps: int | Int[Array, ""],
     mean: State | None = None,
 ) -> Float[Array, "outputs ..."]:
-    """Current and speed at a sample, and the other values from which `reported` makes a delayed or averaged speed.
+    """Current and speed when a sample is read, and the other values from which `reported` makes a delayed or averaged
+    speed.
 
     With a delayed sensor: the speed at the instant it sees, between this sample and the next. With averaging: the mean
-    speed from this sample to the next, that of the `mean` state. With both: also the part of this mean that comes from
-    before that instant.
+    speed from this sample to the next, that of the `mean` state. With averaging and a speed that is seen within a
+    sample: also the part of this mean that comes from before that instant.
     """
-    seen = [*motor.sensors(state)]
-    part_mean = None
-    if propagator.sensor_instant is not None:
-        part, share = propagator.sensor_instant
-        within = acting.part(share / 2, share)
-        there, part_mean = held_step_and_mean(motor, part, within, state, steps)
+
+    def at(instant: Instant) -> tuple[State, State | None]:
+        within = acting.part(instant.share / 2, instant.share)
+        return held_step_and_mean(motor, instant.propagator, within, state, steps)
+
+    reading, speed_seen, part_mean = propagator.reading, propagator.speed_seen, None
+    if reading is None:
+        seen = [*motor.sensors(state)]
+    else:
+        there, part_mean = at(reading)
+        seen = [*motor.sensors(there)]
+    if speed_seen is not None:
+        there, part_mean = at(speed_seen)
         seen.append(motor.sensors(there)[1])
     if mean is not None:
         seen.append(motor.sensors(mean)[1])
-    if propagator.sensor_instant is not None and part_mean is not None:
-        seen.append(propagator.sensor_instant.share * motor.sensors(part_mean)[1])
+    instant = speed_seen or reading
+    if instant is not None and part_mean is not None:
+        seen.append(instant.share * motor.sensors(part_mean)[1])
     return jnp.stack(seen)
 
 
 def reports_of(propagator: Propagator) -> int:
     """Number of `outputs`."""
-    late, averaged = propagator.sensor_instant is not None, propagator.mean is not None
-    return 2 + late + averaged + (late and averaged)
+    delayed, averaged = propagator.speed_seen is not None, propagator.mean is not None
+    within = delayed or propagator.reading is not None
+    return 2 + delayed + averaged + (averaged and within)
 
 
 def reported(
@@ -54,7 +64,7 @@ def reported(
 
     Before the start of a run the speed is taken to be that at the start.
     """
-    delay = motor.speed_delay()
+    delay, reading = motor.speed_delay(), tape.reading
     if delay is None and tape.averaging is None:
         return seen
     speed, *others = (seen[:, k].reshape(-1) for k in range(1, seen.shape[1]))
@@ -65,11 +75,14 @@ def reported(
         return jnp.where(k < first, before, values[jnp.clip(k, 0, len(speed) - 1)])
 
     share = None
-    if delay is not None:
-        within, *others = others
-        behind = delay / jnp.repeat(jnp.asarray(tape.sample_time)[tape.grid], BLOCK)
+    if delay is not None or reading is not None:
+        sample_time = jnp.repeat(jnp.asarray(tape.sample_time)[tape.grid], BLOCK)
+        behind = (0.0 if delay is None else delay) / sample_time
+        behind -= 0.0 if reading is None else reading
         last = last - jnp.floor(behind).astype(int)
         share = 1 - (behind - jnp.floor(behind))
+    if delay is not None:
+        within, *others = others
         speed = sample(within, last, begun)
     if tape.averaging is not None:
         mean, *parts = others

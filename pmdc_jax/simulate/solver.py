@@ -138,7 +138,7 @@ def _step(
         touching = teeth.teeth(state).touch
         propagator = jax.tree.map(
             lambda a, b: jnp.where(touching, a, b),
-            propagator._replace(without_contact=None, sensor_instant=None),
+            propagator._replace(without_contact=None, reading=None, speed_seen=None),
             propagator.without_contact,
         )
     weights = propagator.weights

@@ -60,6 +60,8 @@ class Tape(eqx.Module):
     rise: Float[Samples, "blocks samples"] | None = None
     # shares in the reported speed of its mean over the last sample and over the next; None if no speed is a mean
     averaging: Float[Samples, "runs 2"] | None = None
+    # share of each sample, between 0 and 1, after which its outputs are read; None if they are read at its start
+    reading: Float[Samples, ""] | None = None
 
     @classmethod
     def from_recordings(
@@ -68,6 +70,7 @@ class Tape(eqx.Module):
         unloaded: bool = False,
         follow: bool = False,
         straight: bool = False,
+        reading: float | None = None,
     ) -> Tape:
         """Lay recordings end to end.
 
@@ -75,7 +78,8 @@ class Tape(eqx.Module):
         `unloaded` declares the load of runs without a load column to be zero instead of unknown; `follow` makes
         the rotor turn by the measured speed where there is one, so that torques that depend on its angle stay in phase
         with the real ones, which a free run would lose after a few turns; `straight`, whether voltages and torques
-        vary linearly from sample to sample instead of being held.
+        vary linearly from sample to sample instead of being held; `reading`, the share of a sample after which its
+        outputs are read, if not at its start.
         """
         runs = [_Run(recording, straight) for recording in recordings]
         rises = straight or any(recording.resampled_from is not None for recording in recordings)
@@ -102,6 +106,7 @@ class Tape(eqx.Module):
             ),
             angle=of_runs(_first(r.angle) for r in recordings),
             angle_known=of_runs(r.angle is not None for r in recordings),
+            reading=None if reading is None else np.asarray(reading),
             longest=2.0 ** math.ceil(math.log2(sample_times.max() / 1e-3) - 1e-6) * 1e-3,
         )
 

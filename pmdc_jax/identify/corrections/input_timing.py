@@ -16,6 +16,7 @@ import attrs
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from ...recording import Recording
 from ...simulate import Tape, uniform
@@ -23,9 +24,12 @@ from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import normal_matrix
+from .reading_time import MARGIN, lead_by_currents
 from .speed_averaging import seems_averaged, with_averaging, without_averaging, without_ends
 from .uneven_sampling import with_even_clock
 
+# Accuracy, in samples, with which a lead is searched
+LEAD_TOLERANCE = 3e-3
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
 MIN_LEAD = 0.3
 
@@ -33,17 +37,35 @@ MIN_LEAD = 0.3
 class Timing(NamedTuple):
     """When the voltages of a recording act, if they are not held from their sample to the next."""
 
-    what: str
-    ahead: int  # by how many samples they were recorded late
+    lead: float  # by how many samples they act before the sample beside which they were recorded, at least -1
     straight: bool  # linear from sample to sample instead of held
     load: bool = False  # whether the recorded loads have the same timing
 
+    @property
+    def ahead(self) -> int:
+        """By how many whole samples they act earlier."""
+        return int(np.floor(self.lead))
 
-ALTERNATIVES = (
-    Timing("is linear between samples instead of held", 0, True),
-    Timing("was recorded one sample late, after it had been held instead of before", 1, False),
-    Timing("acts one sample later than it was recorded", -1, False),
-)
+    @property
+    def reading(self) -> float | None:
+        """The share of a sample between the instant at which a voltage begins to act and the reading of the outputs, if
+        not zero."""
+        return self.lead - self.ahead or None
+
+    @property
+    def what(self) -> str:
+        """What the voltages do, in words."""
+        if self.straight:
+            return "is linear between samples instead of held"
+        if self.reading is not None:
+            sooner = "earlier" if self.lead > 0 else "later"
+            return f"acts {abs(self.lead):.2g} of a sample {sooner} than it was recorded"
+        if self.lead > 0:
+            return "was recorded one sample late, after it had been held instead of before"
+        return "acts one sample later than it was recorded"
+
+
+STRAIGHT, LATE, EARLY = Timing(0, True), Timing(1, False), Timing(-1, False)
 
 
 def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
@@ -56,8 +78,12 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
     lead = _apparent_lead(given, fit)
     # a speed that is a mean over the last sample is half a sample late, too, and may hide the shift
     hidden = given.averaging is None and seems_averaged(given)
-    if abs(lead) < MIN_LEAD and not hidden:
-        return []
+    plausible = []
+    if abs(lead) > MIN_LEAD or hidden:
+        plausible = [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
+    part = lead_by_currents(given, fit)
+    if part is not None:
+        plausible.append(_with_best_lead(given, fit, Timing(part, False)))
 
     @cache
     def unlikelihood(timing: Timing) -> float:
@@ -67,11 +93,24 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
         return negative_log_likelihood_within(*with_averaging(*with_even_clock(other, nearer)))
 
     limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
-    plausible = [t for t in ALTERNATIVES if hidden or (t.ahead < 0) == (lead < 0)]
     likelier = [timing for timing in plausible if unlikelihood(timing) < limit]
     if all(run.load is None for run in given.training):
         return likelier
-    return [min(t, t._replace(load=True), key=unlikelihood) for t in likelier]
+    return [t if t.reading else min(t, t._replace(load=True), key=unlikelihood) for t in likelier]
+
+
+def _with_best_lead(given: Prepared, fit: Fit, timing: Timing) -> Timing:
+    """The timing with the lead, between the same two samples, that fits best."""
+
+    def misfit(reading: float) -> float:
+        other = with_timing(given, timing._replace(lead=timing.ahead + reading))
+        return polish(other.problem, fit.optimum).fitness
+
+    bounds = (MARGIN, 1 - MARGIN)
+    best = minimize_scalar(
+        misfit, bounds=bounds, method="bounded", options={"xatol": LEAD_TOLERANCE}
+    )
+    return timing._replace(lead=timing.ahead + float(best.x))
 
 
 def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:
@@ -86,7 +125,7 @@ def _apparent_lead(given: Prepared, fit: Fit) -> float:
 
     Half a sample earlier is a held mean of the voltages at a sample and the next, which reuses compiled programs.
     """
-    means = with_timing(given, ALTERNATIVES[0]).problem
+    means = with_timing(given, STRAIGHT).problem
     means = replace(means, tape=replace(means.tape, rise=None))
     sooner, evaluation = polish(means, fit.optimum, steps=0).evaluation.seen, fit.evaluation
     scale = given.problem.tape.weight / fit.noise[:, None]
@@ -104,9 +143,9 @@ def with_timing(given: Prepared, timing: Timing) -> Prepared:
     """The runs with voltages of this timing."""
     tape = given.problem.tape
     runs = [uniform(_retimed(run, k, tape, timing)) for k, run in enumerate(given.runs)]
-    driven = Tape.from_recordings(runs, straight=timing.straight)
-    value, load, rise = jax.tree.map(jnp.asarray, (driven.value, driven.load, driven.rise))
-    tape = replace(tape, value=value, load=load, rise=rise)
+    driven = Tape.from_recordings(runs, straight=timing.straight, reading=timing.reading)
+    names = ("value", "load", "rise", "reading")
+    tape = replace(tape, **jax.tree.map(jnp.asarray, {n: getattr(driven, n) for n in names}))
     problem = replace(given.problem, tape=tape)
     acting = given._replace(runs=runs, problem=problem, timing=timing)
     # what acts during the first sample was not recorded: without outputs there, the initial state makes up for it

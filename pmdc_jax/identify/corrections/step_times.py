@@ -51,14 +51,14 @@ class Steps(NamedTuple):
 
 def with_step_times(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the steps of their voltages at the times when the motor felt them, and the fit to them; both
-    unchanged if the steps coincide with samples or all have the same delay."""
+    unchanged if the steps coincide with samples or all have the same delay, which is a matter of `reading_time`."""
     problem = given.problem
     steps = [steps_of(run) for run in given.runs]
     if given.straight:  # a straight rise between two samples is a step in their middle
         steps = [s._replace(share=s.share + 0.5) for s in steps]
     count, most = sum(len(s.at) for s in steps), max(len(s.at) for s in steps)
     too_many = 2 * problem.tape.value.size * most > MAX_ELEMENTS
-    if not all(problem.samples > 0) or count < MIN_STEPS or too_many:
+    if given.reading or not all(problem.samples > 0) or count < MIN_STEPS or too_many:
         return given, fit
     min_gain = MIN_LOG_LIKELIHOOD_GAIN + MIN_GAIN_PER_STEP * count
     steps, predicted_gain = _fit_times(problem, fit, steps)

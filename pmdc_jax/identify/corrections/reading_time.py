@@ -1,0 +1,151 @@
+"""Outputs that are read some time after the voltage of their sample was applied, or a voltage that acts some time after
+it was recorded: a control loop that applies a voltage, waits, and then reads its sensors, or a recorder that is not
+synchronised with the supply.
+
+The electrical equation shows it, whatever torque acts: from one sample to the next, the current then depends on two
+voltages instead of one. How much on each tells the instant, which is then fitted together with the motor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from ...recording import Recording
+from ..polish import Fit, polish
+from ..prepare import Prepared
+from ..problem import Problem, evaluate
+
+# Least lead that counts, in samples, and how many standard errors from zero its voltage must be
+MIN_LEAD, MIN_Z = 0.02, 10.0
+# Share of the squared residuals of the electrical equation that this voltage must explain
+MIN_EXPLAINED = 0.05
+# ... and the largest effect of the one on the other side, relative to it: a noisy voltage seems to have both
+MAX_OTHER_SIDE = 0.3
+# Range of the decay of the current over a sample by which the lead is computed
+DECAYS = (1e-3, 0.999)
+# Refits to the fitted instant, the change of it, in samples, by which the outputs are differentiated, and its least
+# distance from a sample
+REFITS, DIFFERENCE, MARGIN = 4, 1e-4, 0.005
+
+# Columns of the electrical equation: the current, both speeds, the voltage of the sample before, of this and of the
+# next one, a constant, the direction of the current
+DECAY, BEFORE, NOW, AFTER, COLUMNS = 0, 3, 4, 5, 8
+
+
+class _Equation(NamedTuple):
+    """The electrical equation from sample to sample: the next current by the `COLUMNS`."""
+
+    current: Float[np.ndarray, " samples"]
+    columns: Float[np.ndarray, "samples columns"]
+    # the same columns of the simulation, whose currents and speeds have no noise
+    instruments: Float[np.ndarray, "samples columns"]
+
+    def solve(self, used: Int[np.ndarray, " used"]) -> tuple[np.ndarray, np.ndarray, float]:
+        """Coefficients of the columns used, their standard errors, and the mean square that is left.
+
+        By instrumental variables, because noise of the currents would bias least squares; errors as of White (1980).
+        """
+        size = np.sqrt(np.mean(np.square(self.instruments[:, used]), axis=0)) + 1e-300
+        Z, X = self.instruments[:, used] / size, self.columns[:, used] / size
+        inverse = np.linalg.pinv(Z.T @ X, rcond=1e-10)
+        coefficients = inverse @ (Z.T @ self.current)
+        left = self.current - X @ coefficients
+        scores = inverse @ (Z * left[:, None]).T
+        errors = np.sqrt(np.square(scores).sum(1)) / size
+        return coefficients / size, errors, float(np.mean(np.square(left)))
+
+
+def lead_by_currents(given: Prepared, fit: Fit) -> float | None:
+    """By how many samples, between -1 and 1, the voltages act before the outputs beside which they were recorded; None
+    if they act at a sample, as far as the currents tell.
+
+    With the decay d of the current over a sample, of which a share s comes after a voltage has changed, this voltage
+    contributes 1 - d^s of 1 - d, and the one before it the rest.
+
+    **Arguments**: `fit`, to these runs, with voltages that are held from their samples on.
+    """
+    equation = _electrical_equation(given, fit)
+    if equation is None:
+        return None
+    coefficients, errors, left = equation.solve(np.arange(COLUMNS))
+    without = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))[2]
+    gains = coefficients / coefficients[[BEFORE, NOW, AFTER]].sum()
+    own, other = (AFTER, BEFORE) if gains[AFTER] > gains[BEFORE] else (BEFORE, AFTER)
+    clear = gains[own] > 0 and abs(coefficients[own]) > MIN_Z * errors[own]
+    one_sided = abs(gains[other]) < MAX_OTHER_SIDE * gains[own]
+    if not (clear and one_sided and left < (1 - MIN_EXPLAINED) * without):
+        return None
+    late, early = (AFTER, NOW) if own == AFTER else (NOW, BEFORE)
+    decay = float(np.clip(coefficients[DECAY], *DECAYS))
+    share = np.clip(gains[late] / (gains[late] + gains[early]), 0.0, 1.0)
+    since = np.log(max(1 - share * (1 - decay), 1e-12)) / np.log(decay)
+    lead = float(np.clip(since, MARGIN, 1 - MARGIN)) - (own == BEFORE)
+    return lead if abs(lead) > MIN_LEAD else None
+
+
+def _electrical_equation(given: Prepared, fit: Fit) -> _Equation | None:
+    """The equation of all training runs together; None if they differ in sample time or none has what it takes."""
+    tape, seen = given.problem.tape, np.asarray(fit.evaluation.seen)
+    currents, columns, instruments = [], [], []
+    runs = [(k, run) for k, run in enumerate(given.training) if _is_usable(run)]
+    if len({tape.grid_of(k) for k, _ in runs}) != 1:
+        return None
+    for k, run in runs:
+
+        def of_run(signal: np.ndarray, k: int = k, run: Recording = run) -> np.ndarray:
+            return np.stack([tape.samples_of(k, signal[:, c], len(run)) for c in range(2)], 1)
+
+        measured, simulated = of_run(np.asarray(tape.measured)), of_run(seen)
+        known = (of_run(np.asarray(tape.weight)) > 0).all(1)
+        voltage = np.asarray(tape.samples_of(k, tape.value, len(run)))
+        both = known[1:-1] & known[2:]
+        direction = np.sign(simulated[1:-1, 0] + simulated[2:, 0])
+        shared = [voltage[:-2], voltage[1:-1], voltage[2:], np.ones(len(both)), direction]
+        currents.append(measured[2:, 0][both])
+        for rows, x in ((columns, measured), (instruments, simulated)):
+            rows.append(np.stack([x[1:-1, 0], x[1:-1, 1], x[2:, 1], *shared], 1)[both])
+    return _Equation(*map(np.concatenate, (currents, columns, instruments)))
+
+
+def _is_usable(run: Recording) -> bool:
+    measured = run.drive == "voltage" and run.current is not None and run.speed is not None
+    return measured and not run.held and run.resampled_from is None
+
+
+def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+    """The runs with the instant of reading fitted, as a nuisance parameter, and the fit to them; both unchanged where
+    the outputs are read at the samples."""
+    if given.problem.tape.reading is None:
+        return given, fit
+    for _ in range(REFITS):
+        change = _change_by_reading(given.problem, fit)
+        given = given._replace(problem=replace(given.problem, nuisance=change[..., None]))
+        fit = polish(given.problem, fit.optimum)
+        given = _moved(given, fit, change)
+    return given, polish(given.problem, fit.optimum)
+
+
+def _change_by_reading(problem: Problem, fit: Fit) -> Float[np.ndarray, "blocks 2 samples"]:
+    """Derivative of the outputs, A and rad/s, by the instant of reading, in samples."""
+    tape = problem.tape
+    assert tape.reading is not None
+    later = replace(problem, tape=replace(tape, reading=tape.reading + DIFFERENCE))
+    seen = evaluate(later, fit.unknowns).seen
+    return (seen - fit.evaluation.seen) / DIFFERENCE
+
+
+def _moved(given: Prepared, fit: Fit, change: Float[np.ndarray, "blocks 2 samples"]) -> Prepared:
+    """The runs read when their residuals say. The parameters do not respond: their derivatives are orthogonal."""
+    problem, tape = given.problem, given.problem.tape
+    scale = tape.weight / fit.noise[:, None] * problem.fitted_blocks[:, None, None]
+    left, column = (tape.measured - fit.evaluation.seen) * scale, change * scale
+    by = jnp.sum(left * column) / jnp.sum(column**2)
+    reading = jnp.clip(tape.reading + by, MARGIN, 1 - MARGIN)
+    assert given.timing is not None
+    timing = given.timing._replace(lead=given.timing.ahead + float(reading))
+    return given.with_tape(reading=reading)._replace(timing=timing)
