@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import attrs
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,8 +14,15 @@ from pmdc_jax import identify
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.recording import Recording
-from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, free_run, sensitivities
+from pmdc_jax.recording import OVER_LAST, Recording
+from pmdc_jax.simulate import (
+    UNKNOWNS_PER_RUN,
+    RunUnknowns,
+    Tape,
+    free_run,
+    sensitivities,
+    squared_errors,
+)
 
 # with a current that settles about as fast as it is sampled: L / R is 1.25 ms, the sample time 2 ms
 TRUE = {"R": 0.8, "L": 1e-3, "Kb": 0.04, "Kt": 0.039, "J": 4e-5, "f": 3e-5}
@@ -46,7 +54,7 @@ def largest_error(found: np.ndarray, expected: np.ndarray) -> float:
     return float((np.abs(found - expected).max(0) / np.abs(expected).max(0)).max())
 
 
-def outputs_by_scipy(run: Recording, straight: bool = True) -> np.ndarray:
+def outputs_by_scipy(run: Recording, straight: bool = True, step: float = STEP) -> np.ndarray:
     """Current, speed and angle of the linear motor: `lsim` goes straight between the samples, `dlsim` holds them."""
     m = TRUE
     A = np.array(
@@ -60,7 +68,19 @@ def outputs_by_scipy(run: Recording, straight: bool = True) -> np.ndarray:
     system, inputs = (A, B, np.eye(3), np.zeros((3, 2))), np.stack([run.voltage, run.load], 1)
     if straight:
         return signal.lsim(system, inputs, run.time)[1]
-    return signal.dlsim(signal.cont2discrete(system, STEP), inputs)[1]
+    return signal.dlsim(signal.cont2discrete(system, step), inputs)[1]
+
+
+def outputs_within(run: Recording, tenths: int) -> np.ndarray:
+    """Current, speed and angle so many tenths of a sample after each sample of a held voltage, by scipy."""
+    fine = Recording(
+        "fine",
+        run.time[0] + STEP / 10 * np.arange(10 * len(run)),
+        voltage=np.repeat(run.voltage, 10),
+        speed=np.zeros(10 * len(run)),
+        load=np.repeat(run.load, 10),
+    )
+    return outputs_by_scipy(fine, straight=False, step=STEP / 10)[tenths::10]
 
 
 def test_the_linear_motor_matches_scipy(x64):
@@ -111,12 +131,13 @@ def test_effects_match_an_independent_integrator(x64, name):
     assert largest_error(simulated(run, motor_with(effect)), exact) < tolerance
 
 
+@pytest.mark.parametrize("timing", [{"straight": True}, {"reading": 0.3}])
 @pytest.mark.parametrize("names", [("coulomb_friction",), ("speed_sensor_delay",)])
-def test_sensitivities_match_central_differences(x64, names):
+def test_sensitivities_match_central_differences(x64, names, timing):
     bounds = {n: (x / 2, x * 2) for n, x in TRUE.items()}
     parameters = Parameters.of(bounds, [EFFECTS[name] for name in names])
     at = np.log([*TRUE.values(), *[{"coulomb_friction": 0.02}.get(n, 0.003) for n in names]])
-    tape = Tape.from_recordings([run_by_sines(3, 300)], straight=True)
+    tape = Tape.from_recordings([run_by_sines(3, 300)], **timing)
     found, jacobian = sensitivities(parameters, jnp.asarray(at), tape, FROM_REST)
 
     def run(at):
@@ -130,6 +151,34 @@ def test_sensitivities_match_central_differences(x64, names):
         assert error < 1e-4, (parameters.names[column], error)
 
 
+@pytest.mark.parametrize("averaged", [False, True])
+def test_outputs_are_read_within_a_sample_as_by_scipy(x64, averaged):
+    run, tenths = run_by_sines(4, 300, load=0.02), 3
+    if averaged:
+        run = attrs.evolve(run, averaging=OVER_LAST)
+    tape = Tape.from_recordings([run], reading=tenths / 10)
+    seen = free_run(motor_with(), tape, FROM_REST)
+    current, speed = (tape.samples_of(0, seen[:, c], len(run)) for c in range(2))
+    expected = outputs_within(run, tenths)
+    if averaged:  # before the start of the run its speed is unknown
+        expected, current, speed = np.diff(expected, axis=0) / STEP, np.diff(current), speed[1:]
+        expected[:, 1], expected[:, 0] = expected[:, 2], expected[:, 0] * STEP
+    assert largest_error(np.stack([current, speed], 1), expected[:, :2]) < 1e-10
+
+
+def test_a_population_is_read_within_a_sample(x64):
+    run = attrs.evolve(run_by_sines(5, 300), current=np.zeros(300))
+    tape = Tape.from_recordings([run], reading=0.3)
+    seen = np.asarray(free_run(motor_with(), tape, FROM_REST))
+    population = jax.tree.map(lambda x: jnp.full(4, x), motor_with())
+    for effects in ((), (EFFECTS["coulomb_friction"](torque_Nm=jnp.zeros(4)),)):
+        found = squared_errors(population.with_effects(effects), tape)
+        for c, errors in enumerate(found):
+            np.testing.assert_allclose(
+                errors, np.sum(seen[:, c] ** 2 * tape.weight[:, c]), rtol=1e-9
+            )
+
+
 # ways in which voltages act and are logged, and the message for each
 MESSAGE_OF = {
     "held": None,
@@ -137,6 +186,9 @@ MESSAGE_OF = {
     "recorded late": "recorded one sample late",
     "acts late": "acts one sample later",
     "straight, counted": "is linear between samples",
+    "held, read after 3 tenths": "acts 0.3 of a sample earlier",
+    "recorded early by 3 tenths": "acts 0.3 of a sample later",
+    "held, read after 3 tenths, counted": "acts 0.3 of a sample earlier",
 }
 LINES = 2048
 
@@ -153,11 +205,19 @@ def logged(timing: str) -> list[Recording]:
         load = run.load[:-1]
         if timing == "recorded late":  # beside the next outputs, and so is the load
             measured = outputs[1:]
+        if "tenths" in timing:
+            exact = outputs_within(run, 3 if "after" in timing else 7)
+            measured = measured + (exact - outputs_by_scipy(run, straight=False))[:-1, :2]
         if "counted" in timing:  # by an encoder, over the last sample
-            angle = np.round(outputs_by_scipy(run)[:, 2] * LINES / (2 * np.pi)) * 2 * np.pi / LINES
+            exact = outputs_within(run, 3) if "tenths" in timing else outputs_by_scipy(run)
+            angle = np.round(exact[:, 2] * LINES / (2 * np.pi)) * 2 * np.pi / LINES
             measured[:, 1] = np.diff(angle, prepend=angle[0])[:-1] / STEP
         if timing == "acts late":
             v, measured, load = run.voltage[1:], outputs[:-1], run.load[:-1]
+        if (
+            "early" in timing
+        ):  # the next voltage acts 3 tenths of a sample after the outputs were read
+            v = run.voltage[1:]
         runs.append(Recording(run.name, run.time[:-1], v, *measured.T, load=load))
     return runs
 

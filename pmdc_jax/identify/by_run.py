@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..simulate import UNKNOWNS_PER_RUN, RunUnknowns
-from .polish import gauss_newton_step, residual_noise, scaled, select_blocks
+from .polish import RIDGE, gauss_newton_step, residual_noise, ridge_of, scaled, select_blocks
 from .problem import Evaluation, Problem, Unknowns, evaluate, normal_matrix
 from .uncertainty import information
 
@@ -83,7 +83,8 @@ def _step(
     count, tape = best.coordinates.shape[1], problem.tape
     weighted = _with_own_columns(problem, best, k)
     matrix = np.asarray(normal_matrix(weighted, tape, problem.fitted_runs))
-    flat, _ = gauss_newton_step(matrix, held, count + tape.runs)
+    ridge = np.insert(ridge_of(problem), count, np.full(tape.runs, RIDGE))
+    flat, _ = gauss_newton_step(matrix, held, ridge)
     shared, own, unknowns = np.split(flat, [count, count + tape.runs])
     coordinates = best.coordinates + shared
     coordinates[:, k] += own

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..simulate import RunUnknowns
+from ..simulate import UNKNOWNS_PER_RUN, RunUnknowns
 from ..threads import map_in_threads
 from .noise import MIN_RELATIVE_NOISE
 from .parameters import Parameters
@@ -38,8 +38,9 @@ TOLERANCE = 2e-3
 BACKLASH_STARTS = np.linspace(-1.0, 1.0, 9)
 # Initial rotor angles tried per period of an angle-dependent torque (the shortest one), and at most
 ANGLES_PER_PERIOD, MAX_ANGLES = 8, 32
-# Curvature added to every coordinate in a step, as a prior that knows each to within a factor of e: negligible for a
-# coordinate that the data determine, while one that they do not determine stays where it is
+# Curvature added to every coordinate in a step, as a prior that knows each to within a factor of e, and to the initial
+# state, as one that knows it to within what was measured: negligible for what the data determine, while what they do
+# not determine, such as a current that has settled before it is read, stays where it is
 RIDGE = 1.0
 
 
@@ -85,6 +86,7 @@ def polish(
     inside. `known` is the evaluation at the start, if there is one already.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
+    ridge = ridge_of(problem)
     held = set(start.at_bound)
     best = trial = _evaluate_weighted(problem, start.unknowns, known)
     step, share, gain = np.zeros(len(flatten(start.unknowns))), 1.0, np.inf
@@ -98,7 +100,7 @@ def polish(
             best, share = trial, 1.0
             coordinates = np.asarray(best.unknowns.coordinates)
             held = {k for k in held if (best.matrix[k, -1] > 0) == (coordinates[k] <= low[k])}
-            step, gain = gauss_newton_step(best.matrix, held, len(low))
+            step, gain = gauss_newton_step(best.matrix, held, ridge)
             if gain <= tolerance * _residual_variance(problem, best):
                 break
         elif share > 1e-3:
@@ -244,10 +246,10 @@ def fit_run_unknowns(
     everyone, share = jnp.ones(problem.tape.runs, bool), np.ones(problem.tape.runs)
 
     unknowns = best_initial_angle(fixed, best_backlash_start(fixed, unknowns, unknowns.runs))
-    best = evaluate(fixed, unknowns)
+    best, ridge = evaluate(fixed, unknowns), ridge_of(problem)
     for _ in range(passes):
         matrix = np.asarray(normal_matrix(best, fixed.tape, everyone))
-        flat, gain = gauss_newton_step(matrix, set(), 0)
+        flat, gain = gauss_newton_step(matrix, set(), ridge)
         if gain < TOLERANCE * matrix[-1, -1] / problem.most_samples:
             break
         step = unflatten(problem, jnp.asarray(flat)).runs
@@ -295,17 +297,27 @@ def select_blocks(blocks: Bool[Array, " blocks"], one: Evaluation, other: Evalua
     return jax.tree.map(jax.vmap(jnp.where), *(Evaluation(*3 * [blocks]), one, other))
 
 
-def gauss_newton_step(matrix: np.ndarray, held: set[int], count: int) -> tuple[np.ndarray, float]:
+def ridge_of(problem: Problem) -> Float[np.ndarray, " unknowns"]:
+    """The curvature added to each unknown in a step: the coordinates, then the own unknowns of run after run."""
+    rms = problem.measured_rms
+    own = np.zeros((problem.tape.runs, UNKNOWNS_PER_RUN))
+    own[:, :2] = np.where(rms > 0, 1 / np.where(rms > 0, rms, 1.0) ** 2, 0.0)
+    return np.concatenate([np.full(len(problem.free), RIDGE), own.ravel()])
+
+
+def gauss_newton_step(
+    matrix: np.ndarray, held: set[int], ridge: Float[np.ndarray, " unknowns"]
+) -> tuple[np.ndarray, float]:
     """The Gauss-Newton step, and the reduction of the sum of squares that it predicts.
 
-    **Arguments**: `matrix`, as from `normal_matrix`; `held`, which of the `count` coordinates stay fixed.
+    **Arguments**: `matrix`, as from `normal_matrix`; `held`, which unknowns stay fixed; `ridge`, as from `ridge_of`.
     """
     gradient, hessian = matrix[:-1, -1].copy(), matrix[:-1, :-1].copy()
     if not np.all(np.isfinite(matrix)):
         return np.zeros(len(gradient)), np.inf
     for k in held:
         gradient[k] = hessian[k, :] = hessian[:, k] = 0.0
-    hessian[np.arange(count), np.arange(count)] += RIDGE
+    hessian[np.diag_indices_from(hessian)] += ridge
     lengths = np.sqrt(np.diag(hessian))
     moves = lengths > 0
     lengths = np.where(moves, lengths, 1.0)

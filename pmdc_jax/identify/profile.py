@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .polish import gauss_newton_step
+from .polish import gauss_newton_step, ridge_of
 from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
 # For a coordinate (natural logarithm) with a smaller standard error the sum of squares is close enough to quadratic.
@@ -73,7 +73,7 @@ def _moved(problem: Problem, point: _Point, index: int, value: float) -> Unknown
     unknowns, count = point.unknowns, len(point.unknowns.coordinates)
     delta, matrix = value - float(unknowns.coordinates[index]), point.matrix.copy()
     matrix[:-1, -1] += delta * matrix[:-1, index]
-    step, _ = gauss_newton_step(matrix, {index}, count)
+    step, _ = gauss_newton_step(matrix, {index}, ridge_of(problem))
     step[index] = delta
     moved = np.asarray(flatten(unknowns)) + step
     moved[:count] = np.clip(moved[:count], problem.parameters.lower, problem.parameters.upper)
@@ -83,6 +83,6 @@ def _moved(problem: Problem, point: _Point, index: int, value: float) -> Unknown
 def _point(problem: Problem, unknowns: Unknowns, index: int) -> _Point:
     found = evaluate(problem, unknowns)
     matrix = np.array(normal_matrix(found, problem.tape, problem.fitted_runs))
-    gain = gauss_newton_step(matrix, {index}, len(unknowns.coordinates))[1]
+    gain = gauss_newton_step(matrix, {index}, ridge_of(problem))[1]
     squares = float(matrix[-1, -1] - gain)
     return _Point(unknowns, matrix, squares if np.isfinite(squares) else 1e300, gain)

@@ -229,25 +229,28 @@ def run_fits(
     own: RunUnknowns,
 ) -> dict[str, RunFit]:
     """The fit of each run: what was measured beside what was `simulated`, the outputs in the blocks of the tape."""
-    # the speed as it was fitted: corrected for what the sensor added, without samples that do not count
-    fitted = np.where(np.asarray(tape.weight) > 0, tape.measured, np.nan)[:, 1]
+    # as fitted: a speed corrected for what the sensor added, and both without samples that do not count
+    fitted = np.where(np.asarray(tape.weight) > 0, tape.measured, np.nan)
     fits = {}
     for index, (run, role) in enumerate(zip(runs, roles, strict=True)):
         current, speed = (tape.samples_of(index, simulated[:, c], len(run)) for c in range(2))
         driven = run.drive == "voltage"
-        measured = None if run.speed is None else tape.samples_of(index, fitted, len(run))
+        i, w = (
+            None if signal is None else tape.samples_of(index, fitted[:, c], len(run))
+            for c, signal in enumerate((run.current if driven else None, run.speed))
+        )
         fits[run.name] = RunFit(
             role=role,
-            current_rmse=_rmse(run.current, current) if driven else None,
-            speed_rmse=_rmse(measured, speed),
-            current_fit_percent=_fit_percent(run.current, current) if driven else None,
-            speed_fit_percent=_fit_percent(measured, speed),
+            current_rmse=_rmse(i, current),
+            speed_rmse=_rmse(w, speed),
+            current_fit_percent=_fit_percent(i, current),
+            speed_fit_percent=_fit_percent(w, speed),
             load_offset=float(own.load_offset[index]) if tape.load_unknown[index] else None,
             time=run.time,
             voltage=run.voltage,
-            current=run.current,
+            current=i if driven else run.current,
             current_simulated=current if driven else None,
-            speed=measured,
+            speed=w,
             speed_simulated=speed,
             load=run.load,
         )

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from ...recording import Recording
 from ..polish import Fit, polish
@@ -130,16 +130,17 @@ def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     return given, polish(given.problem, fit.optimum)
 
 
-def _change_by_reading(problem: Problem, fit: Fit) -> Float[np.ndarray, "blocks 2 samples"]:
-    """Derivative of the outputs, A and rad/s, by the instant of reading, in samples."""
+def _change_by_reading(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
+    """Derivative of the outputs, A and rad/s, by the instant of reading, in samples; zero at the first two samples of a
+    run, where the initial state can make up for it."""
     tape = problem.tape
     assert tape.reading is not None
     later = replace(problem, tape=replace(tape, reading=tape.reading + DIFFERENCE))
-    seen = evaluate(later, fit.unknowns).seen
-    return (seen - fit.evaluation.seen) / DIFFERENCE
+    change = (evaluate(later, fit.unknowns).seen - fit.evaluation.seen) / DIFFERENCE
+    return change.at[jnp.asarray(tape.begins), :, :2].set(0.0)
 
 
-def _moved(given: Prepared, fit: Fit, change: Float[np.ndarray, "blocks 2 samples"]) -> Prepared:
+def _moved(given: Prepared, fit: Fit, change: Float[Array, "blocks 2 samples"]) -> Prepared:
     """The runs read when their residuals say. The parameters do not respond: their derivatives are orthogonal."""
     problem, tape = given.problem, given.problem.tape
     scale = tape.weight / fit.noise[:, None] * problem.fitted_blocks[:, None, None]
