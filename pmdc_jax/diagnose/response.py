@@ -152,23 +152,27 @@ def respond(
     if propagator.reading is not None:
         # a kick builds up evenly over its sample
         part, share = propagator.reading
-        response = jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start) + share * kicks
+        response = (
+            jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start)
+            + share[:, None, :, None] * kicks
+        )
         response = response.at[:, 1].multiply(moving)
     if propagator.mean is None:
         return response
 
     def mean_speed(
         within: Propagator, share: Scalars | float
-    ) -> Float[Array, "samples blocks columns"]:
+    ) -> Float[Array, "samples 1 blocks columns"]:
         """Over a share of each sample, of a kick that builds up evenly."""
         assert within.mean is not None
         by_start = jnp.einsum("jsb,sjbc->sbc", within.mean.transition[1], at_start)
-        return (by_start + share / 2 * kicks[:, 1]) * moving
+        return ((by_start + share / 2 * kicks[:, 1]) * moving)[:, None]
 
-    seen = [response, mean_speed(propagator, 1.0)[:, None]]
+    seen = [response, mean_speed(propagator, 1.0)]
     if propagator.reading is not None:
         part, share = propagator.reading
-        seen.append(share * mean_speed(part, share)[:, None])
+        share = share[..., None]
+        seen.append(share[:, None] * mean_speed(part, share))
     seen = jnp.concatenate(seen, 1)
     report = partial(_reported_samples_first, motor, tape)
     return jax.vmap(report, in_axes=-1, out_axes=-1)(seen)

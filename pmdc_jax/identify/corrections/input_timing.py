@@ -24,12 +24,14 @@ from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import normal_matrix
-from .reading_time import MARGIN, lead_by_currents
+from .reading_time import MARGIN, samples_ahead
 from .speed_averaging import seems_averaged, with_averaging, without_averaging, without_ends
 from .uneven_sampling import with_even_clock
 
 # Accuracy, in samples, with which a lead is searched
 LEAD_TOLERANCE = 3e-3
+# Least distance from a sample, in samples, of a voltage that acts between two
+MIN_DISTANCE = 0.02
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
 MIN_LEAD = 0.3
 
@@ -38,7 +40,7 @@ class Timing(NamedTuple):
     """When the voltages of a recording act, if they are not held from their sample to the next."""
 
     lead: float  # by how many samples they act before the sample beside which they were recorded, at least -1
-    straight: bool  # linear from sample to sample instead of held
+    straight: bool = False  # linear from sample to sample instead of held
     load: bool = False  # whether the recorded loads have the same timing
 
     @property
@@ -65,7 +67,7 @@ class Timing(NamedTuple):
         return "acts one sample later than it was recorded"
 
 
-STRAIGHT, LATE, EARLY = Timing(0, True), Timing(1, False), Timing(-1, False)
+STRAIGHT, LATE, EARLY = Timing(0, straight=True), Timing(1), Timing(-1)
 
 
 def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
@@ -81,9 +83,7 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
     plausible = []
     if abs(lead) > MIN_LEAD or hidden:
         plausible = [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
-    part = lead_by_currents(given, fit)
-    if part is not None:
-        plausible.append(_with_best_lead(given, fit, Timing(part, False)))
+    plausible += _between_samples(given, fit)
 
     @cache
     def unlikelihood(timing: Timing) -> float:
@@ -99,18 +99,19 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
     return [t if t.reading else min(t, t._replace(load=True), key=unlikelihood) for t in likelier]
 
 
-def _with_best_lead(given: Prepared, fit: Fit, timing: Timing) -> Timing:
-    """The timing with the lead, between the same two samples, that fits best."""
+def _between_samples(given: Prepared, fit: Fit) -> list[Timing]:
+    """The timing between two samples that fits best, if the voltages act there."""
+    ahead = samples_ahead(given, fit)
+    if ahead is None:
+        return []
 
     def misfit(reading: float) -> float:
-        other = with_timing(given, timing._replace(lead=timing.ahead + reading))
-        return polish(other.problem, fit.optimum).fitness
+        return polish(with_timing(given, Timing(ahead + reading)).problem, fit.optimum).fitness
 
-    bounds = (MARGIN, 1 - MARGIN)
-    best = minimize_scalar(
-        misfit, bounds=bounds, method="bounded", options={"xatol": LEAD_TOLERANCE}
-    )
-    return timing._replace(lead=timing.ahead + float(best.x))
+    tolerance = {"xatol": LEAD_TOLERANCE}
+    best = minimize_scalar(misfit, bounds=(MARGIN, 1 - MARGIN), method="bounded", options=tolerance)
+    reading = float(best.x)
+    return [Timing(ahead + reading)] if MIN_DISTANCE < reading < 1 - MIN_DISTANCE else []
 
 
 def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:

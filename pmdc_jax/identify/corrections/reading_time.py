@@ -3,7 +3,7 @@ it was recorded: a control loop that applies a voltage, waits, and then reads it
 synchronised with the supply.
 
 The electrical equation shows it, whatever torque acts: from one sample to the next, the current then depends on two
-voltages instead of one. How much on each tells the instant, which is then fitted together with the motor.
+voltages instead of one. The instant is then fitted together with the motor.
 """
 
 from __future__ import annotations
@@ -20,21 +20,18 @@ from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem, evaluate
 
-# Least lead that counts, in samples, and how many standard errors from zero its voltage must be
-MIN_LEAD, MIN_Z = 0.02, 10.0
-# Share of the squared residuals of the electrical equation that this voltage must explain
-MIN_EXPLAINED = 0.05
+# How many standard errors from zero the coefficient of the second voltage must be, and the share of the squared
+# residuals of the electrical equation that it must explain
+MIN_Z, MIN_EXPLAINED = 10.0, 0.05
 # ... and the largest effect of the one on the other side, relative to it: a noisy voltage seems to have both
 MAX_OTHER_SIDE = 0.3
-# Range of the decay of the current over a sample by which the lead is computed
-DECAYS = (1e-3, 0.999)
 # Refits to the fitted instant, the change of it, in samples, by which the outputs are differentiated, and its least
 # distance from a sample
 REFITS, DIFFERENCE, MARGIN = 4, 1e-4, 0.005
 
 # Columns of the electrical equation: the current, both speeds, the voltage of the sample before, of this and of the
 # next one, a constant, the direction of the current
-DECAY, BEFORE, NOW, AFTER, COLUMNS = 0, 3, 4, 5, 8
+BEFORE, NOW, AFTER, COLUMNS = 3, 4, 5, 8
 
 
 class _Equation(NamedTuple):
@@ -60,12 +57,10 @@ class _Equation(NamedTuple):
         return coefficients / size, errors, float(np.mean(np.square(left)))
 
 
-def lead_by_currents(given: Prepared, fit: Fit) -> float | None:
-    """By how many samples, between -1 and 1, the voltages act before the outputs beside which they were recorded; None
-    if they act at a sample, as far as the currents tell.
-
-    With the decay d of the current over a sample, of which a share s comes after a voltage has changed, this voltage
-    contributes 1 - d^s of 1 - d, and the one before it the rest.
+def samples_ahead(given: Prepared, fit: Fit) -> int | None:
+    """By how many whole samples at least the voltages act before the one beside which they were recorded: 0 if they
+    begin to act between the sample before and their own, -1 if between their own and the next; None if they act at a
+    sample, as far as the currents tell.
 
     **Arguments**: `fit`, to these runs, with voltages that are held from their samples on.
     """
@@ -80,12 +75,7 @@ def lead_by_currents(given: Prepared, fit: Fit) -> float | None:
     one_sided = abs(gains[other]) < MAX_OTHER_SIDE * gains[own]
     if not (clear and one_sided and left < (1 - MIN_EXPLAINED) * without):
         return None
-    late, early = (AFTER, NOW) if own == AFTER else (NOW, BEFORE)
-    decay = float(np.clip(coefficients[DECAY], *DECAYS))
-    share = np.clip(gains[late] / (gains[late] + gains[early]), 0.0, 1.0)
-    since = np.log(max(1 - share * (1 - decay), 1e-12)) / np.log(decay)
-    lead = float(np.clip(since, MARGIN, 1 - MARGIN)) - (own == BEFORE)
-    return lead if abs(lead) > MIN_LEAD else None
+    return 0 if own == AFTER else -1
 
 
 def _electrical_equation(given: Prepared, fit: Fit) -> _Equation | None:
