@@ -8,7 +8,7 @@ from typing import NamedTuple
 import attrs
 import numpy as np
 
-from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction
+from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction, InputDeadZone
 from ..identify.generalised_least_squares import (
     last_fit,
     residuals_of,
@@ -28,6 +28,8 @@ from .response import Path, path_of
 
 # Largest number of effects in a set
 MAX_EFFECTS = 3
+# Least relative standard deviation of voltages that differ in size
+MIN_VOLTAGE_SPREAD = 0.05
 # A model is exact if its residuals are a smaller share of what was measured, as root mean squares
 EXACT_MISFIT = 1e-4
 
@@ -47,10 +49,10 @@ class Model:
 
     @property
     def is_possible(self) -> bool:
-        """Whether it can be simulated, its effects are physical, and each periodic torque completes a period."""
+        """Whether it can be simulated, its effects are physical, and the runs show a periodic torque or a dead zone."""
         simulated = np.isfinite(self.fit.fitness)
         physical = all(effect.is_possible() for effect in self.motor.effects)
-        return bool(simulated) and physical and self._completes_periods
+        return bool(simulated) and physical and self._completes_periods and self._leaves_dead_zone
 
     @property
     def _completes_periods(self) -> bool:
@@ -60,6 +62,22 @@ class Model:
         """
         periods = [effect.repeats_after().get("angle", 0.0) for effect in self.motor.effects]
         return not any(periods) or bool(max(periods) <= self.travel)
+
+    @property
+    def _leaves_dead_zone(self) -> bool:
+        """Whether the voltages beyond the dead zone, if there is one, differ in size.
+
+        To a supply that is only switched on and off it would be another gain, and what it then explains is noise of the
+        recorded voltage where that is zero.
+        """
+        width = sum(float(e.width_V) for e in self.motor.effects if isinstance(e, InputDeadZone))
+        tape = self.given.problem.tape
+        driven = [k for k in self.training if tape.drive_of(k).voltage]
+        if not width or not driven:
+            return True
+        voltage = np.abs(np.asarray(tape.value)[np.isin(np.asarray(tape.run), driven)])
+        beyond = voltage[voltage > width]
+        return bool(len(beyond) and np.std(beyond) > MIN_VOLTAGE_SPREAD * np.mean(beyond))
 
     @property
     def travel(self) -> float:

@@ -154,7 +154,7 @@ def respond(
         part, share = propagator.reading
         response = (
             jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start)
-            + share[:, None, :, None] * kicks
+            + jnp.asarray(share)[:, None, :, None] * kicks
         )
         response = response.at[:, 1].multiply(moving)
     if propagator.mean is None:
@@ -171,7 +171,7 @@ def respond(
     seen = [response, mean_speed(propagator, 1.0)]
     if propagator.reading is not None:
         part, share = propagator.reading
-        share = share[..., None]
+        share = jnp.asarray(share)[..., None]
         seen.append(share[:, None] * mean_speed(part, share))
     seen = jnp.concatenate(seen, 1)
     report = partial(_reported_samples_first, motor, tape)

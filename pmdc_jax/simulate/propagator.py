@@ -207,7 +207,7 @@ def grid_propagators(motor: Motor, tape: Tape) -> Propagator:
         options = (tape.rise is not None, tape.averaging is not None)
 
         def instant(share: Scalars) -> Instant:
-            share = share * jnp.ones_like(motor.R)
+            share = jnp.asarray(share) * jnp.ones_like(motor.R)
             return Instant(make_propagator(motor, share * sample / steps, drive, *options), share)
 
         propagator = make_propagator(motor, sample / steps, drive, *options)

@@ -27,7 +27,9 @@ MIN_Z, MIN_EXPLAINED = 10.0, 0.05
 MAX_OTHER_SIDE = 0.3
 # Refits to the fitted instant, the change of it, in samples, by which the outputs are differentiated, and its least
 # distance from a sample
-REFITS, DIFFERENCE, MARGIN = 4, 1e-4, 0.005
+MAX_REFITS, DIFFERENCE, MARGIN = 12, 1e-4, 0.005
+# Refits end when the instant moved by less than this in the last two, in samples
+TOLERANCE = 2e-4
 
 # Columns of the electrical equation: the current, both speeds, the voltage of the sample before, of this and of the
 # next one, a constant, the direction of the current
@@ -91,7 +93,7 @@ def _electrical_equation(given: Prepared, fit: Fit) -> _Equation | None:
             return np.stack([tape.samples_of(k, signal[:, c], len(run)) for c in range(2)], 1)
 
         measured, simulated = of_run(np.asarray(tape.measured)), of_run(seen)
-        known = (of_run(np.asarray(tape.weight)) > 0).all(1)
+        known = np.all(of_run(np.asarray(tape.weight)) > 0, axis=1)
         voltage = np.asarray(tape.samples_of(k, tape.value, len(run)))
         both = known[1:-1] & known[2:]
         direction = np.sign(simulated[1:-1, 0] + simulated[2:, 0])
@@ -110,13 +112,19 @@ def _is_usable(run: Recording) -> bool:
 def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the instant of reading fitted, as a nuisance parameter, and the fit to them; both unchanged where
     the outputs are read at the samples."""
-    if given.problem.tape.reading is None:
+    reading = given.problem.tape.reading
+    if reading is None:
         return given, fit
-    for _ in range(REFITS):
+    instants = [float(reading)]
+    for _ in range(MAX_REFITS):
         change = _change_by_reading(given.problem, fit)
         given = given._replace(problem=replace(given.problem, nuisance=change[..., None]))
         fit = polish(given.problem, fit.optimum)
-        given = _moved(given, fit, change)
+        instants.append(_better_instant(given.problem, fit, change))
+        given = _read_at(given, instants[-1])
+        # every other refit moves the parameters instead, along a valley
+        if np.ptp(instants[-3:]) < TOLERANCE and len(instants) > 2:
+            break
     return given, polish(given.problem, fit.optimum)
 
 
@@ -124,19 +132,23 @@ def _change_by_reading(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 sam
     """Derivative of the outputs, A and rad/s, by the instant of reading, in samples; zero at the first two samples of a
     run, where the initial state can make up for it."""
     tape = problem.tape
-    assert tape.reading is not None
-    later = replace(problem, tape=replace(tape, reading=tape.reading + DIFFERENCE))
+    later = replace(problem, tape=replace(tape, reading=jnp.asarray(tape.reading) + DIFFERENCE))
     change = (evaluate(later, fit.unknowns).seen - fit.evaluation.seen) / DIFFERENCE
     return change.at[jnp.asarray(tape.begins), :, :2].set(0.0)
 
 
-def _moved(given: Prepared, fit: Fit, change: Float[Array, "blocks 2 samples"]) -> Prepared:
-    """The runs read when their residuals say. The parameters do not respond: their derivatives are orthogonal."""
-    problem, tape = given.problem, given.problem.tape
+def _better_instant(problem: Problem, fit: Fit, change: Float[Array, "blocks 2 samples"]) -> float:
+    """When the residuals of a fit say that the outputs were read. Its parameters do not respond, because their
+    derivatives are orthogonal to the `change`."""
+    tape = problem.tape
     scale = tape.weight / fit.noise[:, None] * problem.fitted_blocks[:, None, None]
     left, column = (tape.measured - fit.evaluation.seen) * scale, change * scale
-    by = jnp.sum(left * column) / jnp.sum(column**2)
-    reading = jnp.clip(tape.reading + by, MARGIN, 1 - MARGIN)
+    later = float(jnp.sum(left * column) / jnp.sum(column**2))
+    return float(np.clip(float(jnp.asarray(tape.reading)) + later, MARGIN, 1 - MARGIN))
+
+
+def _read_at(given: Prepared, reading: float) -> Prepared:
+    """The runs with the outputs read after this share of a sample."""
     assert given.timing is not None
-    timing = given.timing._replace(lead=given.timing.ahead + float(reading))
-    return given.with_tape(reading=reading)._replace(timing=timing)
+    timing = given.timing._replace(lead=given.timing.ahead + reading)
+    return given.with_tape(reading=jnp.asarray(reading))._replace(timing=timing)
