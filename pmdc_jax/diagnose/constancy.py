@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from ..identify.by_run import FitByRun, errors_by_run, fit_by_run
 from ..identify.identification import Estimate
+from ..identify.likelihood import negative_log_likelihood
 from ..identify.parameters import unit_of
 from ..identify.polish import fit_run_unknowns, squares_of_runs
 from ..identify.results import run_fits
@@ -78,6 +79,7 @@ def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | Non
         min(1.0, len(variations) * float(np.exp(best.log_p))),
         alternatives,
         {run.name: fits[run.name] for run in given.training},
+        negative_log_likelihood(given, fit),
     )
 
 

@@ -76,6 +76,7 @@ class VaryingParameter:
     p_value: float  # of the data if it were the same in all runs
     also_possible: tuple[str, ...]  # parameters whose variation would explain the runs as well
     fit: Mapping[str, RunFit]  # of every training run, simulated with its own value
+    unlikelihood: float  # negative logarithm of the likelihood of these, up to a constant
 
 
 @frozen

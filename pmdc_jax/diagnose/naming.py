@@ -109,7 +109,22 @@ class StepwiseSelection:
         # even if little is left: what backlash leaves is small beside what a large effect explains
         if found.p_value < FALSE_ALARM:
             others += self._with_refit_only_forms(current, found, set(current.effects))
-        return self._naming(self._better(current, found, others) or current)
+        return self._without_compensation(
+            self._naming(self._better(current, found, others) or current)
+        )
+
+    def _without_compensation(self, named: Naming) -> Naming:
+        """The naming without effects if they only compensate for a parameter that differs from run to run: with a value
+        for each run, the motor without them explains the runs as well."""
+        if named.varies is None or not named.chosen.effects:
+            return named
+        plain = self._naming(self.base)
+        if plain.varies is None:
+            return named
+        gain = plain.varies.unlikelihood - named.varies.unlikelihood
+        more = len(named.chosen.fit.coordinates) - len(self.base.fit.coordinates)
+        limit = more * np.log(self.base.given.problem.most_samples) + BIC_MARGIN
+        return named if 2 * gain > limit else plain
 
     def _step(self, current: Model, found: Assessment) -> Model | None:
         """The next model: the first accepted result of the ways to add or replace an effect; None if there is none."""

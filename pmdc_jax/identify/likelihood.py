@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from .by_run import FitByRun
 from .generalised_least_squares import series_of, training_indices
 from .noise_model import Series, whitener
 from .polish import Fit
@@ -13,7 +14,7 @@ from .prepare import Prepared
 MIN_LOG_LIKELIHOOD_GAIN = 30.0
 
 
-def negative_log_likelihood(given: Prepared, fit: Fit) -> float:
+def negative_log_likelihood(given: Prepared, fit: Fit | FitByRun) -> float:
     """Negative log-likelihood of the training runs as recorded, up to a constant.
 
     Of Gaussian innovations: the one-step prediction errors of an autoregressive model of the residuals.
