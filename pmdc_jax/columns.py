@@ -259,7 +259,9 @@ def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column
         return _column(header, quantity, unit or _unit_in_header(header, quantity))
     except UnitError as error:
         example = f"--column {name}={header}:{QUANTITIES[quantity].units[0]}"
-        raise InputError(option, str(error), f"Write for example {example}") from None
+        counts = f", or {name}={header}:rev/2000 for 2000 counts per turn"
+        mend = f"Write for example {example}{counts if quantity == 'angle' else ''}"
+        raise InputError(option, str(error), mend) from None
 
 
 def _unit_in_header(header: str, quantity: str) -> str | None:

@@ -53,13 +53,16 @@ class UnitError(ValueError):
 def conversion(unit: str, quantity: str, bases: Sequence[str]) -> tuple[str, float, float]:
     """The conversion of a unit to SI.
 
-    **Arguments**: `unit`, as found in a header; `quantity`, for the message; `bases`, the SI units allowed, in order of
-    preference.
+    **Arguments**: `unit`, as found in a header, or a fraction of one, such as rev/2000 for counts of an encoder;
+    `quantity`, for the message; `bases`, the SI units allowed, in order of preference.
 
     **Returns**: the SI unit, scale and offset: SI value = scale * number + offset.
 
     **Raises**: `UnitError` if `unit` is unknown or converts to none of `bases`.
     """
+    if fraction := re.fullmatch(r"(.*\w)\s*/\s*(\d+(?:\.\d+)?)", unit):
+        base, scale, offset = conversion(fraction[1], quantity, bases)
+        return base, scale / float(fraction[2]), offset
     unknown = True
     for spelling in _spellings(unit):
         for base in bases:

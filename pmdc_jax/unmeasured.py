@@ -1,5 +1,5 @@
-"""Samples that are no measurements: single-sample spikes, for example from a lost telegram, and values clipped at the
-end of the measuring range."""
+"""Samples that are no measurements: single-sample spikes, for example from a lost telegram, values clipped at the end
+of the measuring range, and values that a sensor repeated when it had failed."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from .differences import noise_by_differences
 from .recording import MAX_MISSING, Finding, Recording, place_of_sample
 
+RANGE = "If the values are real, sample faster and with a larger measuring range"
 # Least height of a spike over the median absolute second difference of the signal ...
 SPIKE_RATIO = 50.0
 # ... and over the range of the signal (from its 2 % to its 98 % quantile)
@@ -22,12 +23,17 @@ MAX_STEP_ASIDE = 0.2
 MAX_STEP_OF_DRIVE = 0.2
 # If more than this share of all samples look like spikes, they are taken for the signal
 MAX_SPIKES = 0.01
-# Probability at which a run of equal extreme values is still taken for chance
+# Probability at which a run of equal values is still taken for chance
 CHANCE_OF_STAY = 1e-9
+# Least number of equal values from a failed sensor, and the least jump after them, over the noise; at zero, where a
+# sensor may truly rest, before and after them, over the range of the signal
+MIN_FROZEN, MIN_JUMP, MIN_JUMP_AT_ZERO = 20, 10.0, 0.05
+# Largest share of neighbouring values that are equal elsewhere: a counted speed often stays at one value
+MAX_REPEATS = 0.02
 
 
 def without_unmeasured(run: Recording) -> Recording:
-    """The run with the spikes and the clipped samples of its outputs set to NaN, and a note on each."""
+    """The run with the spikes, the clipped and the frozen samples of its outputs set to NaN, and a note on each."""
     outputs = ("speed", "current") if run.drive == "voltage" else ("speed",)
     for name in outputs:
         signal = getattr(run, name)
@@ -35,20 +41,25 @@ def without_unmeasured(run: Recording) -> Recording:
             continue
         spikes = _spikes(signal) & _drive_is_steady(run)
         if 0 < spikes.sum() <= MAX_SPIKES * len(run):
-            run = _with_missing_samples(run, name, spikes, "has a single-sample spike")
+            run = _with_missing_samples(run, name, spikes, "has a single-sample spike", RANGE)
         signal = getattr(run, name)
         ends = [extreme for extreme, *_ in clipped_extremes(signal)]
         clipped = np.isin(signal, ends)
         missing = np.mean(clipped | np.isnan(signal))
         if ends and missing <= MAX_MISSING:
-            run = _with_missing_samples(run, name, clipped, "looks clipped")
+            run = _with_missing_samples(run, name, clipped, "looks clipped", RANGE)
+        frozen = _frozen(getattr(run, name))
+        if frozen.any():
+            run = _with_missing_samples(
+                run, name, frozen, "stays", "Check the sensor and its cable"
+            )
     return run
 
 
 def _with_missing_samples(
-    run: Recording, name: str, lost: Bool[np.ndarray, " samples"], how: str
+    run: Recording, name: str, lost: Bool[np.ndarray, " samples"], how: str, mend: str
 ) -> Recording:
-    """The run with the `lost` samples of an output set to NaN, and a note that says `how` they were recognised."""
+    """The run with the `lost` samples of an output set to NaN, and a note: `how` they were recognised, and a remedy."""
     signal, rows = getattr(run, name), np.flatnonzero(lost)
     others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
     note = Finding(
@@ -57,7 +68,7 @@ def _with_missing_samples(
         "note",
         f"it {how} at {signal[rows[0]]:.6g}: treated as missing",
         f"{place_of_sample(run, rows[0])}{others}",
-        "If the values are real, sample faster and with a larger measuring range",
+        mend,
     )
     missing = np.where(lost, np.nan, signal)
     return attrs.evolve(run, notes=(*run.notes, note), **{name: missing})
@@ -110,7 +121,8 @@ def _longest_stay_at(values: np.ndarray, extreme: float) -> tuple[int, int, floa
         return 0, 0, np.inf
     starts, ends = starts[later], ends[later]
     longest = int(np.argmax(ends - starts))
-    inner = values[(values != extreme) & np.isfinite(values)]
+    ends_of_range = (np.nanmin(values), np.nanmax(values))
+    inner = values[~np.isin(values, ends_of_range) & np.isfinite(values)]
     repeats = (np.count_nonzero(np.diff(inner) == 0) + 1) / len(inner)
     expected = 1 + np.log(CHANCE_OF_STAY / len(values)) / np.log(min(repeats, 0.999))
     # a speed in encoder counts stays at one value whenever the motor turns steadily
@@ -120,6 +132,36 @@ def _longest_stay_at(values: np.ndarray, extreme: float) -> tuple[int, int, floa
         int(ends[longest] - starts[longest]),
         max(float(expected), elsewhere, 5.0),
     )
+
+
+def _frozen(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
+    """Where a noisy signal that otherwise hardly repeats a value stays at one for long, and then leaps back to what it
+    should be. The first of these values may be measured."""
+    frozen = np.zeros(len(values), bool)
+    if not _is_noisy(values):
+        return frozen
+    ends = np.flatnonzero(np.diff(values, append=np.nan) != 0)
+    starts = np.append(0, ends[:-1] + 1)
+    long = ends - starts >= MIN_FROZEN
+    others = values[~_covered(starts[long], ends[long], len(values)) & np.isfinite(values)]
+    if not long.any() or np.mean(np.diff(others) == 0) > MAX_REPEATS:
+        return frozen
+    noise = noise_by_differences(3, others)
+    for start, end in zip(starts[long], ends[long], strict=True):
+        if start == 0 or end + 1 == len(values):
+            continue
+        before, after = np.abs(values[[start - 1, end + 1]] - values[start])
+        leaps = after > MIN_JUMP * noise
+        if values[start] == 0:
+            leaps = min(before, after) > MIN_JUMP_AT_ZERO * np.ptp(others)
+        frozen[start + 1 : end + 1] = leaps
+    return frozen
+
+
+def _covered(starts: np.ndarray, ends: np.ndarray, length: int) -> Bool[np.ndarray, " samples"]:
+    """Which of so many samples lie between a start and an end."""
+    begins = np.bincount(starts, minlength=length + 1)
+    return np.cumsum(begins - np.bincount(ends + 1, minlength=length + 1))[:length] > 0
 
 
 def _second_longest_stay(values: Float[np.ndarray, " samples"]) -> int:

@@ -215,7 +215,16 @@ def test_a_second_line_may_hold_the_units(tmp_path, units):
     assert run.notes == ()
 
 
-@pytest.mark.parametrize("form", ["%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f", "parquet"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        "%Y-%m-%dT%H:%M:%S.%f",
+        "%Y-%m-%d %H:%M:%S.%f",
+        "%d.%m.%Y %H:%M:%S.%f",
+        "%H:%M:%S.%f",
+        "parquet",
+    ],
+)
 def test_dates_become_seconds_since_the_first(tmp_path, form):
     stamps = [datetime(2026, 2, 28, 23, 59, 59, 950_000) + timedelta(seconds=t) for t in T]
     if form == "parquet":
@@ -243,6 +252,7 @@ def test_linear_and_rotary_units_together_give_a_warning(tmp_path):
     ("mapping", "scale"),
     [
         ({"speed": "rpm_meas:rpm"}, RPM),
+        ({"speed": "rpm_meas:rpm/10"}, RPM / 10),
         ({"speed": "rpm_meas"}, 1),
         ({"speed": "w:a [rpm]"}, RPM),
         ({"speed": "w:a [rpm]:deg/s"}, DEGREE),
@@ -451,6 +461,15 @@ def test_a_preamble_of_an_instrument_is_skipped(tmp_path, preamble):
     file = tmp_path / "scope.csv"
     file.write_text(f"{preamble}time_s,voltage_V,current_A,speed_rad_s\n{ROWS}")
     run = read_recording(file)
+    assert len(run) == 20
+    assert (run.voltage[1], run.current[1], run.speed[1]) == (13.0, 0.1, 1.0)
+
+
+def test_a_preamble_may_be_followed_by_names_and_units(tmp_path):
+    file = tmp_path / "scope.csv"
+    file.write_text(f"Model,MSO46\n\nTIME,CH1,CH2,CH3\n(s),(V),(A),(rad/s)\n{ROWS}")
+    columns = {"voltage": "CH1", "current": "CH2", "speed": "CH3"}
+    run = read_recording(file, columns)
     assert len(run) == 20
     assert (run.voltage[1], run.current[1], run.speed[1]) == (13.0, 0.1, 1.0)
 

@@ -64,6 +64,44 @@ def test_clipped_samples_become_missing():
     assert "looks clipped" in note.what
 
 
+def test_a_current_clipped_at_both_ends_for_few_samples_at_a_time_becomes_missing():
+    run = good_run(7, "prbs", noise=1e-3)
+    low, high = np.quantile(run.current, [0.02, 0.98])
+    clipped = attrs.evolve(run, current=np.clip(run.current, low, high))
+    cleaned = without_unmeasured(clipped)
+    lost = np.isnan(cleaned.current)
+    np.testing.assert_array_equal(lost, (run.current >= high) | (run.current <= low))
+
+
+def noisy_steps() -> Recording:
+    """Voltage steps, with pauses, recorded by noisy sensors of fine resolution."""
+    rng = np.random.default_rng(5)
+    levels = np.repeat([0.0, 60.0, 110.0, -80.0, 0.0, 95.0, 0.0, 40.0], 300)
+    speed = lfilter([0.05], [1, -0.95], levels) + 0.2 * rng.standard_normal(len(levels))
+    current = levels / 50 + 0.1 * rng.standard_normal(len(levels))
+    return Recording("bench", 1e-3 * np.arange(len(levels)), levels / 5, current, speed)
+
+
+@pytest.mark.parametrize("value", [None, 0.0])
+def test_a_sensor_that_fails_for_a_while_is_told(value):
+    run = noisy_steps()
+    assert without_unmeasured(run) is run
+    speed = run.speed.copy()
+    speed[620:770] = speed[620] if value is None else value
+    cleaned = without_unmeasured(attrs.evolve(run, speed=speed))
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(cleaned.speed)), np.arange(621, 770))
+    (note,) = cleaned.notes
+    assert "stays" in note.what and "sensor" in note.mend
+
+
+def test_a_rotor_that_rests_is_no_failed_sensor():
+    """The sensor reads exactly zero below its threshold, as of most tachometers that count edges."""
+    run = noisy_steps()
+    speed = np.where(np.abs(run.speed) < 2.0, 0.0, run.speed)
+    assert np.count_nonzero(speed == 0) > 500
+    assert without_unmeasured(attrs.evolve(run, speed=speed)).notes == ()
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_quantised_speed_that_dwells_at_its_maximum_is_not_clipped(seed):
     """Steady speeds close to whole counts: the reading dwells at the highest no longer than at the others."""

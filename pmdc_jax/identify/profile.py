@@ -84,5 +84,6 @@ def _point(problem: Problem, unknowns: Unknowns, index: int) -> _Point:
     found = evaluate(problem, unknowns)
     matrix = np.array(normal_matrix(found, problem.tape, problem.fitted_runs))
     gain = gauss_newton_step(matrix, {index}, ridge_of(problem))[1]
-    squares = float(matrix[-1, -1] - gain)
-    return _Point(unknowns, matrix, squares if np.isfinite(squares) else 1e300, gain)
+    simulated = np.isfinite(matrix[-1, -1]) and np.isfinite(gain)
+    squares = float(matrix[-1, -1] - gain) if simulated else 1e300
+    return _Point(unknowns, matrix, squares, gain)

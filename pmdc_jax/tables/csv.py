@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
-from .cells import NUMBERS_ONLY, parse_dates, seconds_since_first, without_thousands_separators
+from .cells import NUMBERS_ONLY, seconds_of_dates, without_thousands_separators
 from .csv_header import find_header, split_fields
 
 if TYPE_CHECKING:
@@ -107,8 +107,10 @@ class CsvTable:
         wrong = (numbers.is_null() & text.is_not_null()).arg_true()
         if not len(wrong):
             return numbers
-        if numbers.null_count() == len(numbers) and (dates := parse_dates(text)) is not None:
-            return seconds_since_first(dates)
+        if numbers.null_count() == len(numbers):
+            seconds = seconds_of_dates(text)
+            if seconds is not None:
+                return seconds
         row = int(wrong[0])
         where = f"{self._path}, {self.place(row)}, column {header}"
         raise InputError(where, f"'{text[row]}' is not a number", NUMBERS_ONLY)

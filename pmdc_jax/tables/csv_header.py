@@ -14,6 +14,7 @@ from .cells import is_number
 from .headers import refuse_duplicates, with_unit
 
 MAX_PREAMBLE_LINES = 200  # before the header
+MAX_PREAMBLE_FIELDS = 2  # a name and a value
 
 
 class Header(NamedTuple):
@@ -96,7 +97,9 @@ def _header_line(raw: bytes, first: _Line) -> _Line:
         alike = [text for text in text_lines if len(split_fields(text.text, separator)) == count]
         # a row of data with a remark is not all numbers, but not a header either
         all_words = [text for text in alike if not _has_number(split_fields(text.text, separator))]
-        return (all_words or alike or [first])[-1]
+        *above, last = all_words or alike or [first]
+        has_names_above = above and above[-1].number == last.number - 1
+        return above[-1] if has_names_above and _may_be_units(last.text, separator) else last
     return first
 
 
@@ -108,6 +111,13 @@ def _find_units(raw: bytes, start: int, separator: str, count: int) -> tuple[lis
         return None, start
     units = [field.strip("()[]") for field in fields]
     return (units, line.end) if any(units) else (None, start)
+
+
+def _may_be_units(line: str, separator: str) -> bool:
+    """Whether a line below the names may hold their units: each in brackets, or more of them than a preamble has."""
+    fields = [field.strip() for field in split_fields(line, separator)]
+    bracketed = all(field[:1] in ("(", "[", "") for field in fields)
+    return bracketed or len(fields) > MAX_PREAMBLE_FIELDS
 
 
 def _lines(raw: bytes, after: _Line | None = None) -> Iterator[_Line]:
