@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import plotly.graph_objects as go
 
 from ..diagnose.diagnosis import (
     Diagnosis,
@@ -14,6 +17,7 @@ from ..diagnose.diagnosis import (
     Region,
 )
 from ..effects import EFFECTS
+from ..identify.identification import RunFit
 from .diagnosis_figures import (
     AXIS_TITLES,
     curve_figure,
@@ -68,7 +72,7 @@ def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
         where=[_region(region) for region in diagnosis.where],
         where_figure=_where_figure(diagnosis),
         gaps=_gaps(diagnosis),
-        gap_figure=figure_json(gap_figure(_gap_by_run(diagnosis))),
+        gap_figure=figure_json(_gap_figure(diagnosis)),
         residuals=_residuals(diagnosis),
         against=_residual_over_variable(diagnosis),
         varies=_varies(diagnosis),
@@ -139,6 +143,27 @@ def _region(region: Region) -> dict[str, str]:
     }
 
 
+def _compared(diagnosis: Diagnosis) -> dict[str, Mapping[str, RunFit]]:
+    """The fits of one or two models, by name: without and with the effects, or with a common value of what differs from
+    run to run and with its own."""
+    if diagnosis.effects:
+        return {"before": diagnosis.base.fit, "after": diagnosis.final.fit}
+    if diagnosis.varies:
+        name = diagnosis.varies.name
+        return {f"common {name}": diagnosis.final.fit, f"{name} by run": diagnosis.varies.fit}
+    return {"error": diagnosis.final.fit}
+
+
+def _gap_figure(diagnosis: Diagnosis) -> go.Figure:
+    gaps = _gap_by_run(diagnosis)
+    before, after = ({run: getattr(g, at) for run, g in gaps.items()} for at in ("before", "after"))
+    errors = [before, after] if diagnosis.effects else [after]
+    if diagnosis.varies and not diagnosis.effects:
+        errors.append({run: g.after for run, g in diagnosis.gap_by_own_value.items()})
+    floors = {run: gap.floor for run, gap in gaps.items()}
+    return gap_figure(dict(zip(_compared(diagnosis), errors, strict=True)), floors)
+
+
 def _gap_by_run(diagnosis: Diagnosis) -> dict[str, Gap]:
     return {run: diagnosis.gap_of_run[run] for run, _ in runs_in_order(diagnosis.final)}
 
@@ -158,14 +183,18 @@ def _gaps(diagnosis: Diagnosis) -> list[dict[str, str]]:
 
 
 def _residuals(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """A figure for each run of its residuals before and after; none if no effect was added."""
-    if not diagnosis.effects:
+    """A figure for each run of its residuals by two models; none if there is only one."""
+    models = _compared(diagnosis)
+    if len(models) < 2:
         return []
-    runs = runs_in_order(diagnosis.final)
+    runs = [name for name, _ in runs_in_order(diagnosis.final)]
     points = points_per_trace((TRACES_OF_RESIDUALS + TRACES_OF_SIMULATION) * len(runs))
     figures = {
-        name: residual_figure(diagnosis.base.fit[name], fit, diagnosis.final.noise, points)
-        for name, fit in runs
+        run: residual_figure(
+            {name: fits[run] for name, fits in models.items()}, diagnosis.final.noise, points
+        )
+        for run in runs
+        if all(run in fits for fits in models.values())
     }
     return [{"run": name, "figure": figure_json(one)} for name, one in figures.items() if one]
 
@@ -175,8 +204,7 @@ def _residual_over_variable(diagnosis: Diagnosis) -> dict[str, Any] | None:
     equation, variable = _clearest_misfit(diagnosis)
     wanted = "current" if equation == "electrical" else "speed"
     for channel in (wanted, "speed", "current"):
-        fits = diagnosis.base.fit, diagnosis.final.fit
-        figure = residual_over_variable_figure(*fits, variable, channel)
+        figure = residual_over_variable_figure(_compared(diagnosis), variable, channel)
         if figure:
             return {
                 "variable": variable,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from ..diagnose.diagnosis import Gap, LearnedCurve, NextExperiment, Region
+from ..diagnose.diagnosis import LearnedCurve, NextExperiment, Region
 from ..identify.identification import RunFit
 from .figures import (
     INK,
@@ -20,6 +21,8 @@ from .figures import (
     mark_noise,
     style,
 )
+
+T = TypeVar("T")
 
 # colours: without the effects, and with them
 BEFORE = RESIDUAL
@@ -70,39 +73,46 @@ def where_figure(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> go.Fi
     return figure
 
 
-def gap_figure(gaps: Mapping[str, Gap]) -> go.Figure:
-    """Bars of the error over the noise before and after adding the effects, and the noise floor, for every run."""
-    runs = list(gaps)
+def _coloured(compared: Mapping[str, T]) -> Iterator[tuple[str, T, str]]:
+    """Name, content and colour of one or two models that are compared; the last is the one that was found."""
+    for (name, content), colour in zip(
+        compared.items(), (BEFORE, AFTER)[-len(compared) :], strict=True
+    ):
+        yield name, content, colour
+
+
+def gap_figure(errors: Mapping[str, Mapping[str, float]], floors: Mapping[str, float]) -> go.Figure:
+    """Bars of the error over the noise of one or two models, by name, and the noise floor, for every run."""
     figure = go.Figure()
-    for name, colour in (("before", BEFORE), ("after", AFTER)):
-        heights = [getattr(gap, name) for gap in gaps.values()]
-        figure.add_trace(go.Bar(x=runs, y=heights, name=name, marker_color=colour))
+    for name, of_run, colour in _coloured(errors):
+        bars = go.Bar(x=[*of_run], y=[*of_run.values()], name=name, marker_color=colour)
+        figure.add_trace(bars)
     floor = go.Scatter(
-        x=runs,
-        y=[gap.floor for gap in gaps.values()],
+        x=[*floors],
+        y=[*floors.values()],
         name="noise floor",
         mode="markers",
         marker={"symbol": "line-ew", "size": 34, "line": {"color": INK, "width": 2}},
     )
     figure.add_trace(floor)
     style(figure, height=340)
-    wide = max(gap.before for gap in gaps.values()) > LOGARITHMIC_FROM
+    wide = max(max(of_run.values()) for of_run in errors.values()) > LOGARITHMIC_FROM
     figure.update_yaxes(title_text="error relative to the noise", type="log" if wide else "linear")
     figure.update_xaxes(type="category")
     return figure
 
 
 def residual_figure(
-    before: RunFit, after: RunFit, noise: Mapping[str, float | None], points: int
+    fits: Mapping[str, RunFit], noise: Mapping[str, float | None], points: int
 ) -> go.Figure | None:
-    """Free-run residuals over time, of the motor without and with the effects; None without any output."""
-    channels = [one for one in RESIDUALS if before.residual(one) is not None]
+    """Free-run residuals over time of two models, by name; None without any output."""
+    channels = [one for one in RESIDUALS if next(iter(fits.values())).residual(one) is not None]
     if not channels:
         return None
     figure = make_subplots(rows=len(channels), cols=1, shared_xaxes=True, vertical_spacing=0.05)
     for row, channel in enumerate(channels, start=1):
         title, column = RESIDUALS[channel]
-        for name, fit, colour in (("before", before, BEFORE), ("after", after, AFTER)):
+        for name, fit, colour in _coloured(fits):
             left = fit.residual(channel)
             if left is None:
                 continue
@@ -120,11 +130,12 @@ def residual_figure(
 
 
 def residual_over_variable_figure(
-    before: Mapping[str, RunFit], after: Mapping[str, RunFit], variable: str, channel: str
+    compared: Mapping[str, Mapping[str, RunFit]], variable: str, channel: str
 ) -> go.Figure | None:
-    """The residual of all runs, averaged over bins of a variable, before and after; None where it is not known."""
+    """The residual of all runs, averaged over bins of a variable, of one or two models, by name; None where it is not
+    known."""
     figure = go.Figure()
-    for name, fits, colour in (("before", before, BEFORE), ("after", after, AFTER)):
+    for name, fits, colour in _coloured(compared):
         averaged = averages(fits, variable, channel)
         if averaged is None:
             return None
