@@ -98,7 +98,9 @@ def diagnose(
     by_role = gaps_by_role(gaps, base.fit)
     if unlike_held_out(by_role):
         verdict = "not_in_library"
-    curves_tell_more = verdict == "not_in_library" or naming.leaves_sensor_error
+    # what differs from run to run would look like some curve
+    tells_curves = verdict == "not_in_library" or naming.leaves_sensor_error
+    tells_curves = tells_curves and naming.varies is None
     seconds = {
         "identify": identified - began,
         "name": named - identified,
@@ -113,7 +115,7 @@ def diagnose(
         gap_of_run=gaps,
         closed_fraction=closed_fraction(by_role) if naming.chosen.effects else None,
         next_experiment=next_experiment(naming, given.training) if verdict == "ambiguous" else None,
-        curves=_learned_curves(naming) if curves_tell_more else (),
+        curves=_learned_curves(naming) if tells_curves else (),
         detectable=_detectable_effects(naming.chosen_screen),
         base=base,
         final=final,

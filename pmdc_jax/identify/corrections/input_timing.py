@@ -8,6 +8,7 @@ voltage is up to a sample late or early, and the inductance, then the resistance
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
@@ -16,6 +17,7 @@ import attrs
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
 from ...recording import Recording
@@ -23,8 +25,8 @@ from ...simulate import Tape, uniform
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
-from ..problem import normal_matrix
-from .reading_time import MARGIN, samples_ahead
+from ..problem import Problem, normal_matrix
+from .reading_time import MARGIN, change_by_reading, samples_ahead
 from .speed_averaging import seems_averaged, with_averaging, without_averaging, without_ends
 from .uneven_sampling import with_even_clock
 
@@ -32,6 +34,8 @@ from .uneven_sampling import with_even_clock
 LEAD_TOLERANCE = 3e-3
 # Least distance from a sample, in samples, of a voltage that acts between two
 MIN_DISTANCE = 0.02
+# Share of the apparent lateness of the voltage, and standard errors, from which it is the current that is late
+MIN_LATE_SHARE, MIN_LATE_ERRORS = 0.3, 5.0
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
 MIN_LEAD = 0.3
 
@@ -110,8 +114,28 @@ def _between_samples(given: Prepared, fit: Fit) -> list[Timing]:
 
     tolerance = {"xatol": LEAD_TOLERANCE}
     best = minimize_scalar(misfit, bounds=(MARGIN, 1 - MARGIN), method="bounded", options=tolerance)
-    reading = float(best.x)
-    return [Timing(ahead + reading)] if MIN_DISTANCE < reading < 1 - MIN_DISTANCE else []
+    timing = Timing(ahead + float(best.x))
+    between = MIN_DISTANCE < best.x < 1 - MIN_DISTANCE
+    return [timing] if between and not _only_current_is_late(given, fit, timing) else []
+
+
+def _only_current_is_late(given: Prepared, fit: Fit, timing: Timing) -> bool:
+    """Whether the current alone was read late, as behind a filter, rather than that the voltage acts later.
+
+    By regression of the residuals with this timing on the change that another lead makes in both outputs, and on that
+    of a later reading in the current.
+    """
+    if timing.ahead >= 0:
+        return False
+    problem = with_timing(given, timing).problem
+    nearer = polish(problem, fit.optimum)
+    current = nearer.evaluation.seen[:, 0]
+    rise = jnp.diff(current.reshape(-1), prepend=0.0).reshape(current.shape)
+    rise = rise.at[jnp.asarray(problem.tape.begins), 0].set(0.0)
+    later = jnp.stack([-rise, jnp.zeros_like(rise)], 1)
+    amplitudes, errors = _amplitudes(problem, nearer, [change_by_reading(problem, nearer), later])
+    least = max(MIN_LATE_SHARE * abs(timing.lead), MIN_LATE_ERRORS * errors[1])
+    return bool(amplitudes[1] > least)
 
 
 def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:
@@ -129,15 +153,31 @@ def _apparent_lead(given: Prepared, fit: Fit) -> float:
     means = with_timing(given, STRAIGHT).problem
     means = replace(means, tape=replace(means.tape, rise=None))
     sooner, evaluation = polish(means, fit.optimum, steps=0).evaluation.seen, fit.evaluation
-    scale = given.problem.tape.weight / fit.noise[:, None]
-    change = (sooner - evaluation.seen) * scale * given.problem.fitted_blocks[:, None, None]
-    matrix = np.asarray(
-        normal_matrix(evaluation._replace(residuals=change), means.tape, means.fitted_runs)
-    )
-    hessian, slope = matrix[:-1, :-1], matrix[:-1, -1]
-    own = matrix[-1, -1] - slope @ np.linalg.pinv(hessian, hermitian=True) @ slope
-    along = -float(jnp.sum(evaluation.residuals * change))
-    return along / own if own > 0 else 0.0
+    (amplitude,), _ = _amplitudes(given.problem, fit, [sooner - evaluation.seen])
+    return float(amplitude)
+
+
+def _amplitudes(
+    problem: Problem, fit: Fit, changes: Sequence[Float[Array, "blocks 2 samples"]]
+) -> tuple[Float[np.ndarray, " changes"], Float[np.ndarray, " changes"]]:
+    """Amplitudes of changes of the outputs, A and rad/s, and their standard errors, by regression of the residuals on
+    what the parameters cannot explain of the changes."""
+    scale = problem.tape.weight / fit.noise[:, None] * problem.fitted_blocks[:, None, None]
+    scaled = [change * scale for change in changes]
+    normal = [
+        np.asarray(
+            normal_matrix(
+                fit.evaluation._replace(residuals=change), problem.tape, problem.fitted_runs
+            )
+        )
+        for change in scaled
+    ]
+    slopes = np.stack([matrix[:-1, -1] for matrix in normal])
+    inverse = np.linalg.pinv(normal[0][:-1, :-1], hermitian=True)
+    products = np.array([[float(jnp.sum(a * b)) for b in scaled] for a in scaled])
+    covariance = np.linalg.pinv(products - slopes @ inverse @ slopes.T, hermitian=True)
+    along = np.array([-float(jnp.sum(fit.evaluation.residuals * change)) for change in scaled])
+    return covariance @ along, np.sqrt(np.diag(covariance))
 
 
 def with_timing(given: Prepared, timing: Timing) -> Prepared:

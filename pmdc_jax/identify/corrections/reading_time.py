@@ -25,6 +25,8 @@ from ..problem import Problem, evaluate
 MIN_Z, MIN_EXPLAINED = 10.0, 0.05
 # ... and the largest effect of the one on the other side, relative to it: a noisy voltage seems to have both
 MAX_OTHER_SIDE = 0.3
+# ... and the largest share of what is left that the further columns of a filtered current may explain
+MAX_BY_FILTER = 0.2
 # Refits to the fitted instant, the change of it, in samples, by which the outputs are differentiated, and its least
 # distance from a sample
 MAX_REFITS, DIFFERENCE, MARGIN = 12, 1e-4, 0.005
@@ -32,12 +34,13 @@ MAX_REFITS, DIFFERENCE, MARGIN = 12, 1e-4, 0.005
 TOLERANCE = 2e-4
 
 # Columns of the electrical equation: the current, both speeds, the voltage of the sample before, of this and of the
-# next one, a constant, the direction of the current
-BEFORE, NOW, AFTER, COLUMNS = 3, 4, 5, 8
+# next one, a constant, the direction of the current; and those of a filtered one: the current and the voltage of one
+# sample further back
+BEFORE, NOW, AFTER, COLUMNS, WITH_FILTER = 3, 4, 5, 8, 10
 
 
 class _Equation(NamedTuple):
-    """The electrical equation from sample to sample: the next current by the `COLUMNS`."""
+    """The electrical equation from sample to sample: the next current by the columns."""
 
     current: Float[np.ndarray, " samples"]
     columns: Float[np.ndarray, "samples columns"]
@@ -77,6 +80,8 @@ def samples_ahead(given: Prepared, fit: Fit) -> int | None:
     one_sided = abs(gains[other]) < MAX_OTHER_SIDE * gains[own]
     if not (clear and one_sided and left < (1 - MIN_EXPLAINED) * without):
         return None
+    if equation.solve(np.arange(WITH_FILTER))[2] < (1 - MAX_BY_FILTER) * left:
+        return None
     return 0 if own == AFTER else -1
 
 
@@ -95,12 +100,14 @@ def _electrical_equation(given: Prepared, fit: Fit) -> _Equation | None:
         measured, simulated = of_run(np.asarray(tape.measured)), of_run(seen)
         known = np.all(of_run(np.asarray(tape.weight)) > 0, axis=1)
         voltage = np.asarray(tape.samples_of(k, tape.value, len(run)))
-        both = known[1:-1] & known[2:]
-        direction = np.sign(simulated[1:-1, 0] + simulated[2:, 0])
-        shared = [voltage[:-2], voltage[1:-1], voltage[2:], np.ones(len(both)), direction]
-        currents.append(measured[2:, 0][both])
+        used = known[1:-2] & known[2:-1] & known[3:]
+        direction = np.sign(simulated[2:-1, 0] + simulated[3:, 0])
+        shared = [voltage[1:-2], voltage[2:-1], voltage[3:], np.ones(len(used)), direction]
+        currents.append(measured[3:, 0][used])
         for rows, x in ((columns, measured), (instruments, simulated)):
-            rows.append(np.stack([x[1:-1, 0], x[1:-1, 1], x[2:, 1], *shared], 1)[both])
+            further = [x[1:-2, 0], voltage[:-3]]
+            row = [x[2:-1, 0], x[2:-1, 1], x[3:, 1], *shared, *further]
+            rows.append(np.stack(row, 1)[used])
     return _Equation(*map(np.concatenate, (currents, columns, instruments)))
 
 
@@ -117,7 +124,7 @@ def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
         return given, fit
     instants = [float(reading)]
     for _ in range(MAX_REFITS):
-        change = _change_by_reading(given.problem, fit)
+        change = change_by_reading(given.problem, fit)
         given = given._replace(problem=replace(given.problem, nuisance=change[..., None]))
         fit = polish(given.problem, fit.optimum)
         instants.append(_better_instant(given.problem, fit, change))
@@ -128,7 +135,7 @@ def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     return given, polish(given.problem, fit.optimum)
 
 
-def _change_by_reading(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
+def change_by_reading(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
     """Derivative of the outputs, A and rad/s, by the instant of reading, in samples; zero at the first two samples of a
     run, where the initial state can make up for it."""
     tape = problem.tape
