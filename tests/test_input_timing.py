@@ -131,8 +131,15 @@ def test_effects_match_an_independent_integrator(x64, name):
     assert largest_error(simulated(run, motor_with(effect)), exact) < tolerance
 
 
-@pytest.mark.parametrize("timing", [{"straight": True}, {"reading": 0.3}])
-@pytest.mark.parametrize("names", [("coulomb_friction",), ("speed_sensor_delay",)])
+@pytest.mark.parametrize(
+    ("names", "timing"),
+    [
+        (("coulomb_friction",), {"straight": True}),
+        (("speed_sensor_delay",), {"straight": True}),
+        (("speed_sensor_delay",), {"reading": 0.3}),
+        pytest.param(("coulomb_friction",), {"reading": 0.3}, marks=pytest.mark.slow),
+    ],
+)
 def test_sensitivities_match_central_differences(x64, names, timing):
     bounds = {n: (x / 2, x * 2) for n, x in TRUE.items()}
     parameters = Parameters.of(bounds, [EFFECTS[name] for name in names])
@@ -223,7 +230,11 @@ def logged(timing: str) -> list[Recording]:
 
 
 @pytest.mark.parametrize(
-    "timing", [pytest.param(k, marks=pytest.mark.slow) if "counted" in k else k for k in MESSAGE_OF]
+    "timing",
+    [
+        pytest.param(k, marks=pytest.mark.slow) if "counted" in k or "early" in k else k
+        for k in MESSAGE_OF
+    ],
 )
 def test_the_timing_of_a_voltage_is_found(timing):
     """Taken for held from their samples on, these voltages would bias L by up to 60 % and R by 5 %."""
