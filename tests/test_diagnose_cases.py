@@ -366,10 +366,10 @@ def test_an_eccentric_weight_behind_a_gear_is_not_in_the_library():
 @pytest.mark.parametrize(
     ("name", "factor", "friction"),
     [
-        ("R", 1.1, 0.08),
+        ("Kb", 0.97, 0.0),
+        pytest.param("R", 1.1, 0.08, marks=pytest.mark.slow),
         pytest.param("J", 1.6, 0.0, marks=pytest.mark.slow),
         pytest.param("f", 1.5, 0.0, marks=pytest.mark.slow),
-        pytest.param("Kb", 0.97, 0.0, marks=pytest.mark.slow),
     ],
 )
 def test_a_parameter_that_differs_in_one_run_is_told(name, factor, friction):
