@@ -229,12 +229,14 @@ def logged(timing: str) -> list[Recording]:
     return runs
 
 
+def slow(case: str) -> object:
+    """A case that runs with the slow tests only."""
+    return pytest.param(case, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     "timing",
-    [
-        pytest.param(k, marks=pytest.mark.slow) if "counted" in k or "early" in k else k
-        for k in MESSAGE_OF
-    ],
+    [k if k in ("held", "acts late", "held, read after 3 tenths") else slow(k) for k in MESSAGE_OF],
 )
 def test_the_timing_of_a_voltage_is_found(timing):
     """Taken for held from their samples on, these voltages would bias L by up to 60 % and R by 5 %."""
