@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import attrs
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from .differences import noise_by_differences
 from .recording import MAX_MISSING, Finding, Recording, place_of_sample
@@ -140,10 +140,9 @@ def _frozen(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples
     frozen = np.zeros(len(values), bool)
     if not _is_noisy(values):
         return frozen
-    ends = np.flatnonzero(np.diff(values, append=np.nan) != 0)
-    starts = np.append(0, ends[:-1] + 1)
+    starts, ends = _stays(values)
     long = ends - starts >= MIN_FROZEN
-    others = values[~_covered(starts[long], ends[long], len(values)) & np.isfinite(values)]
+    others = values[~np.repeat(long, ends - starts + 1) & np.isfinite(values)]
     if not long.any() or np.mean(np.diff(others) == 0) > MAX_REPEATS:
         return frozen
     noise = noise_by_differences(3, others)
@@ -158,14 +157,16 @@ def _frozen(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples
     return frozen
 
 
-def _covered(starts: np.ndarray, ends: np.ndarray, length: int) -> Bool[np.ndarray, " samples"]:
-    """Which of so many samples lie between a start and an end."""
-    begins = np.bincount(starts, minlength=length + 1)
-    return np.cumsum(begins - np.bincount(ends + 1, minlength=length + 1))[:length] > 0
-
-
 def _second_longest_stay(values: Float[np.ndarray, " samples"]) -> int:
     """Length of the second longest stay of a signal at one value."""
+    starts, ends = _stays(values)
+    lengths = np.sort(ends - starts + 1)
+    return int(lengths[-2]) if len(lengths) > 1 else 0
+
+
+def _stays(
+    values: Float[np.ndarray, " samples"],
+) -> tuple[Int[np.ndarray, " stays"], Int[np.ndarray, " stays"]]:
+    """First and last sample of each stay of a signal at one value; one after the other they make up the signal."""
     ends = np.flatnonzero(np.diff(values, append=np.nan) != 0)
-    stays = np.sort(np.diff(ends, prepend=-1))
-    return int(stays[-2]) if len(stays) > 1 else 0
+    return np.append(0, ends[:-1] + 1), ends

@@ -386,7 +386,7 @@ def test_a_parameter_that_differs_in_one_run_is_told(name, factor, friction):
     for run, one in found.varies.by_run.items():
         truth = (changed if run == "apart" else PAPER)[name]
         assert one.value == pytest.approx(truth, abs=4 * one.stderr)
-        assert one.stderr < 0.02 * truth
+        assert one.stderr < 0.01 * truth
     gap = found.gap_by_own_value["apart"]
     assert gap.before > 2.5
     assert gap.after == pytest.approx(1.0, abs=0.05)

@@ -221,9 +221,8 @@ def logged(timing: str) -> list[Recording]:
             measured[:, 1] = np.diff(angle, prepend=angle[0])[:-1] / STEP
         if timing == "acts late":
             v, measured, load = run.voltage[1:], outputs[:-1], run.load[:-1]
-        if (
-            "early" in timing
-        ):  # the next voltage acts 3 tenths of a sample after the outputs were read
+        # the next voltage acts 3 tenths of a sample after the outputs were read
+        if "early" in timing:
             v = run.voltage[1:]
         runs.append(Recording(run.name, run.time[:-1], v, *measured.T, load=load))
     return runs

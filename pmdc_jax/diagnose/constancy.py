@@ -68,8 +68,10 @@ def varying_parameter(model: Model, found: Assessment) -> VaryingParameter | Non
     if not {best.name, *alternatives} <= PARAMETERS.keys():
         return None
     fit = _fit(model, best)
-    by_run = {} if fit is None else _estimates_by_run(model, best, fit)
-    if fit is None or len(by_run) < 2:
+    if fit is None:
+        return None
+    by_run = _estimates_by_run(model, best, fit)
+    if len(by_run) < 2:
         return None
     given, simulated = model.given, np.asarray(fit.evaluation.seen)
     fits = run_fits(given.runs, given.roles, given.problem.tape, simulated, fit.runs)

@@ -52,7 +52,7 @@ class Model:
         """Whether it can be simulated, its effects are physical, and the runs show a periodic torque or a dead zone."""
         simulated = np.isfinite(self.fit.fitness)
         physical = all(effect.is_possible() for effect in self.motor.effects)
-        return bool(simulated) and physical and self._completes_periods and self._leaves_dead_zone
+        return bool(simulated) and physical and self._completes_periods and self._shows_dead_zone
 
     @property
     def _completes_periods(self) -> bool:
@@ -64,7 +64,7 @@ class Model:
         return not any(periods) or bool(max(periods) <= self.travel)
 
     @property
-    def _leaves_dead_zone(self) -> bool:
+    def _shows_dead_zone(self) -> bool:
         """Whether the voltages beyond the dead zone, if there is one, differ in size.
 
         To a supply that is only switched on and off it would be another gain, and what it then explains is noise of the

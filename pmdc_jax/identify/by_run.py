@@ -10,7 +10,15 @@ import numpy as np
 from jaxtyping import Float
 
 from ..simulate import UNKNOWNS_PER_RUN, RunUnknowns
-from .polish import RIDGE, gauss_newton_step, residual_noise, ridge_of, scaled, select_blocks
+from .polish import (
+    RIDGE,
+    gauss_newton_step,
+    residual_noise,
+    ridge_of,
+    scaled,
+    select_blocks,
+    squares_of_outputs,
+)
 from .problem import Evaluation, Problem, Unknowns, evaluate, normal_matrix
 from .uncertainty import information
 
@@ -97,7 +105,7 @@ def _with_own_columns(problem: Problem, fit: FitByRun, k: int) -> Evaluation:
     """The evaluation, each output weighted by its own residuals, with a column for coordinate `k` of each run after
     those of the coordinates; that of the common one is zero."""
     count, tape = fit.coordinates.shape[1], problem.tape
-    _, stretch = residual_noise(problem, _squares(problem, fit))
+    _, stretch = residual_noise(problem, squares_of_outputs(problem, fit.evaluation))
     weighted = scaled(fit.evaluation, stretch)
     shared, unknowns = jnp.split(weighted.jacobian, [count], axis=-1)
     of_run = jnp.asarray(tape.run)[:, None] == jnp.arange(tape.runs)
@@ -108,11 +116,5 @@ def _with_own_columns(problem: Problem, fit: FitByRun, k: int) -> Evaluation:
 
 def _cost(problem: Problem, fit: FitByRun) -> float:
     """What maximum likelihood minimises: the sum of the logarithms of the outputs' noise."""
-    noise, _ = residual_noise(problem, _squares(problem, fit))
+    noise, _ = residual_noise(problem, squares_of_outputs(problem, fit.evaluation))
     return float(np.log(noise).sum())
-
-
-def _squares(problem: Problem, fit: FitByRun) -> Float[np.ndarray, "2"]:
-    """Sum of squared residuals of each output in the training runs."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.square(np.asarray(fit.evaluation.residuals)[problem.fitted_blocks]).sum((0, 2))

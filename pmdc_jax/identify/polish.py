@@ -158,7 +158,7 @@ def _evaluate_weighted(
 ) -> _WeightedPoint:
     evaluation = evaluate(problem, unknowns) if known is None else known
     with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
-        squares = np.square(np.asarray(evaluation.residuals)[problem.fitted_blocks]).sum((0, 2))
+        squares = squares_of_outputs(problem, evaluation)
         noise, stretch = residual_noise(problem, squares)
         weighted = scaled(evaluation, stretch)
         matrix = np.array(normal_matrix(weighted, problem.tape, problem.fitted_runs))
@@ -231,6 +231,12 @@ def squares_of_runs(problem: Problem, evaluation: Evaluation) -> Float[np.ndarra
         of_block = np.square(np.asarray(evaluation.residuals)).sum((1, 2))
     sound = np.nan_to_num(of_block, nan=np.inf)
     return np.bincount(np.asarray(problem.tape.run), sound, problem.tape.runs)
+
+
+def squares_of_outputs(problem: Problem, evaluation: Evaluation) -> Float[np.ndarray, "2"]:
+    """Sum of squared residuals of each output in the training runs."""
+    with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
+        return np.square(np.asarray(evaluation.residuals)[problem.fitted_blocks]).sum((0, 2))
 
 
 def fit_run_unknowns(

@@ -17,6 +17,7 @@ from ..motor import Motor
 from ..threads import CORES, map_in_threads
 from .exponential import Matrix, product
 from .propagator import Propagator, grid_propagators, pick_grid, steps_in_sample
+from .sensing import at_instant
 from .solver import Carry, Input, StepSolver, held_step_and_mean, take_steps
 from .tape import BLOCK, Samples, Tape
 
@@ -112,8 +113,7 @@ def _when_read(
     """The state when the outputs of a sample are read, from that at its start."""
     if propagator.reading is None:
         return state
-    part, share = propagator.reading
-    return held_step_and_mean(motors, part, acting.part(share / 2, share), state, steps)[0]
+    return at_instant(motors, propagator.reading, acting, state, steps)[0]
 
 
 # State of the motors, and their squared errors of current and speed so far

@@ -13,6 +13,18 @@ from .solver import Input, held_step_and_mean
 from .tape import BLOCK, Tape
 
 
+def at_instant(
+    motor: Motor,
+    instant: Instant,
+    acting: Input,
+    state: State,
+    steps: int | Int[Array, ""] = 1,
+) -> tuple[State, State | None]:
+    """The state at an instant within a sample, and its mean up to there, from the state at the start of the sample."""
+    within = acting.part(instant.share / 2, instant.share)
+    return held_step_and_mean(motor, instant.propagator, within, state, steps)
+
+
 def outputs(
     motor: Motor,
     propagator: Propagator,
@@ -28,19 +40,14 @@ def outputs(
     speed from this sample to the next, that of the `mean` state. With averaging and a speed that is seen within a
     sample: also the part of this mean that comes from before that instant.
     """
-
-    def at(instant: Instant) -> tuple[State, State | None]:
-        within = acting.part(instant.share / 2, instant.share)
-        return held_step_and_mean(motor, instant.propagator, within, state, steps)
-
     reading, speed_seen, part_mean = propagator.reading, propagator.speed_seen, None
     if reading is None:
         seen = [*motor.sensors(state)]
     else:
-        there, part_mean = at(reading)
+        there, part_mean = at_instant(motor, reading, acting, state, steps)
         seen = [*motor.sensors(there)]
     if speed_seen is not None:
-        there, part_mean = at(speed_seen)
+        there, part_mean = at_instant(motor, speed_seen, acting, state, steps)
         seen.append(motor.sensors(there)[1])
     if mean is not None:
         seen.append(motor.sensors(mean)[1])

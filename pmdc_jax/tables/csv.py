@@ -107,10 +107,9 @@ class CsvTable:
         wrong = (numbers.is_null() & text.is_not_null()).arg_true()
         if not len(wrong):
             return numbers
-        if numbers.null_count() == len(numbers):
-            seconds = seconds_of_dates(text)
-            if seconds is not None:
-                return seconds
+        is_empty = numbers.null_count() == len(numbers)
+        if is_empty and (seconds := seconds_of_dates(text)) is not None:
+            return seconds
         row = int(wrong[0])
         where = f"{self._path}, {self.place(row)}, column {header}"
         raise InputError(where, f"'{text[row]}' is not a number", NUMBERS_ONLY)
