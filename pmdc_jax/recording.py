@@ -45,27 +45,27 @@ class Finding:
 
 
 class Averaging(NamedTuple):
-    """A recorded speed that is a mean over the neighbouring sample intervals, as a difference of angles is.
+    """A recorded signal that is a mean over the neighbouring sample intervals, as a difference of angles is.
 
     **Fields**: `last` and `next`, the weights of the means over the previous and over the following interval; the rest
-    of the weight is that of the instantaneous speed.
+    of the weight is that of the instantaneous signal.
     """
 
     last: float
     next: float
 
-    def with_ends_missing(self, speed: np.ndarray) -> np.ndarray:
-        """`speed`, NaN at the ends whose averaging interval lies outside the record."""
-        known = speed.copy()
+    def with_ends_missing(self, signal: np.ndarray) -> np.ndarray:
+        """`signal`, NaN at the ends whose averaging interval lies outside the record."""
+        known = signal.copy()
         known[: 1 if self.last else 0] = np.nan
         known[len(known) - 1 if self.next else len(known) :] = np.nan
         return known
 
-    def applied_to(self, speed: np.ndarray) -> np.ndarray:
-        """The recorded speed for an instantaneous speed, (samples, ...), that is linear between samples."""
-        means = (speed[:-1] + speed[1:]) / 2
-        last, coming = np.concatenate([speed[:1], means]), np.concatenate([means, speed[-1:]])
-        return (1 - self.last - self.next) * speed + self.last * last + self.next * coming
+    def applied_to(self, signal: np.ndarray) -> np.ndarray:
+        """What is recorded of a signal, (samples, ...), that is linear between samples."""
+        means = (signal[:-1] + signal[1:]) / 2
+        last, coming = np.concatenate([signal[:1], means]), np.concatenate([means, signal[-1:]])
+        return (1 - self.last - self.next) * signal + self.last * last + self.next * coming
 
 
 OVER_LAST, OVER_BOTH = Averaging(1.0, 0.0), Averaging(0.5, 0.5)
@@ -86,7 +86,8 @@ class Recording:
     the same shape, and are None where not recorded: `voltage` V, `current` A, `speed` rad/s, `load` N m, `angle` rad,
     `temperature` degrees C, `torque` N m. `held`, whether the rotor was locked; `source`, the file; `ignored`, headers
     not used; `notes`, assumptions made while reading; `resampled_from`, the original record if this one was resampled
-    to an even clock, else None; `averaging`, the averaging of the speed, None for an instantaneous speed.
+    to an even clock, else None; `averaging`, the averaging of the speed, None for an instantaneous speed;
+    `current_averaged`, whether the current is a mean over the last sample interval.
 
     **Raises**: `InputError` if no recorded quantity drives the motor, or the arrays are faulty (see `faults`).
     """
@@ -106,6 +107,7 @@ class Recording:
     notes: tuple[Finding, ...] = field(default=(), kw_only=True)
     resampled_from: Recording | None = field(default=None, kw_only=True)
     averaging: Averaging | None = field(default=None, kw_only=True)
+    current_averaged: bool = field(default=False, kw_only=True)
 
     def __attrs_post_init__(self) -> None:
         # the original of a resampled record has already been checked

@@ -94,7 +94,9 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     """The residuals of the electrical equation in a run; None if they are too few or a signal was not recorded."""
     given, tape = model.given, model.given.problem.tape
     drive, known, residuals = tape.drive_of(run), residual.known, residual.values
-    if residual.kind[1] != (0, 1) or not drive.voltage or known.sum() < MIN_SAMPLES:
+    recorded = given.runs[run]
+    both = residual.kind[1] == (0, 1) and not recorded.current_averaged
+    if not both or not drive.voltage or known.sum() < MIN_SAMPLES:
         return None
     measured = series_of(tape, run, np.asarray(tape.measured)).values
     simulated = measured - residuals

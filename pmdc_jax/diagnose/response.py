@@ -160,19 +160,19 @@ def respond(
     if propagator.mean is None:
         return response
 
-    def mean_speed(
+    def mean(
         within: Propagator, share: Scalars | float
-    ) -> Float[Array, "samples 1 blocks columns"]:
+    ) -> Float[Array, "samples 2 blocks columns"]:
         """Over a share of each sample, of a kick that builds up evenly."""
         assert within.mean is not None
-        by_start = jnp.einsum("jsb,sjbc->sbc", within.mean.transition[1], at_start)
-        return ((by_start + share / 2 * kicks[:, 1]) * moving)[:, None]
+        by_start = jnp.einsum("ijsb,sjbc->sibc", within.mean.transition, at_start)
+        return (by_start + share / 2 * kicks).at[:, 1].multiply(moving)
 
-    seen = [response, mean_speed(propagator, 1.0)]
+    seen = [response, mean(propagator, 1.0)]
     if propagator.reading is not None:
         part, share = propagator.reading
-        share = jnp.asarray(share)[..., None]
-        seen.append(share[:, None] * mean_speed(part, share))
+        share = jnp.asarray(share)[:, None, :, None]
+        seen.append((share * mean(part, share))[:, 1:])
     seen = jnp.concatenate(seen, 1)
     report = partial(_reported_samples_first, motor, tape)
     return jax.vmap(report, in_axes=-1, out_axes=-1)(seen)

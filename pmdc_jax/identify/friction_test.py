@@ -17,6 +17,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter, ss2tf
 
 from ..motor import Motor
+from ..recording import OVER_LAST
 from ..simulate import UNKNOWNS_PER_RUN, Tape
 from .generalised_least_squares import residuals_of, series_of, training_indices
 from .identification import Identification
@@ -103,6 +104,8 @@ def _regression_columns(given: Prepared, fit: Fit) -> list[Series]:
         friction = _load_response(filters[tape.grid_of(run)], np.sign(speed))
         if (averaging := given.runs[run].averaging) is not None:
             friction[:, 1] = averaging.applied_to(friction[:, 1])
+        if given.runs[run].current_averaged:
+            friction[:, 0] = OVER_LAST.applied_to(friction[:, 0])
         friction = friction[:, list(outputs)]
         derivatives = series_of(tape, run, J).values
         columns = (derivatives[..., :count], friction, derivatives[..., count:], residual.values)

@@ -50,6 +50,7 @@ class Fit(NamedTuple):
     optimum: Optimum
     evaluation: Evaluation
     noise: Float[np.ndarray, "2"]  # standard deviations of current A and speed rad/s
+    cost: float  # what the polish minimises (see `_WeightedPoint`)
 
     @property
     def unknowns(self) -> Unknowns:
@@ -117,7 +118,7 @@ def polish(
         costs.append(min(trial.cost, best.cost))
     distance = float(np.sqrt(gain / _residual_variance(problem, best)))
     optimum = Optimum(best.unknowns, best.fitness, tuple(sorted(held)), distance)
-    return Fit(optimum, best.evaluation, best.noise)
+    return Fit(optimum, best.evaluation, best.noise, best.cost)
 
 
 def _damped_log_step(parameters: Parameters, step: np.ndarray) -> np.ndarray:
@@ -278,11 +279,8 @@ def with_holdout_unknowns(problem: Problem, fit: Fit) -> Fit:
     runs = _select_runs(problem.fitted_runs, fit.unknowns.runs, unknowns.runs)
     optimum = fit.optimum._replace(unknowns=unknowns._replace(runs=runs))
     weighted = scaled(evaluation, np.asarray(problem.noise) / fit.noise)
-    return Fit(
-        optimum,
-        select_blocks(jnp.asarray(problem.fitted_blocks), fit.evaluation, weighted),
-        fit.noise,
-    )
+    fitted = jnp.asarray(problem.fitted_blocks)
+    return fit._replace(optimum=optimum, evaluation=select_blocks(fitted, fit.evaluation, weighted))
 
 
 def scaled(evaluation: Evaluation, stretch: Float[np.ndarray, "2"]) -> Evaluation:

@@ -63,6 +63,11 @@ class Prepared(NamedTuple):
         """The share of each sample after which its outputs are read, if not at its start."""
         return None if self.timing is None else self.timing.reading
 
+    @property
+    def current_mean(self) -> bool:
+        """Whether the recorded currents are means over the last sample."""
+        return self.timing is not None and self.timing.current_mean
+
     def with_tape(self, **fields: Array | None) -> Prepared:
         """The same runs with some fields of the tape replaced."""
         tape = replace(self.problem.tape, **fields)

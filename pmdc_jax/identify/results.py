@@ -306,6 +306,8 @@ def _messages(given: Prepared, solved: Solved, Kt_set_to_Kb: bool) -> tuple[str,
     acts = "steps between samples" if given.stepped else given.timing and given.timing.what
     if acts:
         messages.append(f"the voltage {acts}: this is modelled")
+    if given.current_mean:
+        messages.append("the current is a mean over the last sample interval: this is modelled")
     if given.averaging:
         messages.append(
             f"the speed is a mean over {AVERAGING_SPANS[given.averaging]}, as differences of an angle are:"

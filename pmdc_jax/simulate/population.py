@@ -69,38 +69,45 @@ def _errors(motors: Motor, tape: Tape, share: Int[Array | np.ndarray, ""], share
     return _errors_with_effects(motors, tape) if motors.effects else _errors_of_linear(motors, tape)
 
 
-def _means_at_sample_start(tape: Tape) -> tuple[Samples, Samples, Bool[Array, " blocks"] | None]:
-    """Measurements and weights, with mean speeds over the last sample moved to where that sample begins; and which
-    blocks have such speeds, None if no speed of the tape is a mean.
+def _means_at_sample_start(
+    tape: Tape,
+) -> tuple[Samples, Samples, Bool[Array, "blocks 2"] | None]:
+    """Measurements and weights, with means over the last sample moved to where that sample begins; and which currents
+    and speeds of the blocks are such means, None if nothing of the tape is a mean.
 
     A mean over the last sample and the next is centred already, and stays.
     """
     if tape.averaging is None:
         return tape.measured, tape.weight, None
-    over_last = (jnp.asarray(tape.averaging)[:, 0] == 1)[tape.run]
+    over_last = (jnp.asarray(tape.averaging)[:, (2, 0)] == 1)[tape.run]
     # the mean from the last sample of a run on was not recorded
     last_of_run = jnp.append(jnp.asarray(tape.begins)[1:], True)
 
     def moved(signal: Samples) -> Float[Array, "blocks 2 samples"]:
         signal = jnp.asarray(signal)
-        speed = signal[:, 1].reshape(-1)
-        sooner = jnp.append(speed[1:], 0.0).reshape(signal[:, 1].shape)
-        sooner = sooner.at[:, -1].multiply(jnp.where(last_of_run, 0.0, 1.0))
-        return signal.at[:, 1].set(jnp.where(over_last[:, None], sooner, signal[:, 1]))
+        next_block = jnp.where(last_of_run[:, None], 0.0, jnp.roll(signal[..., 0], -1, axis=0))
+        sooner = jnp.concatenate([signal[..., 1:], next_block[..., None]], -1)
+        return jnp.where(over_last[..., None], sooner, signal)
 
     return moved(tape.measured), moved(tape.weight), over_last
 
 
-def _sensed_speed(
-    speed: Scalars,
-    mean: Scalars | None,
-    over_last: Bool[Array, " blocks"] | None,
+def _seen(
+    motors: Motor,
+    state: State,
+    mean: State | None,
+    over_last: Bool[Array, "blocks 2"] | None,
     block: Int[Array, ""],
-) -> Scalars:
-    """The speed at a sample, or, in blocks that report means, the mean from there to the next sample."""
+) -> tuple[Scalars, Scalars]:
+    """Current and speed at a sample, or, in blocks that report means, the means from there to the next sample."""
+    outputs = motors.sensors(state)
     if mean is None or over_last is None:
-        return speed
-    return jnp.where(over_last[block], mean, speed)
+        return outputs
+    current, speed = (
+        jnp.where(over_last[block, c], *both)
+        for c, both in enumerate(zip(motors.sensors(mean), outputs, strict=True))
+    )
+    return current, speed
 
 
 def _when_read(
@@ -200,7 +207,7 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
             acting = Input(drive, value, load)
             after, mean = held_step_and_mean(motors, propagator, acting, state)
             read = _when_read(motors, propagator, acting, state)
-            seen = (read.current, _sensed_speed(read.speed, mean and mean.speed, over_last, block))
+            seen = _seen(motors, read, mean, over_last, block)
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
@@ -268,9 +275,8 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
                 weight = (weight[0], jnp.where(inside, speed_weights[late], 0.0))
             acting = Input(drive, value, load)
             after, mean = held_step_and_mean(motors, propagator, acting, state, steps)
-            current, speed = motors.sensors(_when_read(motors, propagator, acting, state, steps))
-            mean_speed = mean and motors.sensors(mean)[1]
-            seen = (current, _sensed_speed(speed, mean_speed, over_last, block))
+            read = _when_read(motors, propagator, acting, state, steps)
+            seen = _seen(motors, read, mean, over_last, block)
             errors = tuple(
                 e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )

@@ -154,8 +154,10 @@ def _step(
     if motor.switches:
         corrected = _correct_dry_elements(motor, weights, acting, state, rate, corrected)
     if mean is not None:
-        correction = mean_correction(state.speed, after.speed, corrected.speed)
-        mean = mean._replace(speed=mean.speed + correction)
+        mean = mean._replace(
+            current=mean.current + mean_correction(state.current, after.current, corrected.current),
+            speed=mean.speed + mean_correction(state.speed, after.speed, corrected.speed),
+        )
     return corrected, mean
 
 

@@ -155,12 +155,12 @@ def stick_or_reverse(
 
 
 def mean_correction(before: Scalars, uncorrected: Scalars, corrected: Scalars) -> Scalars:
-    """Change of the mean speed over a step due to the correction of its end.
+    """Change of the mean speed, or current, over a step due to the correction of its end.
 
-    The change grows linearly from the instant at which the speed reaches zero, or from the middle of the step where
-    something else switches.
+    The change grows linearly from the instant at which it reaches zero, or from the middle of the step where something
+    else switches.
 
-    **Arguments**: the speed at the start of the step, and at its end without and with the correction.
+    **Arguments**: the value at the start of the step, and at its end without and with the correction.
     """
     crosses = before * uncorrected <= 0
     fall = jnp.where(crosses & (before != 0), before - uncorrected, 1.0)

@@ -58,8 +58,9 @@ class Tape(eqx.Module):
     longest: float = eqx.field(static=True)
     # change of the drive over each sample; None if all drives are held
     rise: Float[Samples, "blocks samples"] | None = None
-    # shares in the reported speed of its mean over the last sample and over the next; None if no speed is a mean
-    averaging: Float[Samples, "runs 2"] | None = None
+    # shares in the reported speed of its means over the last sample and over the next, and in the reported current of
+    # its mean over the last sample, which is not combined with a `reading`; None if nothing is a mean
+    averaging: Float[Samples, "runs 3"] | None = None
     # share of each sample, between 0 and 1, after which its outputs are read; None if they are read at its start
     reading: Float[Samples, ""] | None = None
 
@@ -83,7 +84,7 @@ class Tape(eqx.Module):
         """
         runs = [_Run(recording, straight) for recording in recordings]
         rises = straight or any(recording.resampled_from is not None for recording in recordings)
-        averaged = any(recording.averaging is not None for recording in recordings)
+        averaged = any(r.averaging is not None or r.current_averaged for r in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
         sample_times, drives, free = (np.array(each) for each in zip(*grids, strict=True))
         empty_runs = _power_of_two(len(runs)) - len(runs)
@@ -100,7 +101,7 @@ class Tape(eqx.Module):
                 free=np.where(free, 1.0, 0.0),
             ),
             initial=of_runs(run.initial for run in runs),
-            averaging=of_runs(r.averaging or (0.0, 0.0) for r in recordings) if averaged else None,
+            averaging=of_runs(map(_averaging_shares, recordings)) if averaged else None,
             load_unknown=of_runs(
                 r.load is None and not unloaded and not r.held for r in recordings
             ),
@@ -193,6 +194,8 @@ class _Run:
         drive = recording.drive
         if drive == "voltage" and recording.current is not None:
             self.current = recording.current
+            if recording.current_averaged:
+                self.current = OVER_LAST.with_ends_missing(self.current)
         value = getattr(recording, drive)
         linear = straight or varies_linearly(recording)
         if recording.resampled_from is not None:
@@ -259,6 +262,10 @@ def _laid_in_blocks(
         "begins": begins,
         "grid": of_grid,
     }
+
+
+def _averaging_shares(recording: Recording) -> tuple[float, float, float]:
+    return (*(recording.averaging or (0.0, 0.0)), float(recording.current_averaged))
 
 
 def _first(samples: np.ndarray | None) -> float:

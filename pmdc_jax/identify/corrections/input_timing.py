@@ -1,9 +1,11 @@
-"""When a recorded voltage acts: held from its sample to the next, which is the default, or otherwise.
+"""When a recorded voltage acts: held from its sample to the next, which is the default, or otherwise; and whether the
+currents beside it are means over the last sample.
 
 An amplifier that follows a signal, and most simulation tools (`lsim`, interpolated tables), connect the recorded
 voltages by straight lines; a loop that applies a voltage, waits and then records everything writes it a sample late; a
 command computed by a controller often acts a sample after it was recorded. Treated as held from its sample on, such a
 voltage is up to a sample late or early, and the inductance, then the resistance and the friction, compensate for it.
+So they do for currents that a sensor or a recorder averages from sample to sample.
 """
 
 from __future__ import annotations
@@ -22,12 +24,20 @@ from scipy.optimize import minimize_scalar
 
 from ...recording import Recording
 from ...simulate import Tape, uniform
+from ..generalised_least_squares import training_indices
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
+from ..noise import noise_of_sensor
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
 from .reading_time import MARGIN, change_by_reading, samples_ahead
-from .speed_averaging import seems_averaged, with_averaging, without_averaging, without_ends
+from .speed_averaging import (
+    refitted,
+    seems_averaged,
+    with_averaging,
+    without_averaging,
+    without_ends,
+)
 from .uneven_sampling import with_even_clock
 
 # Accuracy, in samples, with which a lead is searched
@@ -36,16 +46,21 @@ LEAD_TOLERANCE = 3e-3
 MIN_DISTANCE = 0.02
 # Share of the apparent lateness of the voltage, and standard errors, from which it is the current that is late
 MIN_LATE_SHARE, MIN_LATE_ERRORS = 0.3, 5.0
+# The current settles from one sample to the next if that is this many time constants; and the largest residuals, over
+# their white noise, that another timing may leave then
+MIN_TIME_CONSTANTS, MAX_RATIO_LEFT = 1.0, 1.3
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
 MIN_LEAD = 0.3
 
 
 class Timing(NamedTuple):
-    """When the voltages of a recording act, if they are not held from their sample to the next."""
+    """When the voltages of a recording act, if they are not held from their sample to the next, and how its currents
+    were read."""
 
     lead: float  # by how many samples they act before the sample beside which they were recorded, at least -1
     straight: bool = False  # linear from sample to sample instead of held
     load: bool = False  # whether the recorded loads have the same timing
+    current_mean: bool = False  # whether the recorded currents are means over the last sample
 
     @property
     def ahead(self) -> int:
@@ -59,8 +74,10 @@ class Timing(NamedTuple):
         return self.lead - self.ahead or None
 
     @property
-    def what(self) -> str:
-        """What the voltages do, in words."""
+    def what(self) -> str | None:
+        """What the voltages do, in words, if they are not held from their sample on."""
+        if self.lead == 0 and not self.straight:
+            return None
         if self.straight:
             return "is linear between samples instead of held"
         if self.reading is not None:
@@ -71,7 +88,7 @@ class Timing(NamedTuple):
         return "acts one sample later than it was recorded"
 
 
-STRAIGHT, LATE, EARLY = Timing(0, straight=True), Timing(1), Timing(-1)
+HELD, STRAIGHT, LATE, EARLY = Timing(0), Timing(0, straight=True), Timing(1), Timing(-1)
 
 
 def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
@@ -81,36 +98,52 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
     """
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
         return []  # without a current, or without a speed, only a delay would show
-    lead = _apparent_lead(given, fit)
-    # a speed that is a mean over the last sample is half a sample late, too, and may hide the shift
-    hidden = given.averaging is None and seems_averaged(given)
-    plausible = []
-    if abs(lead) > MIN_LEAD or hidden:
-        plausible = [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
-    plausible += _between_samples(given, fit)
 
     @cache
-    def unlikelihood(timing: Timing) -> float:
+    def fitted(timing: Timing) -> tuple[Prepared, Fit]:
         other = without_averaging(with_timing(given, timing))
-        nearer = polish(other.problem, fit.optimum)
         # only a fit with the right timing can tell a mean over the last sample from a delay
-        return negative_log_likelihood_within(*with_averaging(*with_even_clock(other, nearer)))
+        return with_averaging(*with_even_clock(*refitted(other, fit)))
 
+    def unlikelihood(timing: Timing) -> float:
+        return negative_log_likelihood_within(*fitted(timing))
+
+    plausible = _at_samples(given, fit)
+    ahead = samples_ahead(given, fit)
+    if ahead is not None:
+        # the current depends on two voltages: one acts between samples, or the current is a mean
+        means = [Timing(lead, current_mean=True) for lead in ((0, -1) if ahead < 0 else (1,))]
+        plausible += [*_between_samples(given, fit, ahead), *means]
+    elif _settles(given, fit):
+        means = [Timing(t.lead, current_mean=True) for t in (HELD, *plausible) if not t.straight]
+        hidden = [*_between_samples(given, fit, -1), *means]
+        plausible += [timing for timing in hidden if _explains_all(*fitted(timing))]
     limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
     likelier = [timing for timing in plausible if unlikelihood(timing) < limit]
+    # where everything is a mean, voltages on straight lines are as good, and simpler
+    simpler = [timing for timing in likelier if not timing.current_mean]
+    limit = min(map(unlikelihood, simpler), default=np.inf) - MIN_LOG_LIKELIHOOD_GAIN
+    likelier = simpler + [t for t in likelier if t.current_mean and unlikelihood(t) < limit]
     if all(run.load is None for run in given.training):
         return likelier
     return [t if t.reading else min(t, t._replace(load=True), key=unlikelihood) for t in likelier]
 
 
-def _between_samples(given: Prepared, fit: Fit) -> list[Timing]:
-    """The timing between two samples that fits best, if the voltages act there."""
-    ahead = samples_ahead(given, fit)
-    if ahead is None:
+def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
+    """The timings without an instant between samples that the residuals make plausible."""
+    lead = _apparent_lead(given, fit)
+    # a speed that is a mean over the last sample is half a sample late, too, and may hide the shift
+    hidden = given.averaging is None and seems_averaged(given)
+    if abs(lead) <= MIN_LEAD and not hidden:
         return []
+    return [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
+
+
+def _between_samples(given: Prepared, fit: Fit, ahead: int) -> list[Timing]:
+    """The instant that fits best, if the voltages act between two samples, at least so many ahead."""
 
     def misfit(reading: float) -> float:
-        return polish(with_timing(given, Timing(ahead + reading)).problem, fit.optimum).fitness
+        return refitted(with_timing(given, Timing(ahead + reading)), fit)[1].cost
 
     tolerance = {"xatol": LEAD_TOLERANCE}
     best = minimize_scalar(misfit, bounds=(MARGIN, 1 - MARGIN), method="bounded", options=tolerance)
@@ -127,8 +160,8 @@ def _only_current_is_late(given: Prepared, fit: Fit, timing: Timing) -> bool:
     """
     if timing.ahead >= 0:
         return False
-    problem = with_timing(given, timing).problem
-    nearer = polish(problem, fit.optimum)
+    runs, nearer = refitted(with_timing(given, timing), fit)
+    problem = runs.problem
     current = nearer.evaluation.seen[:, 0]
     rise = jnp.diff(current.reshape(-1), prepend=0.0).reshape(current.shape)
     rise = rise.at[jnp.asarray(problem.tape.begins), 0].set(0.0)
@@ -136,6 +169,30 @@ def _only_current_is_late(given: Prepared, fit: Fit, timing: Timing) -> bool:
     amplitudes, errors = _amplitudes(problem, nearer, [change_by_reading(problem, nearer), later])
     least = max(MIN_LATE_SHARE * abs(timing.lead), MIN_LATE_ERRORS * errors[1])
     return bool(amplitudes[1] > least)
+
+
+def _settles(given: Prepared, fit: Fit) -> bool:
+    """Whether the current settles from one sample to the next. Then it looks the same whenever within the sample before
+    the voltage began to act, if the inductance is chosen to match; only the torque comes too soon."""
+    motor, tape = given.problem.parameters(fit.coordinates), given.problem.tape
+    shortest = min(tape.sample_time_of(k) for k in training_indices(given))
+    return float(motor.R / motor.L) * shortest > MIN_TIME_CONSTANTS
+
+
+def _explains_all(given: Prepared, fit: Fit) -> bool:
+    """Whether a fit leaves nothing but the white noise of the sensors."""
+    tape = given.problem.tape
+    left = np.where(tape.weight > 0, tape.measured - fit.evaluation.seen, np.nan)
+    for c in range(2):
+        squares = []
+        for k in training_indices(given):
+            length = len(given.runs[k])
+            residual = tape.samples_of(k, left[:, c], length)
+            noise = noise_of_sensor(tape.samples_of(k, tape.measured[:, c], length), residual)
+            squares.append(np.square(residual / noise) if noise else np.zeros(1))
+        if np.sqrt(np.nanmean(np.concatenate(squares))) > MAX_RATIO_LEFT:
+            return False
+    return True
 
 
 def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:
@@ -183,14 +240,17 @@ def _amplitudes(
 def with_timing(given: Prepared, timing: Timing) -> Prepared:
     """The runs with voltages of this timing."""
     tape = given.problem.tape
-    runs = [uniform(_retimed(run, k, tape, timing)) for k, run in enumerate(given.runs)]
+    runs = [
+        attrs.evolve(uniform(_retimed(run, k, tape, timing)), current_averaged=timing.current_mean)
+        for k, run in enumerate(given.runs)
+    ]
     driven = Tape.from_recordings(runs, straight=timing.straight, reading=timing.reading)
-    names = ("value", "load", "rise", "reading")
+    names = ("value", "load", "rise", "reading", "averaging")
     tape = replace(tape, **jax.tree.map(jnp.asarray, {n: getattr(driven, n) for n in names}))
     problem = replace(given.problem, tape=tape)
     acting = given._replace(runs=runs, problem=problem, timing=timing)
     # what acts during the first sample was not recorded: without outputs there, the initial state makes up for it
-    return without_ends(acting) if timing.ahead < 0 else acting
+    return without_ends(acting) if timing.ahead < 0 or timing.current_mean else acting
 
 
 def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:

@@ -67,15 +67,16 @@ def with_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     if mean is None:
         return given, fit
     inner = without_ends(given, SPEED)
-    averaged, better = _fit_to(_with_speeds_averaged(inner, mean), fit)
+    averaged, better = refitted(_with_speeds_averaged(inner, mean), fit)
     left = negative_log_likelihood(averaged, better)
     if not negative_log_likelihood(inner, fit) - left > min_gain:
         return given, fit
     if not counted:
         # a mean over the last and the next sample has no lag: a speed that fits better a sample earlier, or as a mean
         # over the last sample, is merely late
-        last = negative_log_likelihood(*_fit_to(_with_speeds_averaged(inner, OVER_LAST), fit))
-        if last < left or _fit_to(_shifted_earlier(inner), fit)[1].fitness < fit.fitness:
+        last = negative_log_likelihood(*refitted(_with_speeds_averaged(inner, OVER_LAST), fit))
+        other = better if mean == OVER_LAST else fit
+        if last < left or refitted(_shifted_earlier(inner), fit)[1].cost < other.cost:
             return given, fit
     return averaged, better
 
@@ -120,32 +121,34 @@ def _shifted_earlier(given: Prepared) -> Prepared:
     return given.with_tape(measured=jnp.asarray(laid.measured), weight=weight)
 
 
-def _fit_to(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
-    """The runs, and the fit to them that starts from `fit`, or from there with a smaller inductance: a large one may
-    have compensated half a sample of delay."""
+def refitted(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+    """The runs, and the best fit to them that starts from `fit`, or from there with a smaller inductance: a large one
+    may have compensated part of a sample of delay."""
     parameters, unknowns = given.problem.parameters, fit.unknowns
     starts = [fit.optimum]
-    if "L" in parameters.names and given.averaging == OVER_LAST:
+    if "L" in parameters.names and (given.averaging == OVER_LAST or given.current_mean):
         L = parameters.names.index("L")
         less = jnp.maximum(unknowns.coordinates[L] - L_REDUCTION, parameters.lower[L])
         coordinates = unknowns.coordinates.at[L].set(less)
         starts.append(fit.optimum._replace(unknowns=unknowns._replace(coordinates=coordinates)))
     ends = [polish(given.problem, start) for start in starts]
-    return given, min(ends, key=lambda end: end.fitness)
+    return given, min(ends, key=lambda end: end.cost)
 
 
 def _averaging_by_noise(given: Prepared) -> tuple[Averaging | None, float, bool]:
     """The mean that the noise of the speeds suggests, None if none; the gain in log-likelihood that it must bring, as
     in `averaging_of_counts`; and whether the speeds are counts.
 
-    A mean over the last sample can be told from a delay only if the speed is counted, and from an inductance only if
-    the current was measured.
+    A mean over the last sample can be told from a delay only if the speed is counted, or where the current is such a
+    mean, and from an inductance only if the current was measured.
     """
     speeds = _speeds(given)
     counts = _in_counts(speeds)
     mean, min_gain = (
         averaging_of_counts(counts) if counts else averaging_of_differences([s for s, _ in speeds])
     )
+    if mean is None and speeds and not counts and given.current_mean:
+        mean = OVER_LAST
     if mean == OVER_LAST and not given.problem.samples[0] > 0:
         mean = None
     return mean, min_gain, bool(counts)

@@ -158,7 +158,9 @@ def _responses(
         at_sample = expm(A * step * np.clip(share, 0.0, 1.0)) @ B[:, 0] * step * height
         responses[at:, :, k] = after[: length - at] @ at_sample
     if tape.averaging is not None:
-        responses[:, 1] = Averaging(*np.asarray(tape.averaging)[run]).applied_to(responses[:, 1])
+        last, coming, of_current = np.asarray(tape.averaging)[run]
+        responses[:, 0] = Averaging(of_current, 0.0).applied_to(responses[:, 0])
+        responses[:, 1] = Averaging(last, coming).applied_to(responses[:, 1])
     return np.moveaxis(responses.reshape(length // BLOCK, BLOCK, 2, len(steps.at)), 1, 2)
 
 
