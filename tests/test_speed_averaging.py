@@ -54,8 +54,8 @@ def recorded(kind: str) -> list[Recording]:
 
 
 MEAN_OVER = {
-    "counts of two samples": "the last and the next sample",
-    "counts of the last sample": "the last sample",
+    "counts of two samples": "the last and the next sample interval",
+    "counts of the last sample": "the last sample interval",
     "tachometer": None,
     "rounded": None,
     "angle alone": None,  # differentiated by the package, without a message

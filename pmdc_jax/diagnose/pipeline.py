@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import attrs
 import numpy as np
@@ -11,8 +12,13 @@ from scipy import stats
 
 from ..compiled import free_memory_maps
 from ..effects import EFFECTS, ShaftCompliance
+from ..identify.corrections.input_timing import (
+    Timing,
+    negative_log_likelihood_within,
+    other_timings,
+)
 from ..identify.identification import Identification
-from ..identify.prepare import prepare
+from ..identify.prepare import Prepared, prepare
 from ..identify.results import results_of
 from ..identify.solve import Solved, solve
 from ..motor import Motor
@@ -75,13 +81,10 @@ def diagnose(
     report = progress or silent
     free_memory_maps()
     report("checking the recordings")
-    given = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
-    given, solved = solve(given, search, seed, progress)
-    identified = time.perf_counter()
-    report("gathering evidence", solved.fit.fitness)
-    selection = StepwiseSelection(model_of((), given, solved.fit), solved, report)
-    naming = selection.name()
-    named = time.perf_counter()
+    prepared = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
+    found = _likeliest_attempt(prepared, search, seed, report)
+    given, solved, selection, naming, identifying = found
+    naming_ended = time.perf_counter()
     report("estimating the uncertainty", naming.chosen.fit.fitness)
     base = results_of(given, solved)
     final = _identification(naming, solved)
@@ -102,8 +105,8 @@ def diagnose(
     tells_curves = verdict == "not_in_library" or naming.leaves_sensor_error
     tells_curves = tells_curves and naming.varies is None
     seconds = {
-        "identify": identified - began,
-        "name": named - identified,
+        "identify": identifying,
+        "name": naming_ended - began - identifying,
         "total": time.perf_counter() - began,
     }
     final = attrs.evolve(final, seconds=seconds)
@@ -129,6 +132,42 @@ def diagnose(
             gaps_of_runs(final.fit, naming.varies.fit, noise) if naming.varies else {}
         ),
     )
+
+
+class _Attempt(NamedTuple):
+    """Effects named for one timing of the voltages."""
+
+    given: Prepared
+    solved: Solved
+    selection: StepwiseSelection
+    naming: Naming
+    identifying: float  # s that the identification of the motor without effects took
+
+
+def _likeliest_attempt(
+    prepared: Prepared, search: str, seed: int, report: ReportProgress
+) -> _Attempt:
+    """The effects named, and if these reveal another timing of the voltages, which a fit without them could not tell,
+    those named with that timing if they make the runs likelier."""
+
+    def attempt(timing: Timing | None = None) -> _Attempt:
+        began = time.perf_counter()
+        given, solved = solve(prepared, search, seed, report, timing)
+        identifying = time.perf_counter() - began
+        report("gathering evidence", solved.fit.fitness)
+        selection = StepwiseSelection(model_of((), given, solved.fit), solved, report)
+        return _Attempt(given, solved, selection, selection.name(), identifying)
+
+    def unlikelihood(attempt: _Attempt) -> float:
+        chosen = attempt.naming.chosen
+        return negative_log_likelihood_within(chosen.given, chosen.fit)
+
+    first = attempt()
+    chosen = first.naming.chosen
+    if first.given.timing is not None or not chosen.effects:
+        return first
+    others = other_timings(chosen.given, chosen.fit).likelier
+    return min(first, *map(attempt, others[:1]), key=unlikelihood) if others else first
 
 
 def _identification(naming: Naming, solved: Solved) -> Identification:

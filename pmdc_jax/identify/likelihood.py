@@ -6,10 +6,13 @@ import numpy as np
 
 from .by_run import FitByRun
 from .generalised_least_squares import series_of, training_indices
+from .noise import noise_of_sensor
 from .noise_model import Series, whitener
 from .polish import Fit
 from .prepare import Prepared
 
+# Root mean square of residuals, over the white noise of the sensor, up to which they are nothing but that noise
+MAX_NOISE_RATIO = 1.3
 # Gain in log-likelihood from which a recording is interpreted in another way than by default
 MIN_LOG_LIKELIHOOD_GAIN = 30.0
 
@@ -32,3 +35,19 @@ def negative_log_likelihood(given: Prepared, fit: Fit | FitByRun) -> float:
         spread = np.linalg.slogdet(rest.T @ rest / len(rest))[1]
         total += len(rest) * (spread / 2 - np.linalg.slogdet(white.scales[0])[1])
     return float(total)
+
+
+def leaves_only_noise(given: Prepared, fit: Fit) -> bool:
+    """Whether a fit leaves nothing of the training runs but the white noise of the sensors."""
+    tape = given.problem.tape
+    left = np.where(tape.weight > 0, tape.measured - fit.evaluation.seen, np.nan)
+    for c in range(2):
+        squares = []
+        for k in training_indices(given):
+            length = len(given.runs[k])
+            residual = tape.samples_of(k, left[:, c], length)
+            noise = noise_of_sensor(tape.samples_of(k, tape.measured[:, c], length), residual)
+            squares.append(np.square(residual / noise) if noise else np.zeros(1))
+        if np.sqrt(np.nanmean(np.concatenate(squares))) > MAX_NOISE_RATIO:
+            return False
+    return True

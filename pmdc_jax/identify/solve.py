@@ -16,8 +16,9 @@ from ..threads import map_in_threads_until, submit
 from .bounds import effect_bounds
 from .corrections.input_noise import without_input_noise
 from .corrections.input_timing import (
-    likelier_timings,
+    Timing,
     negative_log_likelihood_within,
+    other_timings,
     with_timing,
 )
 from .corrections.reading_time import with_fitted_reading
@@ -57,22 +58,33 @@ class Solved(NamedTuple):
 
 
 def solve(
-    given: Prepared, search: str, seed: int, progress: ReportProgress | None = None
+    given: Prepared,
+    search: str,
+    seed: int,
+    progress: ReportProgress | None = None,
+    timing: Timing | None = None,
 ) -> tuple[Prepared, Solved]:
     """The best fit of a search, to runs corrected for artefacts of their sensors and for the timing of their inputs.
 
+    **Arguments**: `timing` of the inputs, if it is known already.
     **Returns**: the problem as `search_and_refine` returns it, corrected, and the fit to it.
     """
-    recorded = given = with_evident_averaging(given)
-    given, solved = _corrected(*search_and_refine(given, search, seed, progress))
-    timings = likelier_timings(given, solved.fit)
-    retimed = [with_timing(recorded, timing) for timing in timings]
-    others = [_corrected(*search_and_refine(runs, search, seed, progress)) for runs in retimed]
+    recorded = with_evident_averaging(given)
+
+    def at(timing: Timing | None) -> tuple[Prepared, Solved]:
+        runs = with_timing(recorded, timing) if timing else recorded
+        return _corrected(*search_and_refine(runs, search, seed, progress))
+
+    attempts = [at(timing)]
+    if timing is None:
+        given, solved = attempts[0]
+        others = other_timings(given, solved.fit)
+        attempts = [*([] if others.for_certain else attempts), *map(at, others.likelier)]
     found = []
-    for runs, result in [(given, solved), *others]:
+    for runs, result in attempts:
         runs, fit = with_fitted_reading(*with_step_times(runs, result.fit))
         found.append((runs, result._replace(fit=fit)))
-    if not others:
+    if len(found) == 1:
         return found[0]
     return min(found, key=lambda pair: negative_log_likelihood_within(pair[0], pair[1].fit))
 

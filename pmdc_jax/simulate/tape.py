@@ -265,7 +265,8 @@ def _laid_in_blocks(
 
 
 def _averaging_shares(recording: Recording) -> tuple[float, float, float]:
-    return (*(recording.averaging or (0.0, 0.0)), float(recording.current_averaged))
+    last, coming = recording.averaging or (0.0, 0.0)
+    return last, coming, float(recording.current_averaged)
 
 
 def _first(samples: np.ndarray | None) -> float:

@@ -25,12 +25,15 @@ from scipy.optimize import minimize_scalar
 from ...recording import Recording
 from ...simulate import Tape, uniform
 from ..generalised_least_squares import training_indices
-from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
-from ..noise import noise_of_sensor
+from ..likelihood import (
+    MIN_LOG_LIKELIHOOD_GAIN,
+    leaves_only_noise,
+    negative_log_likelihood,
+)
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
-from .reading_time import MARGIN, change_by_reading, samples_ahead
+from .reading_time import MARGIN, change_by_reading, two_voltages
 from .speed_averaging import (
     refitted,
     seems_averaged,
@@ -46,9 +49,8 @@ LEAD_TOLERANCE = 3e-3
 MIN_DISTANCE = 0.02
 # Share of the apparent lateness of the voltage, and standard errors, from which it is the current that is late
 MIN_LATE_SHARE, MIN_LATE_ERRORS = 0.3, 5.0
-# The current settles from one sample to the next if that is this many time constants; and the largest residuals, over
-# their white noise, that another timing may leave then
-MIN_TIME_CONSTANTS, MAX_RATIO_LEFT = 1.0, 1.3
+# The current settles from one sample to the next if that is this many time constants
+MIN_TIME_CONSTANTS = 1.0
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
 MIN_LEAD = 0.3
 
@@ -91,13 +93,20 @@ class Timing(NamedTuple):
 HELD, STRAIGHT, LATE, EARLY = Timing(0), Timing(0, straight=True), Timing(1), Timing(-1)
 
 
-def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
+class OtherTimings(NamedTuple):
+    """Timings of the voltages that are likelier than the assumed one, the likeliest first."""
+
+    likelier: list[Timing]
+    for_certain: bool = False  # whether it is certain that the voltages do not act as assumed
+
+
+def other_timings(given: Prepared, fit: Fit) -> OtherTimings:
     """The timings of the voltages that are clearly likelier than the assumed one.
 
     **Arguments**: `given`, the runs with the effects of their sensors corrected; `fit`, to these.
     """
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
-        return []  # without a current, or without a speed, only a delay would show
+        return OtherTimings([])  # without a current, or without a speed, only a delay would show
 
     @cache
     def fitted(timing: Timing) -> tuple[Prepared, Fit]:
@@ -109,24 +118,35 @@ def likelier_timings(given: Prepared, fit: Fit) -> list[Timing]:
         return negative_log_likelihood_within(*fitted(timing))
 
     plausible = _at_samples(given, fit)
-    ahead = samples_ahead(given, fit)
-    if ahead is not None:
-        # the current depends on two voltages: one acts between samples, or the current is a mean
-        means = [Timing(lead, current_mean=True) for lead in ((0, -1) if ahead < 0 else (1,))]
-        plausible += [*_between_samples(given, fit, ahead), *means]
+    limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
+    seen = two_voltages(given, fit)
+    certain = False
+    if seen is not None:
+        reading = seen.reading
+        lead = _best_lead(given, fit, seen.ahead) if reading is None else seen.ahead + reading
+        leads = (0, -1) if seen.ahead < 0 else (1,)
+        means = [Timing(lead, current_mean=True) for lead in leads]
+        between = _between_samples(given, fit, lead)
+        if seen.explains and between and reading is not None:
+            # a fit that lacks something else could not tell
+            certain, limit = True, np.inf
+            plausible = [t for t in plausible if t.straight and seen.as_mean]
+            means = means[:1] if seen.as_mean else []
+        plausible += between + means
     elif _settles(given, fit):
         means = [Timing(t.lead, current_mean=True) for t in (HELD, *plausible) if not t.straight]
-        hidden = [*_between_samples(given, fit, -1), *means]
-        plausible += [timing for timing in hidden if _explains_all(*fitted(timing))]
-    limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
+        hidden = [*_between_samples(given, fit, _best_lead(given, fit, -1)), *means]
+        plausible += [timing for timing in hidden if leaves_only_noise(*fitted(timing))]
     likelier = [timing for timing in plausible if unlikelihood(timing) < limit]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     simpler = [timing for timing in likelier if not timing.current_mean]
     limit = min(map(unlikelihood, simpler), default=np.inf) - MIN_LOG_LIKELIHOOD_GAIN
     likelier = simpler + [t for t in likelier if t.current_mean and unlikelihood(t) < limit]
-    if all(run.load is None for run in given.training):
-        return likelier
-    return [t if t.reading else min(t, t._replace(load=True), key=unlikelihood) for t in likelier]
+    if any(run.load is not None for run in given.training):
+        likelier = [
+            t if t.reading else min(t, t._replace(load=True), key=unlikelihood) for t in likelier
+        ]
+    return OtherTimings(sorted(likelier, key=unlikelihood), certain)
 
 
 def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
@@ -139,16 +159,21 @@ def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
     return [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
 
 
-def _between_samples(given: Prepared, fit: Fit, ahead: int) -> list[Timing]:
-    """The instant that fits best, if the voltages act between two samples, at least so many ahead."""
+def _best_lead(given: Prepared, fit: Fit, ahead: int) -> float:
+    """The lead that fits best, if the voltages act between two samples, at least so many ahead."""
 
     def misfit(reading: float) -> float:
         return refitted(with_timing(given, Timing(ahead + reading)), fit)[1].cost
 
     tolerance = {"xatol": LEAD_TOLERANCE}
     best = minimize_scalar(misfit, bounds=(MARGIN, 1 - MARGIN), method="bounded", options=tolerance)
-    timing = Timing(ahead + float(best.x))
-    between = MIN_DISTANCE < best.x < 1 - MIN_DISTANCE
+    return ahead + float(best.x)
+
+
+def _between_samples(given: Prepared, fit: Fit, lead: float) -> list[Timing]:
+    """The timing with this lead, if the voltages then act between two samples."""
+    timing = Timing(lead)
+    between = MIN_DISTANCE < lead - timing.ahead < 1 - MIN_DISTANCE
     return [timing] if between and not _only_current_is_late(given, fit, timing) else []
 
 
@@ -177,22 +202,6 @@ def _settles(given: Prepared, fit: Fit) -> bool:
     motor, tape = given.problem.parameters(fit.coordinates), given.problem.tape
     shortest = min(tape.sample_time_of(k) for k in training_indices(given))
     return float(motor.R / motor.L) * shortest > MIN_TIME_CONSTANTS
-
-
-def _explains_all(given: Prepared, fit: Fit) -> bool:
-    """Whether a fit leaves nothing but the white noise of the sensors."""
-    tape = given.problem.tape
-    left = np.where(tape.weight > 0, tape.measured - fit.evaluation.seen, np.nan)
-    for c in range(2):
-        squares = []
-        for k in training_indices(given):
-            length = len(given.runs[k])
-            residual = tape.samples_of(k, left[:, c], length)
-            noise = noise_of_sensor(tape.samples_of(k, tape.measured[:, c], length), residual)
-            squares.append(np.square(residual / noise) if noise else np.zeros(1))
-        if np.sqrt(np.nanmean(np.concatenate(squares))) > MAX_RATIO_LEFT:
-            return False
-    return True
 
 
 def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:

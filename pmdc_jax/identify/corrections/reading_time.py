@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...recording import Recording
+from ..likelihood import leaves_only_noise
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem, evaluate
@@ -27,6 +28,17 @@ MIN_Z, MIN_EXPLAINED = 10.0, 0.05
 MAX_OTHER_SIDE = 0.3
 # ... and the largest share of what is left that the further columns of a filtered current may explain
 MAX_BY_FILTER = 0.2
+# The second voltage explains for certain if no more than this share of the squared residuals is left
+MAX_LEFT = 0.5
+# Range of the share of a current that is left after a sample
+REMAINING = (1e-9, 0.999)
+# Standard errors by which the share of the later voltage, and that of a current that remains, may be off; how much the
+# instant of reading may differ between these, in samples; and a further tolerance for the share of the later voltage
+SHARE_ERRORS, MAX_SPREAD, MEAN_TOLERANCE = 4.0, 0.05, 0.03
+SIDES = np.array([-1.0, 0.0, 1.0])
+# Standard deviations of its noise from which a current flows for certain; samples in which it does not flow in one
+# direction are left out if this share of the squared steps of the voltage remains
+FLOWS, MIN_STEPS = 4.0, 0.2
 # Refits to the fitted instant, the change of it, in samples, by which the outputs are differentiated, and its least
 # distance from a sample
 MAX_REFITS, DIFFERENCE, MARGIN = 12, 1e-4, 0.005
@@ -62,10 +74,20 @@ class _Equation(NamedTuple):
         return coefficients / size, errors, float(np.mean(np.square(left)))
 
 
-def samples_ahead(given: Prepared, fit: Fit) -> int | None:
-    """By how many whole samples at least the voltages act before the one beside which they were recorded: 0 if they
-    begin to act between the sample before and their own, -1 if between their own and the next; None if they act at a
-    sample, as far as the currents tell.
+class TwoVoltages(NamedTuple):
+    """A current that depends on the voltages of two samples."""
+
+    ahead: int  # as many samples at least the voltages act before the one beside which they were recorded: 0 or -1
+    # share of a sample after which the outputs are read, if the voltages are held; None if the current settles too soon
+    # to tell
+    reading: float | None
+    as_mean: bool  # whether it does so as a mean over the last sample would, or beside voltages on straight lines
+    explains: bool  # whether that explains most of what a single voltage leaves of the electrical equation
+
+
+def two_voltages(given: Prepared, fit: Fit) -> TwoVoltages | None:
+    """How the currents depend on two voltages: these begin to act between two samples, or are straight between them, or
+    the currents are means. None if they act at a sample, as far as the currents tell.
 
     **Arguments**: `fit`, to these runs, with voltages that are held from their samples on.
     """
@@ -82,7 +104,36 @@ def samples_ahead(given: Prepared, fit: Fit) -> int | None:
         return None
     if equation.solve(np.arange(WITH_FILTER))[2] < (1 - MAX_BY_FILTER) * left:
         return None
-    return 0 if own == AFTER else -1
+    later = AFTER if own == AFTER else NOW
+    both = [later - 1, later]
+    share = float(coefficients[later] / coefficients[both].sum())
+    shares = share + SHARE_ERRORS * np.hypot(*errors[both]) / coefficients[both].sum() * SIDES
+    remains = coefficients[0] + SHARE_ERRORS * errors[0] * SIDES
+    readings = [_reading(s, r) for s in shares for r in remains]
+    least, _, most = map(_later_share_of_mean, remains[::-1])
+    return TwoVoltages(
+        ahead=0 if own == AFTER else -1,
+        reading=_reading(share, remains[1]) if np.ptp(readings) < MAX_SPREAD else None,
+        as_mean=bool(least - MEAN_TOLERANCE < share < most + MEAN_TOLERANCE),
+        explains=left < MAX_LEFT * without,
+    )
+
+
+def _later_share_of_mean(remains: float) -> float:
+    """Share of the later of two voltages in a current that is a mean over the last sample, or beside voltages on
+    straight lines; `remains`, the share of a current that is left after a sample."""
+    remains = float(np.clip(remains, *REMAINING))
+    a = -np.log(remains)
+    return (a - 1 + remains) / (a * (1 - remains))  # phi_2(-a) / phi_1(-a)
+
+
+def _reading(share: float, remains: float) -> float:
+    """The share of a sample after which the outputs are read, from that of the later of two held voltages."""
+    remains = float(np.clip(remains, *REMAINING))
+    left = np.clip(
+        1 - share * (1 - remains), remains, 1.0
+    )  # of the current at the start of the sample
+    return float(np.log(left) / np.log(remains))
 
 
 def _electrical_equation(given: Prepared, fit: Fit) -> _Equation | None:
@@ -101,8 +152,13 @@ def _electrical_equation(given: Prepared, fit: Fit) -> _Equation | None:
         known = np.all(of_run(np.asarray(tape.weight)) > 0, axis=1)
         voltage = np.asarray(tape.samples_of(k, tape.value, len(run)))
         used = known[1:-2] & known[2:-1] & known[3:]
-        direction = np.sign(simulated[2:-1, 0] + simulated[3:, 0])
-        shared = [voltage[1:-2], voltage[2:-1], voltage[3:], np.ones(len(used)), direction]
+        # where the current is next to nothing or reverses, brushes may drop any voltage
+        flow = np.sign(measured[:, 0]) * (np.abs(measured[:, 0]) > FLOWS * given.problem.noise[0])
+        flows = used & (flow[1:-2] == flow[2:-1]) & (flow[2:-1] == flow[3:]) & (flow[3:] != 0)
+        steps = np.square(np.diff(voltage[1:-1]))
+        if steps[flows].sum() > MIN_STEPS * steps[used].sum():
+            used = flows
+        shared = [voltage[1:-2], voltage[2:-1], voltage[3:], np.ones(len(used)), flow[3:]]
         currents.append(measured[3:, 0][used])
         for rows, x in ((columns, measured), (instruments, simulated)):
             further = [x[1:-2, 0], voltage[:-3]]
@@ -118,7 +174,10 @@ def _is_usable(run: Recording) -> bool:
 
 def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the instant of reading fitted, as a nuisance parameter, and the fit to them; both unchanged where
-    the outputs are read at the samples."""
+    the outputs are read at the samples.
+
+    Where something else is missing from the motor, the instant stays: it would move to make up for that.
+    """
     reading = given.problem.tape.reading
     if reading is None:
         return given, fit
@@ -127,6 +186,8 @@ def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
         change = change_by_reading(given.problem, fit)
         given = given._replace(problem=replace(given.problem, nuisance=change[..., None]))
         fit = polish(given.problem, fit.optimum)
+        if not leaves_only_noise(given, fit):
+            return given, fit
         instants.append(_better_instant(given.problem, fit, change))
         given = _read_at(given, instants[-1])
         # every other refit moves the parameters instead, along a valley
