@@ -24,7 +24,6 @@ from scipy.optimize import minimize_scalar
 
 from ...recording import Recording
 from ...simulate import Tape, uniform
-from ..generalised_least_squares import training_indices
 from ..likelihood import (
     MIN_LOG_LIKELIHOOD_GAIN,
     leaves_only_noise,
@@ -33,7 +32,7 @@ from ..likelihood import (
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
-from .reading_time import MARGIN, change_by_reading, two_voltages
+from .reading_time import MARGIN, change_by_reading, settling, two_voltages
 from .speed_averaging import (
     refitted,
     seems_averaged,
@@ -49,8 +48,6 @@ LEAD_TOLERANCE = 3e-3
 MIN_DISTANCE = 0.02
 # Share of the apparent lateness of the voltage, and standard errors, from which it is the current that is late
 MIN_LATE_SHARE, MIN_LATE_ERRORS = 0.3, 5.0
-# The current settles from one sample to the next if that is this many time constants
-MIN_TIME_CONSTANTS = 1.0
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
 MIN_LEAD = 0.3
 
@@ -90,7 +87,7 @@ class Timing(NamedTuple):
         return "acts one sample later than it was recorded"
 
 
-HELD, STRAIGHT, LATE, EARLY = Timing(0), Timing(0, straight=True), Timing(1), Timing(-1)
+STRAIGHT, LATE, EARLY = Timing(0, straight=True), Timing(1), Timing(-1)
 
 
 class OtherTimings(NamedTuple):
@@ -133,9 +130,11 @@ def other_timings(given: Prepared, fit: Fit) -> OtherTimings:
             plausible = [t for t in plausible if t.straight and seen.as_mean]
             means = means[:1] if seen.as_mean else []
         plausible += between + means
-    elif _settles(given, fit):
-        means = [Timing(t.lead, current_mean=True) for t in (HELD, *plausible) if not t.straight]
-        hidden = [*_between_samples(given, fit, _best_lead(given, fit, -1)), *means]
+    else:
+        settles = settling(given, fit)
+        hidden = [Timing(0, current_mean=True)] if settles.as_mean else []
+        if settles.sooner:
+            hidden += _between_samples(given, fit, _best_lead(given, fit, -1))
         plausible += [timing for timing in hidden if leaves_only_noise(*fitted(timing))]
     likelier = [timing for timing in plausible if unlikelihood(timing) < limit]
     # where everything is a mean, voltages on straight lines are as good, and simpler
@@ -194,14 +193,6 @@ def _only_current_is_late(given: Prepared, fit: Fit, timing: Timing) -> bool:
     amplitudes, errors = _amplitudes(problem, nearer, [change_by_reading(problem, nearer), later])
     least = max(MIN_LATE_SHARE * abs(timing.lead), MIN_LATE_ERRORS * errors[1])
     return bool(amplitudes[1] > least)
-
-
-def _settles(given: Prepared, fit: Fit) -> bool:
-    """Whether the current settles from one sample to the next. Then it looks the same whenever within the sample before
-    the voltage began to act, if the inductance is chosen to match; only the torque comes too soon."""
-    motor, tape = given.problem.parameters(fit.coordinates), given.problem.tape
-    shortest = min(tape.sample_time_of(k) for k in training_indices(given))
-    return float(motor.R / motor.L) * shortest > MIN_TIME_CONSTANTS
 
 
 def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:

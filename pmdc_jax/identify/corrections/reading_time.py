@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...recording import Recording
+from ..generalised_least_squares import training_indices
 from ..likelihood import leaves_only_noise
 from ..polish import Fit, polish
 from ..prepare import Prepared
@@ -30,6 +31,9 @@ MAX_OTHER_SIDE = 0.3
 MAX_BY_FILTER = 0.2
 # The second voltage explains for certain if no more than this share of the squared residuals is left
 MAX_LEFT = 0.5
+# A current settles from one sample to the next if that is this many time constants; least difference of the share that
+# is left of it after a sample, and of the later speed's, that counts
+MIN_TIME_CONSTANTS, MIN_REMAINING, SHARE_TOLERANCE = 1.0, 2e-3, 0.1
 # Range of the share of a current that is left after a sample
 REMAINING = (1e-9, 0.999)
 # Standard errors by which the share of the later voltage, and that of a current that remains, may be off; how much the
@@ -119,9 +123,34 @@ def two_voltages(given: Prepared, fit: Fit) -> TwoVoltages | None:
     )
 
 
+class Settling(NamedTuple):
+    """How a current that settles from one sample to the next contradicts a fit with voltages held from their samples
+    on."""
+
+    sooner: bool  # it settles sooner than in the fit, whose larger inductance may stand for a voltage that acts late
+    as_mean: bool  # it depends on the speeds at both ends of a sample, as only a mean over the sample does
+
+
+def settling(given: Prepared, fit: Fit) -> Settling:
+    """Whether the settling of the currents contradicts the fit; it does not where they settle later."""
+    equation, motor = _electrical_equation(given, fit), given.problem.parameters(fit.coordinates)
+    shortest = min(given.problem.tape.sample_time_of(k) for k in training_indices(given))
+    time_constants = float(motor.R / motor.L) * shortest
+    if equation is None or time_constants < MIN_TIME_CONSTANTS:
+        return Settling(False, False)
+    (remains, before, after, *_), errors, _ = equation.solve(
+        np.delete(np.arange(COLUMNS), [BEFORE, AFTER])
+    )
+    above = np.exp(-time_constants) - remains > max(SHARE_ERRORS * errors[0], MIN_REMAINING)
+    share, error = after / (before + after), np.hypot(*errors[1:3]) / abs(before + after)
+    held = _later_share_of_mean(remains)
+    as_mean = held - share > SHARE_TOLERANCE + SHARE_ERRORS * error
+    return Settling(bool(above), bool(as_mean and given.averaging is None))
+
+
 def _later_share_of_mean(remains: float) -> float:
-    """Share of the later of two voltages in a current that is a mean over the last sample, or beside voltages on
-    straight lines; `remains`, the share of a current that is left after a sample."""
+    """Share of the later of two voltages in a current that is a mean over the last sample, or of two voltages or speeds
+    at the ends of a straight line; `remains`, the share of a current that is left after a sample."""
     remains = float(np.clip(remains, *REMAINING))
     a = -np.log(remains)
     return (a - 1 + remains) / (a * (1 - remains))  # phi_2(-a) / phi_1(-a)
