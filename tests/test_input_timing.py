@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import attrs
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,8 @@ import pytest
 from scipy import signal
 from scipy.integrate import solve_ivp
 
+from benchmarks import virtual_bench as vb
+from benchmarks.naming.plant import Plant, simulate
 from pmdc_jax import identify
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
@@ -292,3 +296,29 @@ def test_what_looks_like_another_inductance_is_found(read, message, truth):
         estimate = found.parameters[name]
         assert abs(estimate.value - truth[name]) < 3 * estimate.stderr, name
         assert estimate.stderr < (0.3 if name == "L" else 0.02) * truth[name], name
+
+
+@pytest.mark.parametrize(
+    ("tenths", "effects"),
+    [(3, []), pytest.param(7, ["brush_voltage_drop"], marks=pytest.mark.slow)],
+)
+def test_the_timing_of_a_voltage_is_found_beside_brushes(tenths, effects):
+    """The electrical equation shows it, although a fit without the drop of the brushes is poor at any timing."""
+    truth = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}
+    rng, runs = np.random.default_rng(17), []
+    for name, excitation in (("prbs", vb.prbs(rng, 2.0)), ("loaded", vb.loaded(rng, 2.0))):
+        time, *held = excitation
+        fine = vb.Excitation(1e-4 * np.arange(10 * len(time)), *(np.repeat(x, 10) for x in held))
+        outputs = simulate(Plant(**truth, brush_V=0.6), *fine)[tenths::10, :2][:-1]
+        current, speed = (outputs + [0.05, 0.3] * rng.standard_normal(outputs.shape)).T
+        # recorded beside the outputs that were read while it acted, or before
+        v, load = (x[1:] if tenths > 5 else x[:-1] for x in held)
+        runs.append(Recording(name, time[:-1], v, current, speed, load=load))
+    found = identify(runs, effects=effects)
+    when = "later" if tenths > 5 else "earlier"
+    told = rf"the voltage acts 0\.3\d? of a sample {when}"
+    assert any(re.match(told, message) for message in found.messages)
+    if effects:
+        drop, L = found.parameters["brush_voltage_drop.voltage_V"], found.parameters["L"]
+        assert abs(drop.value - 0.6) < 3 * drop.stderr < 0.02
+        assert abs(L.value - truth["L"]) < 3 * L.stderr < 0.01 * truth["L"]

@@ -24,15 +24,12 @@ from scipy.optimize import minimize_scalar
 
 from ...recording import Recording
 from ...simulate import Tape, uniform
-from ..likelihood import (
-    MIN_LOG_LIKELIHOOD_GAIN,
-    leaves_only_noise,
-    negative_log_likelihood,
-)
+from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
-from .reading_time import MARGIN, change_by_reading, settling, two_voltages
+from .electrical_equation import TwoVoltages, settling, two_voltages
+from .reading_time import MARGIN, change_by_reading
 from .speed_averaging import (
     refitted,
     seems_averaged,
@@ -114,28 +111,15 @@ def other_timings(given: Prepared, fit: Fit) -> OtherTimings:
     def unlikelihood(timing: Timing) -> float:
         return negative_log_likelihood_within(*fitted(timing))
 
-    plausible = _at_samples(given, fit)
     limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
-    seen = two_voltages(given, fit)
-    certain = False
-    if seen is not None:
-        reading = seen.reading
-        lead = _best_lead(given, fit, seen.ahead) if reading is None else seen.ahead + reading
-        leads = (0, -1) if seen.ahead < 0 else (1,)
-        means = [Timing(lead, current_mean=True) for lead in leads]
-        between = _between_samples(given, fit, lead)
-        if seen.explains and between and reading is not None:
-            # a fit that lacks something else could not tell
-            certain, limit = True, np.inf
-            plausible = [t for t in plausible if t.straight and seen.as_mean]
-            means = means[:1] if seen.as_mean else []
-        plausible += between + means
+    plausible, certain = _at_samples(given, fit), False
+    if seen := two_voltages(given, fit):
+        plausible, certain = _by_two_voltages(given, fit, seen, plausible)
     else:
-        settles = settling(given, fit)
-        hidden = [Timing(0, current_mean=True)] if settles.as_mean else []
-        if settles.sooner:
-            hidden += _between_samples(given, fit, _best_lead(given, fit, -1))
+        hidden = _hidden_by_inductance(given, fit)
         plausible += [timing for timing in hidden if leaves_only_noise(*fitted(timing))]
+    if certain:  # a fit that lacks something else could not tell
+        limit = np.inf
     likelier = [timing for timing in plausible if unlikelihood(timing) < limit]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     simpler = [timing for timing in likelier if not timing.current_mean]
@@ -156,6 +140,31 @@ def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
     if abs(lead) <= MIN_LEAD and not hidden:
         return []
     return [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
+
+
+def _by_two_voltages(
+    given: Prepared, fit: Fit, seen: TwoVoltages, at_samples: list[Timing]
+) -> tuple[list[Timing], bool]:
+    """The plausible timings where the currents depend on two voltages, and whether it is certain that one of them is
+    right."""
+    told = None if seen.reading is None else seen.ahead + seen.reading
+    lead = told or _best_lead(given, fit, seen.ahead)
+    between = _between_samples(given, fit, lead)
+    leads = (0, -1) if seen.ahead < 0 else (1,)
+    means = [Timing(lead, current_mean=True) for lead in leads]
+    if not (told and between and seen.explains):
+        return [*at_samples, *between, *means], False
+    straight = [timing for timing in at_samples if timing.straight]
+    return [*between, *(straight + means[:1] if seen.as_mean else [])], True
+
+
+def _hidden_by_inductance(given: Prepared, fit: Fit) -> list[Timing]:
+    """The timings for which a wrong inductance may make up where the current settles from one sample to the next."""
+    settles = settling(given, fit)
+    means = [Timing(0, current_mean=True)] if any(settles) else []
+    if not settles.sooner:
+        return means
+    return [*_between_samples(given, fit, _best_lead(given, fit, -1)), *means]
 
 
 def _best_lead(given: Prepared, fit: Fit, ahead: int) -> float:
