@@ -13,8 +13,10 @@ from scipy import stats
 from ..compiled import free_memory_maps
 from ..effects import EFFECTS, ShaftCompliance
 from ..identify.corrections.input_timing import (
+    HELD,
     Timing,
     negative_log_likelihood_within,
+    only_current_is_late,
     other_timings,
 )
 from ..identify.identification import Identification
@@ -147,8 +149,8 @@ class _Attempt(NamedTuple):
 def _likeliest_attempt(
     prepared: Prepared, search: str, seed: int, report: ReportProgress
 ) -> _Attempt:
-    """The effects named, and if these reveal another timing of the voltages, which a fit without them could not tell,
-    those named with that timing if they make the runs likelier."""
+    """The effects named. If these reveal another timing of the voltages, which a fit without them could not tell: those
+    named with that timing, if they make the runs likelier; or, if the current alone was late, with held voltages."""
 
     def attempt(timing: Timing | None = None) -> _Attempt:
         began = time.perf_counter()
@@ -164,8 +166,10 @@ def _likeliest_attempt(
 
     first = attempt()
     chosen = first.naming.chosen
-    if first.given.timing is not None or not chosen.effects:
+    if not chosen.effects:
         return first
+    if first.given.timing is not None:
+        return attempt(HELD) if only_current_is_late(chosen.given, chosen.fit) else first
     others = other_timings(chosen.given, chosen.fit).likelier
     return min(first, *map(attempt, others[:1]), key=unlikelihood) if others else first
 

@@ -84,7 +84,7 @@ class Timing(NamedTuple):
         return "acts one sample later than it was recorded"
 
 
-STRAIGHT, LATE, EARLY = Timing(0, straight=True), Timing(1), Timing(-1)
+HELD, STRAIGHT, LATE, EARLY = Timing(0), Timing(0, straight=True), Timing(1), Timing(-1)
 
 
 class OtherTimings(NamedTuple):
@@ -182,25 +182,26 @@ def _between_samples(given: Prepared, fit: Fit, lead: float) -> list[Timing]:
     """The timing with this lead, if the voltages then act between two samples."""
     timing = Timing(lead)
     between = MIN_DISTANCE < lead - timing.ahead < 1 - MIN_DISTANCE
-    return [timing] if between and not _only_current_is_late(given, fit, timing) else []
+    if between and not only_current_is_late(*refitted(with_timing(given, timing), fit)):
+        return [timing]
+    return []
 
 
-def _only_current_is_late(given: Prepared, fit: Fit, timing: Timing) -> bool:
-    """Whether the current alone was read late, as behind a filter, rather than that the voltage acts later.
+def only_current_is_late(given: Prepared, fit: Fit) -> bool:
+    """Whether the current alone was read late, as behind a filter, rather than that the voltages act between samples as
+    the timing of the runs says.
 
-    By regression of the residuals with this timing on the change that another lead makes in both outputs, and on that
-    of a later reading in the current.
+    By regression of the residuals on the change that another lead makes in both outputs, and on that of a later reading
+    in the current.
     """
-    if timing.ahead >= 0:
+    if given.reading is None or given.timing is None or given.timing.ahead >= 0:
         return False
-    runs, nearer = refitted(with_timing(given, timing), fit)
-    problem = runs.problem
-    current = nearer.evaluation.seen[:, 0]
+    problem, current = given.problem, fit.evaluation.seen[:, 0]
     rise = jnp.diff(current.reshape(-1), prepend=0.0).reshape(current.shape)
     rise = rise.at[jnp.asarray(problem.tape.begins), 0].set(0.0)
     later = jnp.stack([-rise, jnp.zeros_like(rise)], 1)
-    amplitudes, errors = _amplitudes(problem, nearer, [change_by_reading(problem, nearer), later])
-    least = max(MIN_LATE_SHARE * abs(timing.lead), MIN_LATE_ERRORS * errors[1])
+    amplitudes, errors = _amplitudes(problem, fit, [change_by_reading(problem, fit), later])
+    least = max(MIN_LATE_SHARE * abs(given.timing.lead), MIN_LATE_ERRORS * errors[1])
     return bool(amplitudes[1] > least)
 
 
