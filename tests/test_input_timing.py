@@ -237,7 +237,7 @@ def slow(case: str) -> object:
 
 @pytest.mark.parametrize(
     "timing",
-    [k if k in ("held", "acts late", "held, read after 3 tenths") else slow(k) for k in MESSAGE_OF],
+    [k if k in ("held", "acts late") else slow(k) for k in MESSAGE_OF],
 )
 def test_the_timing_of_a_voltage_is_found(timing):
     """Taken for held from their samples on, these voltages would bias L by up to 60 % and R by 5 %."""
@@ -261,7 +261,7 @@ FAST = TRUE | {"L": 8e-5}
         ("current", "the current is a mean over the last sample"),
         pytest.param("both", "the speed is a mean over the last sample", marks=pytest.mark.slow),
         pytest.param("late", "acts one sample later", marks=pytest.mark.slow),
-        ("7 tenths", "acts 0.3 of a sample later"),
+        pytest.param("7 tenths", "acts 0.3 of a sample later", marks=pytest.mark.slow),
         pytest.param("held", None, marks=pytest.mark.slow),
     ],
 )

@@ -170,7 +170,7 @@ def _likeliest_attempt(
         return first
     if first.given.timing is not None:
         return attempt(HELD) if only_current_is_late(chosen.given, chosen.fit) else first
-    others = other_timings(chosen.given, chosen.fit).likelier
+    others = other_timings(chosen.given, chosen.fit)
     return min(first, *map(attempt, others[:1]), key=unlikelihood) if others else first
 
 

@@ -78,8 +78,7 @@ def solve(
     attempts = [at(timing)]
     if timing is None:
         given, solved = attempts[0]
-        others = other_timings(given, solved.fit)
-        attempts = [*([] if others.for_certain else attempts), *map(at, others.likelier)]
+        attempts += map(at, other_timings(given, solved.fit))
     found = []
     for runs, result in attempts:
         runs, fit = with_fitted_reading(*with_step_times(runs, result.fit))

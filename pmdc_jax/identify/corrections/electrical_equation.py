@@ -24,16 +24,14 @@ MIN_Z, MIN_EXPLAINED = 10.0, 0.05
 MAX_OTHER_SIDE = 0.3
 # ... and the largest share of what is left that the further columns of a filtered current may explain
 MAX_BY_FILTER = 0.2
-# The second voltage explains for certain if no more than this share of the squared residuals is left
-MAX_LEFT = 0.5
 # A current settles from one sample to the next if that is this many time constants; least difference of the share that
 # is left of it after a sample, and of the later speed's, that counts
 MIN_TIME_CONSTANTS, MIN_REMAINING, SHARE_TOLERANCE = 1.0, 2e-3, 0.1
 # Range of the share of a current that is left after a sample
 REMAINING = (1e-9, 0.999)
-# Standard errors by which the share of the later voltage, and that of a current that remains, may be off; how much the
-# instant of reading may differ between these, in samples; and a further tolerance for the share of the later voltage
-SHARE_ERRORS, MAX_SPREAD, MEAN_TOLERANCE = 4.0, 0.05, 0.03
+# Standard errors by which the share of the later voltage, and that of a current that remains, may be off, and how much
+# the instant of reading may differ between these, in samples
+SHARE_ERRORS, MAX_SPREAD = 4.0, 0.05
 SIDES = np.array([-1.0, 0.0, 1.0])
 # Standard deviations of its noise from which a current flows for certain; samples in which it does not flow in one
 # direction are left out if this share of the squared steps of the voltage remains
@@ -75,8 +73,6 @@ class TwoVoltages(NamedTuple):
     # share of a sample after which the outputs are read, if the voltages are held; None if the current settles too soon
     # to tell
     reading: float | None
-    as_mean: bool  # whether it does so as a mean over the last sample would, or beside voltages on straight lines
-    explains: bool  # whether that explains most of what a single voltage leaves of the electrical equation
 
 
 def two_voltages(given: Prepared, fit: Fit) -> TwoVoltages | None:
@@ -104,12 +100,9 @@ def two_voltages(given: Prepared, fit: Fit) -> TwoVoltages | None:
     shares = share + SHARE_ERRORS * np.hypot(*errors[both]) / coefficients[both].sum() * SIDES
     remains = coefficients[0] + SHARE_ERRORS * errors[0] * SIDES
     readings = [_reading(s, r) for s in shares for r in remains]
-    least, _, most = map(_later_share_of_mean, remains[::-1])
     return TwoVoltages(
         ahead=0 if own == AFTER else -1,
         reading=_reading(share, remains[1]) if np.ptp(readings) < MAX_SPREAD else None,
-        as_mean=bool(least - MEAN_TOLERANCE < share < most + MEAN_TOLERANCE),
-        explains=left < MAX_LEFT * without,
     )
 
 

@@ -87,20 +87,13 @@ class Timing(NamedTuple):
 HELD, STRAIGHT, LATE, EARLY = Timing(0), Timing(0, straight=True), Timing(1), Timing(-1)
 
 
-class OtherTimings(NamedTuple):
-    """Timings of the voltages that are likelier than the assumed one, the likeliest first."""
-
-    likelier: list[Timing]
-    for_certain: bool = False  # whether it is certain that the voltages do not act as assumed
-
-
-def other_timings(given: Prepared, fit: Fit) -> OtherTimings:
-    """The timings of the voltages that are clearly likelier than the assumed one.
+def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
+    """The timings of the voltages that are clearly likelier than the assumed one, the likeliest first.
 
     **Arguments**: `given`, the runs with the effects of their sensors corrected; `fit`, to these.
     """
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
-        return OtherTimings([])  # without a current, or without a speed, only a delay would show
+        return []  # without a current, or without a speed, only a delay would show
 
     @cache
     def fitted(timing: Timing) -> tuple[Prepared, Fit]:
@@ -112,14 +105,12 @@ def other_timings(given: Prepared, fit: Fit) -> OtherTimings:
         return negative_log_likelihood_within(*fitted(timing))
 
     limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
-    plausible, certain = _at_samples(given, fit), False
+    plausible = _at_samples(given, fit)
     if seen := two_voltages(given, fit):
-        plausible, certain = _by_two_voltages(given, fit, seen, plausible)
+        plausible += _by_two_voltages(given, fit, seen)
     else:
         hidden = _hidden_by_inductance(given, fit)
         plausible += [timing for timing in hidden if leaves_only_noise(*fitted(timing))]
-    if certain:  # a fit that lacks something else could not tell
-        limit = np.inf
     likelier = [timing for timing in plausible if unlikelihood(timing) < limit]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     simpler = [timing for timing in likelier if not timing.current_mean]
@@ -129,7 +120,7 @@ def other_timings(given: Prepared, fit: Fit) -> OtherTimings:
         likelier = [
             t if t.reading else min(t, t._replace(load=True), key=unlikelihood) for t in likelier
         ]
-    return OtherTimings(sorted(likelier, key=unlikelihood), certain)
+    return sorted(likelier, key=unlikelihood)
 
 
 def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
@@ -142,20 +133,13 @@ def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
     return [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
 
 
-def _by_two_voltages(
-    given: Prepared, fit: Fit, seen: TwoVoltages, at_samples: list[Timing]
-) -> tuple[list[Timing], bool]:
-    """The plausible timings where the currents depend on two voltages, and whether it is certain that one of them is
-    right."""
+def _by_two_voltages(given: Prepared, fit: Fit, seen: TwoVoltages) -> list[Timing]:
+    """The plausible timings where the currents depend on two voltages."""
     told = None if seen.reading is None else seen.ahead + seen.reading
-    lead = told or _best_lead(given, fit, seen.ahead)
-    between = _between_samples(given, fit, lead)
     leads = (0, -1) if seen.ahead < 0 else (1,)
     means = [Timing(lead, current_mean=True) for lead in leads]
-    if not (told and between and seen.explains):
-        return [*at_samples, *between, *means], False
-    straight = [timing for timing in at_samples if timing.straight]
-    return [*between, *(straight + means[:1] if seen.as_mean else [])], True
+    lead = told or _best_lead(given, fit, seen.ahead)
+    return [*_between_samples(given, fit, lead), *means]
 
 
 def _hidden_by_inductance(given: Prepared, fit: Fit) -> list[Timing]:
