@@ -91,7 +91,8 @@ def _covariance_beyond_chance(residuals: Float[np.ndarray, " samples"], even_clo
 
 
 def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
-    """The residuals of the electrical equation in a run; None if they are too few or a signal was not recorded."""
+    """The residuals of the electrical equation in a run; None if they are too few, a signal was not recorded, or the
+    current is a mean."""
     given, tape = model.given, model.given.problem.tape
     drive, known, residuals = tape.drive_of(run), residual.known, residual.values
     recorded = given.runs[run]
@@ -111,7 +112,7 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     if pairs.sum() < MIN_SAMPLES:
         return None
     gains = _step_gains(model.motor, drive, tape.sample_time_of(run))
-    if given.runs[run].averaging == OVER_LAST:  # the reported speed is the mean over just this step
+    if recorded.averaging == OVER_LAST:  # the reported speed is the mean over just this step
         both = gains.speed_before + gains.speed_after
         gains = gains._replace(speed_before=0.0, speed_after=both)
     by_current, by_before, by_after, by_voltage = gains

@@ -6,7 +6,7 @@ import numpy as np
 
 from .by_run import FitByRun
 from .generalised_least_squares import series_of, training_indices
-from .noise import noise_of_sensor
+from .noise import ratio_to_noise
 from .noise_model import Series, whitener
 from .polish import Fit
 from .prepare import Prepared
@@ -39,15 +39,15 @@ def negative_log_likelihood(given: Prepared, fit: Fit | FitByRun) -> float:
 
 def leaves_only_noise(given: Prepared, fit: Fit) -> bool:
     """Whether a fit leaves nothing of the training runs but the white noise of the sensors."""
-    tape = given.problem.tape
+    tape, training = given.problem.tape, training_indices(given)
     left = np.where(tape.weight > 0, tape.measured - fit.evaluation.seen, np.nan)
-    for c in range(2):
-        squares = []
-        for k in training_indices(given):
-            length = len(given.runs[k])
-            residual = tape.samples_of(k, left[:, c], length)
-            noise = noise_of_sensor(tape.samples_of(k, tape.measured[:, c], length), residual)
-            squares.append(np.square(residual / noise) if noise else np.zeros(1))
-        if np.sqrt(np.nanmean(np.concatenate(squares))) > MAX_NOISE_RATIO:
-            return False
-    return True
+
+    def of_output(c: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        lengths = [(k, len(given.runs[k])) for k in training]
+        measured, residuals = (
+            [tape.samples_of(k, signal[:, c], length) for k, length in lengths]
+            for signal in (np.asarray(tape.measured), left)
+        )
+        return list(zip(measured, residuals, strict=True))
+
+    return all(ratio_to_noise(of_output(c)) <= MAX_NOISE_RATIO for c in range(2))

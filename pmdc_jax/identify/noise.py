@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -40,6 +40,20 @@ def noise_of_sensor(measured: np.ndarray, left: np.ndarray) -> float:
     """
     white = white_noise([left])
     return max(white, resolution_noise([measured])) if white else 0.0
+
+
+def ratio_to_noise(measured_and_left: Iterable[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Root mean square of the residuals of an output over the white noise of its sensor in each run.
+
+    **Arguments**: what was measured and the residuals in every run, NaN where missing; runs too short to show their
+    noise do not count.
+    """
+    scaled = [
+        left / noise
+        for measured, left in measured_and_left
+        if (noise := noise_of_sensor(measured, left))
+    ]
+    return float(np.sqrt(np.nanmean(np.square(np.concatenate(scaled))))) if scaled else 0.0
 
 
 def is_coarse(signal: np.ndarray) -> bool:

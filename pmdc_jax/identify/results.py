@@ -14,7 +14,7 @@ from ..simulate import RunUnknowns, Tape
 from ..threads import map_in_threads
 from .identifiability import MIN_SHARE, explain_directions
 from .identification import Estimate, Identification, Role, RunFit, Status
-from .noise import noise_of_sensor, white_noise
+from .noise import ratio_to_noise, white_noise
 from .parameters import Parameters, unit_of
 from .polish import Fit, fit_run_unknowns, polish
 from .prepare import Prepared
@@ -285,14 +285,9 @@ def _measured_and_residuals(
 def _large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:
     """RMS of the residuals over the white noise of the runs, for the outputs for which that exceeds
     `MAX_RESIDUAL_RATIO`."""
-    ratios = {}
-    for name in ("current", "speed"):
-        scaled = [
-            left / noise
-            for measured, left in _measured_and_residuals(fit, name)
-            if (noise := noise_of_sensor(measured, left))
-        ]
-        ratios[name] = _rms(np.concatenate(scaled)) if scaled else 0.0
+    ratios = {
+        name: ratio_to_noise(_measured_and_residuals(fit, name)) for name in ("current", "speed")
+    }
     return {name: ratio for name, ratio in ratios.items() if ratio > MAX_RESIDUAL_RATIO}
 
 

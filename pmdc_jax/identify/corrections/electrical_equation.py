@@ -43,7 +43,7 @@ FLOWS, MIN_STEPS = 4.0, 0.2
 BEFORE, NOW, AFTER, COLUMNS, WITH_FILTER = 3, 4, 5, 8, 10
 
 
-class _Equation(NamedTuple):
+class ElectricalEquation(NamedTuple):
     """The electrical equation from sample to sample: the next current by the columns."""
 
     current: Float[np.ndarray, " samples"]
@@ -75,15 +75,9 @@ class TwoVoltages(NamedTuple):
     reading: float | None
 
 
-def two_voltages(given: Prepared, fit: Fit) -> TwoVoltages | None:
+def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
     """How the currents depend on two voltages: these begin to act between two samples, or are straight between them, or
-    the currents are means. None if they act at a sample, as far as the currents tell.
-
-    **Arguments**: `fit`, to these runs, with voltages that are held from their samples on.
-    """
-    equation = _electrical_equation(given, fit)
-    if equation is None:
-        return None
+    the currents are means. None if they act at a sample, as far as the currents tell."""
     coefficients, errors, left = equation.solve(np.arange(COLUMNS))
     without = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))[2]
     gains = coefficients / coefficients[[BEFORE, NOW, AFTER]].sum()
@@ -114,26 +108,26 @@ class Settling(NamedTuple):
     as_mean: bool  # it depends on the speeds at both ends of a sample, as only a mean over the sample does
 
 
-def settling(given: Prepared, fit: Fit) -> Settling:
+def settling(equation: ElectricalEquation, given: Prepared, fit: Fit) -> Settling:
     """Whether the settling of the currents contradicts the fit; it does not where they settle later."""
-    equation, motor = _electrical_equation(given, fit), given.problem.parameters(fit.coordinates)
+    motor = given.problem.parameters(fit.coordinates)
     shortest = min(given.problem.tape.sample_time_of(k) for k in training_indices(given))
     time_constants = float(motor.R / motor.L) * shortest
-    if equation is None or time_constants < MIN_TIME_CONSTANTS:
+    if time_constants < MIN_TIME_CONSTANTS:
         return Settling(False, False)
     (remains, before, after, *_), errors, _ = equation.solve(
         np.delete(np.arange(COLUMNS), [BEFORE, AFTER])
     )
     above = np.exp(-time_constants) - remains > max(SHARE_ERRORS * errors[0], MIN_REMAINING)
     share, error = after / (before + after), np.hypot(*errors[1:3]) / abs(before + after)
-    held = _later_share_of_mean(remains)
+    held = _later_share(remains)
     as_mean = held - share > SHARE_TOLERANCE + SHARE_ERRORS * error
     return Settling(bool(above), bool(as_mean and given.averaging is None))
 
 
-def _later_share_of_mean(remains: float) -> float:
-    """Share of the later of two voltages in a current that is a mean over the last sample, or of two voltages or speeds
-    at the ends of a straight line; `remains`, the share of a current that is left after a sample."""
+def _later_share(remains: float) -> float:
+    """Share of the later speed in what two speeds, with a straight line between them, do to a current; `remains`, the
+    share of a current that is left after a sample."""
     remains = float(np.clip(remains, *REMAINING))
     a = -np.log(remains)
     return (a - 1 + remains) / (a * (1 - remains))  # phi_2(-a) / phi_1(-a)
@@ -147,8 +141,11 @@ def _reading(share: float, remains: float) -> float:
     return float(np.log(left) / np.log(remains))
 
 
-def _electrical_equation(given: Prepared, fit: Fit) -> _Equation | None:
-    """The equation of all training runs together; None if they differ in sample time or none has what it takes."""
+def electrical_equation(given: Prepared, fit: Fit) -> ElectricalEquation | None:
+    """The equation of all training runs together; None if they differ in sample time or none has what it takes.
+
+    **Arguments**: `fit`, to these runs, with voltages that are held from their samples on.
+    """
     tape, seen = given.problem.tape, np.asarray(fit.evaluation.seen)
     currents, columns, instruments = [], [], []
     runs = [(k, run) for k, run in enumerate(given.training) if _is_usable(run)]
@@ -177,7 +174,7 @@ def _electrical_equation(given: Prepared, fit: Fit) -> _Equation | None:
             further = [x[1:-2, 0], voltage[:-3]]
             row = [x[2:-1, 0], x[2:-1, 1], x[3:, 1], *shared, *further]
             rows.append(np.stack(row, 1)[used])
-    return _Equation(*map(np.concatenate, (currents, columns, instruments)))
+    return ElectricalEquation(*map(np.concatenate, (currents, columns, instruments)))
 
 
 def _is_usable(run: Recording) -> bool:

@@ -28,7 +28,7 @@ from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_lo
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
-from .electrical_equation import TwoVoltages, settling, two_voltages
+from .electrical_equation import Settling, TwoVoltages, electrical_equation, settling, two_voltages
 from .reading_time import MARGIN, change_by_reading
 from .speed_averaging import (
     refitted,
@@ -101,16 +101,19 @@ def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
         # only a fit with the right timing can tell a mean over the last sample from a delay
         return with_averaging(*with_even_clock(*refitted(other, fit)))
 
+    @cache
     def unlikelihood(timing: Timing) -> float:
         return negative_log_likelihood_within(*fitted(timing))
 
     limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
     plausible = _at_samples(given, fit)
-    if seen := two_voltages(given, fit):
+    equation = electrical_equation(given, fit)
+    if equation and (seen := two_voltages(equation)):
         plausible += _by_two_voltages(given, fit, seen)
-    else:
-        hidden = _hidden_by_inductance(given, fit)
+    elif equation:
+        hidden = _hidden_by_inductance(given, fit, settling(equation, given, fit))
         plausible += [timing for timing in hidden if leaves_only_noise(*fitted(timing))]
+    plausible = [timing for timing in plausible if not only_current_is_late(*fitted(timing))]
     likelier = [timing for timing in plausible if unlikelihood(timing) < limit]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     simpler = [timing for timing in likelier if not timing.current_mean]
@@ -135,20 +138,19 @@ def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
 
 def _by_two_voltages(given: Prepared, fit: Fit, seen: TwoVoltages) -> list[Timing]:
     """The plausible timings where the currents depend on two voltages."""
-    told = None if seen.reading is None else seen.ahead + seen.reading
-    leads = (0, -1) if seen.ahead < 0 else (1,)
+    ahead, reading = seen.ahead, seen.reading
+    lead = _best_lead(given, fit, ahead) if reading is None else ahead + reading
+    leads = (0, -1) if ahead < 0 else (1,)
     means = [Timing(lead, current_mean=True) for lead in leads]
-    lead = told or _best_lead(given, fit, seen.ahead)
-    return [*_between_samples(given, fit, lead), *means]
+    return [*_between_samples(lead), *means]
 
 
-def _hidden_by_inductance(given: Prepared, fit: Fit) -> list[Timing]:
+def _hidden_by_inductance(given: Prepared, fit: Fit, settles: Settling) -> list[Timing]:
     """The timings for which a wrong inductance may make up where the current settles from one sample to the next."""
-    settles = settling(given, fit)
     means = [Timing(0, current_mean=True)] if any(settles) else []
     if not settles.sooner:
         return means
-    return [*_between_samples(given, fit, _best_lead(given, fit, -1)), *means]
+    return [*_between_samples(_best_lead(given, fit, -1)), *means]
 
 
 def _best_lead(given: Prepared, fit: Fit, ahead: int) -> float:
@@ -162,13 +164,10 @@ def _best_lead(given: Prepared, fit: Fit, ahead: int) -> float:
     return ahead + float(best.x)
 
 
-def _between_samples(given: Prepared, fit: Fit, lead: float) -> list[Timing]:
+def _between_samples(lead: float) -> list[Timing]:
     """The timing with this lead, if the voltages then act between two samples."""
     timing = Timing(lead)
-    between = MIN_DISTANCE < lead - timing.ahead < 1 - MIN_DISTANCE
-    if between and not only_current_is_late(*refitted(with_timing(given, timing), fit)):
-        return [timing]
-    return []
+    return [timing] if MIN_DISTANCE < lead - timing.ahead < 1 - MIN_DISTANCE else []
 
 
 def only_current_is_late(given: Prepared, fit: Fit) -> bool:
