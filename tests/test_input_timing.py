@@ -262,6 +262,8 @@ FAST = TRUE | {"L": 8e-5}
         pytest.param("both", "the speed is a mean over the last sample", marks=pytest.mark.slow),
         pytest.param("late", "acts one sample later", marks=pytest.mark.slow),
         pytest.param("7 tenths", "acts 0.3 of a sample later", marks=pytest.mark.slow),
+        pytest.param("3 tenths early", "acts 0.3 of a sample earlier", marks=pytest.mark.slow),
+        pytest.param("5 tenths early", "acts 0.5 of a sample earlier", marks=pytest.mark.slow),
         pytest.param("held", None, marks=pytest.mark.slow),
     ],
 )
@@ -283,6 +285,8 @@ def test_what_looks_like_another_inductance_is_found(read, message, truth):
         if read == "7 tenths":
             current, speed = outputs_within(run, 7, truth)[:-1, :2].T
             voltage, load = voltage[1:], load[1:]
+        if read.endswith("early"):
+            current, speed = outputs_within(run, int(read[0]), truth)[:, :2].T
         time = STEP * np.arange(len(current))
         current, speed = (
             x + s * rng.standard_normal(len(x)) for x, s in ((current, 0.02), (speed, 0.2))

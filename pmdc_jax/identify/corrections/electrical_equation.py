@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...recording import Recording
-from ..generalised_least_squares import training_indices
 from ..polish import Fit
 from ..prepare import Prepared
 
@@ -24,9 +23,9 @@ MIN_Z, MIN_EXPLAINED = 10.0, 0.05
 MAX_OTHER_SIDE = 0.3
 # ... and the largest share of what is left that the further columns of a filtered current may explain
 MAX_BY_FILTER = 0.2
-# A current settles from one sample to the next if that is this many time constants; least difference of the share that
-# is left of it after a sample, and of the later speed's, that counts
-MIN_TIME_CONSTANTS, MIN_REMAINING, SHARE_TOLERANCE = 1.0, 2e-3, 0.1
+# A current settles from one sample to the next if this share of it is left at most, and very soon if this; the least
+# differences that count of the share of the later speed, if it is larger and if it is smaller
+MAX_REMAINING, MAX_HIDDEN, MIN_LATER, MIN_EARLIER = 0.4, 0.02, 0.02, 0.1
 # Range of the share of a current that is left after a sample
 REMAINING = (1e-9, 0.999)
 # Standard errors by which the share of the later voltage, and that of a current that remains, may be off, and how much
@@ -50,9 +49,11 @@ class ElectricalEquation(NamedTuple):
     columns: Float[np.ndarray, "samples columns"]
     # the same columns of the simulation, whose currents and speeds have no noise
     instruments: Float[np.ndarray, "samples columns"]
+    sample_time: float  # s
 
     def solve(self, used: Int[np.ndarray, " used"]) -> tuple[np.ndarray, np.ndarray, float]:
-        """Coefficients of the columns used, their standard errors, and the mean square that is left.
+        """Coefficients of all columns, zero where they are not used, their standard errors, and the mean square that is
+        left.
 
         By instrumental variables, because noise of the currents would bias least squares; errors as of White (1980).
         """
@@ -62,8 +63,9 @@ class ElectricalEquation(NamedTuple):
         coefficients = inverse @ (Z.T @ self.current)
         left = self.current - X @ coefficients
         scores = inverse @ (Z * left[:, None]).T
-        errors = np.sqrt(np.square(scores).sum(1)) / size
-        return coefficients / size, errors, float(np.mean(np.square(left)))
+        of_all = np.zeros((2, WITH_FILTER))
+        of_all[:, used] = coefficients / size, np.sqrt(np.square(scores).sum(1)) / size
+        return of_all[0], of_all[1], float(np.mean(np.square(left)))
 
 
 class TwoVoltages(NamedTuple):
@@ -73,18 +75,28 @@ class TwoVoltages(NamedTuple):
     # share of a sample after which the outputs are read, if the voltages are held; None if the current settles too soon
     # to tell
     reading: float | None
+    # share of a current that is left after that time; at most, where it cannot be told from zero
+    left: float
+    sample_time: float  # s
+
+    def time_constant(self, reading: float) -> float:
+        """L / R, in s, if the outputs are read after this share of a sample."""
+        return -reading * self.sample_time / float(np.log(self.left))
 
 
 def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
     """How the currents depend on two voltages: these begin to act between two samples, or are straight between them, or
     the currents are means. None if they act at a sample, as far as the currents tell."""
     coefficients, errors, left = equation.solve(np.arange(COLUMNS))
-    without = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))[2]
-    gains = coefficients / coefficients[[BEFORE, NOW, AFTER]].sum()
-    own, other = (AFTER, BEFORE) if gains[AFTER] > gains[BEFORE] else (BEFORE, AFTER)
-    clear = gains[own] > 0 and abs(coefficients[own]) > MIN_Z * errors[own]
-    one_sided = abs(gains[other]) < MAX_OTHER_SIDE * gains[own]
-    if not (clear and one_sided and left < (1 - MIN_EXPLAINED) * without):
+    own, other = (AFTER, BEFORE) if coefficients[AFTER] > coefficients[BEFORE] else (BEFORE, AFTER)
+    # the three are nearly collinear where the current settles within a sample, two seldom
+    by_two = equation.solve(np.delete(np.arange(COLUMNS), other))
+    if (1 - MIN_EXPLAINED) * by_two[2] < left:
+        coefficients, errors, left = by_two
+    elif abs(coefficients[other]) > MAX_OTHER_SIDE * coefficients[own]:
+        return None
+    left_by_one = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))[2]
+    if coefficients[own] < MIN_Z * errors[own] or left > (1 - MIN_EXPLAINED) * left_by_one:
         return None
     if equation.solve(np.arange(WITH_FILTER))[2] < (1 - MAX_BY_FILTER) * left:
         return None
@@ -93,36 +105,42 @@ def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
     share = float(coefficients[later] / coefficients[both].sum())
     shares = share + SHARE_ERRORS * np.hypot(*errors[both]) / coefficients[both].sum() * SIDES
     remains = coefficients[0] + SHARE_ERRORS * errors[0] * SIDES
+    lowest, left, highest = 1 - shares[::-1] * (1 - remains[1])
     readings = [_reading(s, r) for s in shares for r in remains]
     return TwoVoltages(
         ahead=0 if own == AFTER else -1,
         reading=_reading(share, remains[1]) if np.ptp(readings) < MAX_SPREAD else None,
+        left=float(np.clip(left if lowest > 0 else highest, *REMAINING)),
+        sample_time=equation.sample_time,
     )
 
 
 class Settling(NamedTuple):
-    """How a current that settles from one sample to the next contradicts a fit with voltages held from their samples
-    on."""
+    """What a current that settles from one sample to the next tells of a fit with voltages held from their samples on:
+    by how much it depends on the speed at the end of a sample, and how much on that at its start."""
 
-    sooner: bool  # it settles sooner than in the fit, whose larger inductance may stand for a voltage that acts late
-    as_mean: bool  # it depends on the speeds at both ends of a sample, as only a mean over the sample does
+    sooner: bool  # it settles sooner than in the fit, or may, whose inductance may stand for a voltage that acts late
+    as_mean: bool  # it depends on both speeds, as only a mean over the sample does
 
 
 def settling(equation: ElectricalEquation, given: Prepared, fit: Fit) -> Settling:
-    """Whether the settling of the currents contradicts the fit; it does not where they settle later."""
+    """What the settling of the currents tells of the fit."""
     motor = given.problem.parameters(fit.coordinates)
-    shortest = min(given.problem.tape.sample_time_of(k) for k in training_indices(given))
-    time_constants = float(motor.R / motor.L) * shortest
-    if time_constants < MIN_TIME_CONSTANTS:
-        return Settling(False, False)
-    (remains, before, after, *_), errors, _ = equation.solve(
+    by_fit = np.exp(-float(motor.R / motor.L) * equation.sample_time)
+    (remains, before, after, *_), errors, _ = equation.solve(  # of the current and both speeds
         np.delete(np.arange(COLUMNS), [BEFORE, AFTER])
     )
-    above = np.exp(-time_constants) - remains > max(SHARE_ERRORS * errors[0], MIN_REMAINING)
-    share, error = after / (before + after), np.hypot(*errors[1:3]) / abs(before + after)
-    held = _later_share(remains)
-    as_mean = held - share > SHARE_TOLERANCE + SHARE_ERRORS * error
-    return Settling(bool(above), bool(as_mean and given.averaging is None))
+    # the errors of both are opposite, because the speeds are nearly the same
+    share, error = after / (before + after), SHARE_ERRORS * errors[2] / abs(before + after)
+    if by_fit > MAX_REMAINING or share - error > 1:
+        return Settling(False, False)  # slow currents, or speeds that are not those at the samples
+    # very soon settled, it tells its inductance too inaccurately to exclude that
+    least = -error if by_fit < MAX_HIDDEN else MIN_LATER + error
+    return Settling(
+        sooner=bool(share - _later_share(by_fit) > least),
+        as_mean=bool(_later_share(remains) - share > MIN_EARLIER + error)
+        and given.averaging is None,
+    )
 
 
 def _later_share(remains: float) -> float:
@@ -174,7 +192,8 @@ def electrical_equation(given: Prepared, fit: Fit) -> ElectricalEquation | None:
             further = [x[1:-2, 0], voltage[:-3]]
             row = [x[2:-1, 0], x[2:-1, 1], x[3:, 1], *shared, *further]
             rows.append(np.stack(row, 1)[used])
-    return ElectricalEquation(*map(np.concatenate, (currents, columns, instruments)))
+    rows = map(np.concatenate, (currents, columns, instruments))
+    return ElectricalEquation(*rows, sample_time=tape.sample_time_of(runs[0][0]))
 
 
 def _is_usable(run: Recording) -> bool:

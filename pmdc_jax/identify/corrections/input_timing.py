@@ -10,7 +10,7 @@ So they do for currents that a sensor or a recorder averages from sample to samp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
@@ -42,7 +42,7 @@ from .uneven_sampling import with_even_clock
 # Accuracy, in samples, with which a lead is searched
 LEAD_TOLERANCE = 3e-3
 # Least distance from a sample, in samples, of a voltage that acts between two
-MIN_DISTANCE = 0.02
+MIN_DISTANCE = 0.01
 # Share of the apparent lateness of the voltage, and standard errors, from which it is the current that is late
 MIN_LATE_SHARE, MIN_LATE_ERRORS = 0.3, 5.0
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
@@ -95,11 +95,20 @@ def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
         return []  # without a current, or without a speed, only a delay would show
 
+    equation = electrical_equation(given, fit)
+    seen = two_voltages(equation) if equation else None
+
+    def refit(other: Prepared) -> tuple[Prepared, Fit]:
+        return refitted(other, fit, _inductance(other, fit, seen) if seen else None)
+
+    def misfit(lead: float) -> float:
+        return refit(with_timing(given, Timing(lead)))[1].cost
+
     @cache
     def fitted(timing: Timing) -> tuple[Prepared, Fit]:
         other = without_averaging(with_timing(given, timing))
         # only a fit with the right timing can tell a mean over the last sample from a delay
-        return with_averaging(*with_even_clock(*refitted(other, fit)))
+        return with_averaging(*with_even_clock(*refit(other)))
 
     @cache
     def unlikelihood(timing: Timing) -> float:
@@ -107,11 +116,10 @@ def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
 
     limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
     plausible = _at_samples(given, fit)
-    equation = electrical_equation(given, fit)
-    if equation and (seen := two_voltages(equation)):
-        plausible += _by_two_voltages(given, fit, seen)
+    if seen:
+        plausible += _by_two_voltages(seen, misfit)
     elif equation:
-        hidden = _hidden_by_inductance(given, fit, settling(equation, given, fit))
+        hidden = _hidden_by_inductance(settling(equation, given, fit), misfit)
         plausible += [timing for timing in hidden if leaves_only_noise(*fitted(timing))]
     plausible = [timing for timing in plausible if not only_current_is_late(*fitted(timing))]
     likelier = [timing for timing in plausible if unlikelihood(timing) < limit]
@@ -136,32 +144,36 @@ def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
     return [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
 
 
-def _by_two_voltages(given: Prepared, fit: Fit, seen: TwoVoltages) -> list[Timing]:
+def _by_two_voltages(seen: TwoVoltages, misfit: Callable[[float], float]) -> list[Timing]:
     """The plausible timings where the currents depend on two voltages."""
     ahead, reading = seen.ahead, seen.reading
-    lead = _best_lead(given, fit, ahead) if reading is None else ahead + reading
+    lead = _best_lead(ahead, misfit) if reading is None else ahead + reading
     leads = (0, -1) if ahead < 0 else (1,)
     means = [Timing(lead, current_mean=True) for lead in leads]
     return [*_between_samples(lead), *means]
 
 
-def _hidden_by_inductance(given: Prepared, fit: Fit, settles: Settling) -> list[Timing]:
+def _hidden_by_inductance(settles: Settling, misfit: Callable[[float], float]) -> list[Timing]:
     """The timings for which a wrong inductance may make up where the current settles from one sample to the next."""
     means = [Timing(0, current_mean=True)] if any(settles) else []
-    if not settles.sooner:
-        return means
-    return [*_between_samples(_best_lead(given, fit, -1)), *means]
+    return [*_between_samples(_best_lead(-1, misfit)), *means] if settles.sooner else means
 
 
-def _best_lead(given: Prepared, fit: Fit, ahead: int) -> float:
+def _inductance(other: Prepared, fit: Fit, seen: TwoVoltages) -> float | None:
+    """The inductance, H, with which the currents depend on two voltages as they were seen to, if these act as the
+    timing of the runs says; None if any does."""
+    timing = other.timing
+    if timing is None or timing.reading is None or timing.ahead != seen.ahead:
+        return None
+    R = float(other.problem.parameters(fit.coordinates).R)
+    return R * seen.time_constant(timing.reading)
+
+
+def _best_lead(ahead: int, misfit: Callable[[float], float]) -> float:
     """The lead that fits best, if the voltages act between two samples, at least so many ahead."""
-
-    def misfit(reading: float) -> float:
-        return refitted(with_timing(given, Timing(ahead + reading)), fit)[1].cost
-
-    tolerance = {"xatol": LEAD_TOLERANCE}
-    best = minimize_scalar(misfit, bounds=(MARGIN, 1 - MARGIN), method="bounded", options=tolerance)
-    return ahead + float(best.x)
+    limits, tolerance = (ahead + MARGIN, ahead + 1 - MARGIN), {"xatol": LEAD_TOLERANCE}
+    best = minimize_scalar(misfit, bounds=limits, method="bounded", options=tolerance)
+    return float(best.x)
 
 
 def _between_samples(lead: float) -> list[Timing]:

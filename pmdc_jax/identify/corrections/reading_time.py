@@ -19,7 +19,7 @@ from ..problem import Problem, evaluate
 # Refits to the fitted instant, the change of it, in samples, by which the outputs are differentiated, and its least
 # distance from a sample
 MAX_REFITS, DIFFERENCE, MARGIN = 12, 1e-4, 0.005
-# Refits end when the instant moved by less than this in the last two, in samples
+# Refits end when the instant moves by less than this, in samples
 TOLERANCE = 2e-4
 
 
@@ -29,37 +29,44 @@ def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 
     Where something else is missing from the motor, the instant stays: it would move to make up for that.
     """
-    reading = given.problem.tape.reading
-    if reading is None:
+    instant = given.reading
+    if instant is None:
         return given, fit
-    instants = [float(reading)]
+    given, fit = _with_nuisance(given, fit)
+    moved, refit = given, fit
     for _ in range(MAX_REFITS):
-        change = change_by_reading(given.problem, fit)
-        given = given._replace(problem=replace(given.problem, nuisance=change[..., None]))
-        fit = polish(given.problem, fit.optimum)
-        if not leaves_only_noise(given, fit):
-            return given, fit
-        instants.append(_better_instant(given.problem, fit, change))
-        given = _read_at(given, instants[-1])
-        # every other refit moves the parameters instead, along a valley
-        if np.ptp(instants[-3:]) < TOLERANCE and len(instants) > 2:
+        before, instant = instant, _better_instant(moved.problem, refit)
+        moved, refit = _with_nuisance(_read_at(moved, instant), refit)
+        if abs(instant - before) < TOLERANCE:
             break
+    return (moved, refit) if leaves_only_noise(moved, refit) else (given, fit)
+
+
+def _with_nuisance(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+    """The runs with the instant of reading as a nuisance parameter, and the fit to them."""
+    change = change_by_reading(given.problem, fit)
+    given = given._replace(problem=replace(given.problem, nuisance=change[..., None]))
     return given, polish(given.problem, fit.optimum)
 
 
 def change_by_reading(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
     """Derivative of the outputs, A and rad/s, by the instant of reading, in samples; zero at the first two samples of a
     run, where the initial state can make up for it."""
-    tape = problem.tape
-    later = replace(problem, tape=replace(tape, reading=jnp.asarray(tape.reading) + DIFFERENCE))
-    change = (evaluate(later, fit.unknowns).seen - fit.evaluation.seen) / DIFFERENCE
-    return change.at[jnp.asarray(tape.begins), :, :2].set(0.0)
+
+    def seen(difference: float) -> Float[Array, "blocks 2 samples"]:
+        reading = jnp.asarray(problem.tape.reading) + difference
+        read = replace(problem, tape=replace(problem.tape, reading=reading))
+        return evaluate(read, fit.unknowns).seen
+
+    change = (seen(DIFFERENCE) - seen(-DIFFERENCE)) / (2 * DIFFERENCE)
+    return change.at[jnp.asarray(problem.tape.begins), :, :2].set(0.0)
 
 
-def _better_instant(problem: Problem, fit: Fit, change: Float[Array, "blocks 2 samples"]) -> float:
+def _better_instant(problem: Problem, fit: Fit) -> float:
     """When the residuals of a fit say that the outputs were read. Its parameters do not respond, because their
     derivatives are orthogonal to the `change`."""
-    tape = problem.tape
+    assert problem.nuisance is not None
+    tape, change = problem.tape, problem.nuisance[..., 0]
     scale = tape.weight / fit.noise[:, None] * problem.fitted_blocks[:, None, None]
     left, column = (tape.measured - fit.evaluation.seen) * scale, change * scale
     later = float(jnp.sum(left * column) / jnp.sum(column**2))

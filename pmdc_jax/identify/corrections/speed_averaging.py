@@ -19,8 +19,10 @@ from ...recording import OVER_BOTH, OVER_LAST, Averaging
 from ...simulate import Tape
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..noise import quantum
+from ..parameters import Parameters
 from ..polish import Fit, polish
 from ..prepare import Prepared
+from ..refine import Optimum
 
 # Most lines of an encoder, and by how much a computed number of lines may differ from a whole one
 MAX_LINES, LINES_TOLERANCE = 2e4, 0.02
@@ -121,18 +123,30 @@ def _shifted_earlier(given: Prepared) -> Prepared:
     return given.with_tape(measured=jnp.asarray(laid.measured), weight=weight)
 
 
-def refitted(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def refitted(given: Prepared, fit: Fit, inductance: float | None = None) -> tuple[Prepared, Fit]:
     """The runs, and the best fit to them that starts from `fit`, or from there with a smaller inductance: a large one
-    may have compensated part of a sample of delay."""
-    parameters, unknowns = given.problem.parameters, fit.unknowns
+    may have compensated part of a sample of delay.
+
+    **Arguments**: `inductance`, H, if it is known about which, to start from.
+    """
+    parameters = given.problem.parameters
     starts = [fit.optimum]
-    if "L" in parameters.names and (given.averaging == OVER_LAST or given.current_mean):
+    if "L" in parameters.names:
         L = parameters.names.index("L")
-        less = jnp.maximum(unknowns.coordinates[L] - L_REDUCTION, parameters.lower[L])
-        coordinates = unknowns.coordinates.at[L].set(less)
-        starts.append(fit.optimum._replace(unknowns=unknowns._replace(coordinates=coordinates)))
+        reduced = float(fit.coordinates[L]) - L_REDUCTION
+        if inductance is not None:
+            starts = [_moved(fit.optimum, parameters, L, np.log(inductance))]
+        elif given.averaging == OVER_LAST or given.current_mean:
+            starts.append(_moved(fit.optimum, parameters, L, reduced))
     ends = [polish(given.problem, start) for start in starts]
     return given, min(ends, key=lambda end: end.cost)
+
+
+def _moved(start: Optimum, parameters: Parameters, k: int, coordinate: float) -> Optimum:
+    """A start with another value of one coordinate, within its bounds."""
+    inside = float(np.clip(coordinate, parameters.lower[k], parameters.upper[k]))
+    coordinates = start.unknowns.coordinates.at[k].set(inside)
+    return start._replace(unknowns=start.unknowns._replace(coordinates=coordinates))
 
 
 def _averaging_by_noise(given: Prepared) -> tuple[Averaging | None, float, bool]:
