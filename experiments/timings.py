@@ -1,11 +1,12 @@
-"""Are motors identified whose voltages are not held from sample to sample? Random motors, five kinds of log each.
+"""Are motors identified whose voltages are not held from sample to sample? Random motors, seven kinds of log each.
 
 `python -m experiments.timings [--motors 10] [--first 2000]`
 
-Motors of 1 W to 20 kW, sampled 0.1 to 6 times in L / R, three runs of each; two of three motors have a load that is
+Motors of 1 W to 20 kW, sampled every 0.1 to 20 times L / R, three runs of each; two of three motors have a load that is
 switched on and off in one run. SciPy simulates the linear motor exactly (`expm`), with voltages that are held from
-sample to sample; are linear between samples; are recorded a sample late, beside their response; act a sample late; or
-are linear while the speed is the difference of encoder counts. `identify` gets only the recordings.
+sample to sample; are linear between samples; are recorded a sample late, beside their response; act a sample late; act
+some fraction of a sample early or late; or are linear while the speed is the difference of encoder counts; and with
+currents that are means over the last sample. `identify` gets only the recordings.
 """
 
 import argparse
@@ -20,7 +21,15 @@ from scipy.linalg import expm
 from benchmarks.virtual_bench import SIX
 from pmdc_jax import Recording, identify
 
-WAYS = ("held", "straight", "recorded late", "acts late", "straight, counted")
+WAYS = (
+    "held",
+    "straight",
+    "recorded late",
+    "acts late",
+    "between samples",
+    "straight, counted",
+    "mean current",
+)
 EXCITATIONS = ("steps", "prbs", "chirp", "sines", "one way")
 LINES = 2048
 
@@ -50,7 +59,7 @@ def random_motor(rng: np.random.Generator) -> RandomMotor:
     L = R * time_constant_s * 10 ** rng.uniform(-2, -0.7)
     f = Kt * amperes * rng.uniform(0.02, 0.15) / speed
     motor = dict(zip(SIX, (R, L, Kb, Kt, time_constant_s * Kb * Kt / R, f), strict=True))
-    sample_time = max(L / R / 10 ** rng.uniform(-0.7, 0.9), time_constant_s / 200)
+    sample_time = max(L / R / 10 ** rng.uniform(-1.3, 0.9), time_constant_s / 200)
     return RandomMotor(motor, volts, amperes, speed, time_constant_s, float(f"{sample_time:.1g}"))
 
 
@@ -76,26 +85,29 @@ def voltage(
     return volts * (0.25 * sines if kind == "sines" else 0.5 + 0.08 * sines)
 
 
-def motion(motor: RandomMotor, v: np.ndarray, load: np.ndarray, straight: bool) -> np.ndarray:
-    """Current, speed and angle from rest, (samples, 3)."""
+def motion(
+    motor: RandomMotor, v: np.ndarray, load: np.ndarray, straight: bool, read_after: float
+) -> np.ndarray:
+    """Current, speed, angle and charge from rest, (samples, 4), read after this share of each sample."""
     R, L, Kb, Kt, J, f = (motor.parameters[name] for name in SIX)
-    # of current, speed, angle, voltage, load and the slope of the voltage
-    rates = np.zeros((6, 6))
-    rates[0, [0, 1, 3]] = -R / L, -Kb / L, 1 / L
-    rates[1, [0, 1, 4]] = Kt / J, -f / J, -1 / J
-    rates[2, 1] = rates[3, 5] = 1.0
-    after = expm(rates * motor.sample_time)[:3]
+    # of current, speed, angle, charge, voltage, load and the slope of the voltage
+    rates = np.zeros((7, 7))
+    rates[0, [0, 1, 4]] = -R / L, -Kb / L, 1 / L
+    rates[1, [0, 1, 5]] = Kt / J, -f / J, -1 / J
+    rates[2, 1] = rates[3, 0] = rates[4, 6] = 1.0
+    after, until_read = (expm(rates * share * motor.sample_time)[:4] for share in (1.0, read_after))
     rise = np.diff(v, append=v[-1]) / motor.sample_time * straight
-    states = np.zeros((len(v), 3))
-    for k in range(len(v) - 1):
-        states[k + 1] = after @ np.concatenate([states[k], [v[k], load[k], rise[k]]])
-    return states
+    state, seen = np.zeros(4), np.zeros((len(v), 4))
+    for k, inputs in enumerate(zip(v, load, rise, strict=True)):
+        seen[k] = until_read @ np.concatenate([state, inputs])
+        state = after @ np.concatenate([state, inputs])
+    return seen
 
 
 def log(
-    motor: RandomMotor, way: str, kind: str, loaded: bool, rng: np.random.Generator
+    motor: RandomMotor, way: str, lead: float, kind: str, loaded: bool, rng: np.random.Generator
 ) -> Recording:
-    """One run, with this kind of log."""
+    """One run, with this kind of log; between samples the voltage acts this share of one earlier than recorded."""
     samples = int(
         np.clip(rng.uniform(20, 60) * motor.time_constant_s / motor.sample_time, 600, 8000)
     )
@@ -103,14 +115,17 @@ def log(
     v = voltage(kind, motor, time, rng)
     torque = motor.parameters["Kt"] * motor.amperes * rng.uniform(0.3, 0.7)
     load = torque * loaded * (np.sin(19 * time / time[-1]) > 0)
-    seen = motion(motor, v, load, "straight" in way)
+    lead = {"between samples": lead, "acts late": -1.0}.get(way, 0.0)
+    seen = motion(motor, v, load, "straight" in way, read_after=lead % 1)
+    if way == "mean current":
+        seen[:, 0] = np.diff(seen[:, 3], prepend=0.0) / motor.sample_time
     noise = np.array([motor.amperes, motor.speed]) * 10 ** rng.uniform([-3.3, -3.7], [-1.7, -2.0])
     current, speed = (seen[:, :2] + noise * rng.standard_normal((samples, 2))).T
     if "counted" in way:
         count = 2 * np.pi / LINES
         speed = np.diff(count * np.round(seen[:, 2] / count), prepend=0.0) / motor.sample_time
     before, after = slice(None, -1), slice(1, None)
-    driven = after if way == "acts late" else before
+    driven = after if lead < 0 else before
     measured = after if way == "recorded late" else before
     return Recording(
         kind, time[before], v[driven], current[measured], speed[measured], load[before]
@@ -122,8 +137,8 @@ def errors(seed: int, way: str) -> tuple[float, float]:
     rng = np.random.default_rng(seed)
     motor = random_motor(rng)
     loaded = rng.random() < 2 / 3
-    kinds = rng.choice(EXCITATIONS, 3, replace=False)
-    runs = [log(motor, way, kind, loaded and kind == kinds[1], rng) for kind in kinds]
+    kinds, lead = rng.choice(EXCITATIONS, 3, replace=False), rng.uniform(-1, 1)
+    runs = [log(motor, way, lead, kind, loaded and kind == kinds[1], rng) for kind in kinds]
     found = {n: e for n, e in identify(runs).parameters.items() if e.status == "identified"}
     error = {name: e.value - motor.parameters[name] for name, e in found.items()}
     return (
@@ -151,7 +166,7 @@ def main() -> None:
         shown.add_row(str(seed), *(f"{sure:.1f} ({percent:.2f})" for sure, percent in cells))
     medians = (np.median([found[seed, way] for seed in seeds], axis=0) for way in WAYS)
     shown.add_row("median", *(f"{sure:.1f} ({percent:.2f})" for sure, percent in medians))
-    Console(width=120).print(shown)
+    Console(width=140).print(shown)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from .problem import (
     evaluate,
     flatten,
     normal_matrix,
+    scaled,
     unflatten,
     whitened,
 )
@@ -281,14 +282,6 @@ def with_holdout_unknowns(problem: Problem, fit: Fit) -> Fit:
     weighted = scaled(evaluation, np.asarray(problem.noise) / fit.noise)
     fitted = jnp.asarray(problem.fitted_blocks)
     return fit._replace(optimum=optimum, evaluation=select_blocks(fitted, fit.evaluation, weighted))
-
-
-def scaled(evaluation: Evaluation, stretch: Float[np.ndarray, "2"]) -> Evaluation:
-    """Residuals and derivatives multiplied by a factor for each output."""
-    return evaluation._replace(
-        residuals=evaluation.residuals * stretch[:, None],
-        jacobian=evaluation.jacobian * stretch[:, None, None],
-    )
 
 
 def _select_runs(chosen: Bool[Array, " runs"], one: RunUnknowns, other: RunUnknowns) -> RunUnknowns:

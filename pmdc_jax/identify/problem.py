@@ -30,6 +30,15 @@ class Unknowns(NamedTuple):
     runs: RunUnknowns
 
 
+class Nuisance(eqx.Module):
+    """Unknowns of each run that only need to be allowed for: what their responses can explain is projected out of the
+    residuals."""
+
+    responses: Float[Array, "blocks 2 samples nuisances"]  # of the outputs, A and rad/s
+    # standard deviations of current A and speed rad/s, by which the two are weighed against each other
+    noise: Float[Array | np.ndarray, "2"]
+
+
 class Problem(eqx.Module):
     """A least-squares problem: runs on tape, the noise to scale by, the free coordinates and the runs to fit.
 
@@ -42,8 +51,7 @@ class Problem(eqx.Module):
     free: Bool[Array, " parameters"]
     fitted_runs: Bool[Array, " runs"]
     whitening: Whitening | None = None  # in place of the noise, where residuals are correlated
-    # response of the outputs, A and rad/s, to each nuisance parameter of a run: projected out of the residuals
-    nuisance: Float[Array, "blocks 2 samples nuisances"] | None = None
+    nuisance: Nuisance | None = None
 
     @property
     def outputs(self) -> int:
@@ -113,6 +121,14 @@ class Evaluation(NamedTuple):
     jacobian: Float[Array, "blocks 2 samples columns"]
 
 
+def scaled(evaluation: Evaluation, stretch: Float[Array | np.ndarray, "2"]) -> Evaluation:
+    """Residuals and derivatives multiplied by a factor for each output."""
+    return evaluation._replace(
+        residuals=evaluation.residuals * stretch[:, None],
+        jacobian=evaluation.jacobian * stretch[:, None, None],
+    )
+
+
 def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     """Simulate every run of the problem and compare it with the measurement."""
     # without whitening and nuisance, so that the simulation, slow to compile, is compiled only once
@@ -166,14 +182,15 @@ _evaluate, _evaluate_linear = compiled(_evaluated), quickly_compiled(_evaluated)
 
 def _without_nuisance(problem: Problem, plain: Evaluation) -> Evaluation:
     """The evaluation with residuals and derivatives orthogonal to the responses to the nuisance parameters, if any."""
-    return plain if problem.nuisance is None else _orthogonal(problem, plain)
+    if problem.nuisance is None:
+        return plain
+    weight = problem.noise / problem.nuisance.noise
+    return scaled(_orthogonal(problem.tape, problem.nuisance, scaled(plain, weight)), 1 / weight)
 
 
 @compiled
-def _orthogonal(problem: Problem, plain: Evaluation) -> Evaluation:
-    tape = problem.tape
-    assert problem.nuisance is not None
-    nuisance = problem.nuisance * (tape.weight / problem.noise[:, None])[..., None]
+def _orthogonal(tape: Tape, allowed: Nuisance, plain: Evaluation) -> Evaluation:
+    nuisance = allowed.responses * (tape.weight / allowed.noise[:, None])[..., None]
     both = jnp.concatenate([nuisance, plain.jacobian, plain.residuals[..., None]], -1)
     products = jax.ops.segment_sum(
         jnp.einsum("bcsi,bcsj->bij", nuisance, both), tape.run, tape.runs

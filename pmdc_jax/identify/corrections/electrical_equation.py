@@ -19,10 +19,12 @@ from ..prepare import Prepared
 # How many standard errors from zero the coefficient of the second voltage must be, and the share of the squared
 # residuals of the electrical equation that it must explain
 MIN_Z, MIN_EXPLAINED = 10.0, 0.05
-# ... and the largest effect of the one on the other side, relative to it: a noisy voltage seems to have both
-MAX_OTHER_SIDE = 0.3
-# ... and the largest share of what is left that the further columns of a filtered current may explain
-MAX_BY_FILTER = 0.2
+# ... and the share of what it explains together with one on the other side, or the largest effect of that relative to
+# its own: a noisy voltage seems to have both
+MIN_OF_THREE, MAX_OTHER_SIDE = 0.95, 0.3
+# ... and the largest share that the further columns of a filtered current may explain of what is left, and of what the
+# second voltage explains
+MAX_BY_FILTER, MAX_OF_TWO = 0.2, 0.01
 # A current settles from one sample to the next if this share of it is left at most, and very soon if this; the least
 # differences that count of the share of the later speed, if it is larger and if it is smaller
 MAX_REMAINING, MAX_HIDDEN, MIN_LATER, MIN_EARLIER = 0.4, 0.02, 0.02, 0.1
@@ -51,9 +53,8 @@ class ElectricalEquation(NamedTuple):
     instruments: Float[np.ndarray, "samples columns"]
     sample_time: float  # s
 
-    def solve(self, used: Int[np.ndarray, " used"]) -> tuple[np.ndarray, np.ndarray, float]:
-        """Coefficients of all columns, zero where they are not used, their standard errors, and the mean square that is
-        left.
+    def solve(self, used: Int[np.ndarray, " used"]) -> Solution:
+        """The solution with the columns used.
 
         By instrumental variables, because noise of the currents would bias least squares; errors as of White (1980).
         """
@@ -65,7 +66,15 @@ class ElectricalEquation(NamedTuple):
         scores = inverse @ (Z * left[:, None]).T
         of_all = np.zeros((2, WITH_FILTER))
         of_all[:, used] = coefficients / size, np.sqrt(np.square(scores).sum(1)) / size
-        return of_all[0], of_all[1], float(np.mean(np.square(left)))
+        return Solution(of_all[0], of_all[1], float(np.mean(np.square(left))))
+
+
+class Solution(NamedTuple):
+    """What solves the electrical equation, zero for columns that are not used."""
+
+    coefficients: Float[np.ndarray, " columns"]
+    errors: Float[np.ndarray, " columns"]  # standard
+    left: float  # mean square that is left
 
 
 class TwoVoltages(NamedTuple):
@@ -87,30 +96,33 @@ class TwoVoltages(NamedTuple):
 def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
     """How the currents depend on two voltages: these begin to act between two samples, or are straight between them, or
     the currents are means. None if they act at a sample, as far as the currents tell."""
-    coefficients, errors, left = equation.solve(np.arange(COLUMNS))
-    own, other = (AFTER, BEFORE) if coefficients[AFTER] > coefficients[BEFORE] else (BEFORE, AFTER)
-    # the three are nearly collinear where the current settles within a sample, two seldom
+    by_three = equation.solve(np.arange(COLUMNS))
+    gains = by_three.coefficients
+    own, other = (AFTER, BEFORE) if gains[AFTER] > gains[BEFORE] else (BEFORE, AFTER)
+    by_one = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))
     by_two = equation.solve(np.delete(np.arange(COLUMNS), other))
-    if (1 - MIN_EXPLAINED) * by_two[2] < left:
-        coefficients, errors, left = by_two
-    elif abs(coefficients[other]) > MAX_OTHER_SIDE * coefficients[own]:
+    if by_one.left - by_two.left < MIN_OF_THREE * (by_one.left - by_three.left):
+        # it explains much, or the two are collinear, as where a current settles within a sample
+        if abs(gains[other]) > MAX_OTHER_SIDE * gains[own]:
+            return None
+        by_two = by_three
+    coefficients, errors, left = by_two
+    if coefficients[own] < MIN_Z * errors[own] or left > (1 - MIN_EXPLAINED) * by_one.left:
         return None
-    left_by_one = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))[2]
-    if coefficients[own] < MIN_Z * errors[own] or left > (1 - MIN_EXPLAINED) * left_by_one:
-        return None
-    if equation.solve(np.arange(WITH_FILTER))[2] < (1 - MAX_BY_FILTER) * left:
+    by_filter = left - equation.solve(np.arange(WITH_FILTER)).left
+    if by_filter > max(MAX_BY_FILTER * left, MAX_OF_TWO * (by_one.left - left)):
         return None
     later = AFTER if own == AFTER else NOW
     both = [later - 1, later]
     share = float(coefficients[later] / coefficients[both].sum())
     shares = share + SHARE_ERRORS * np.hypot(*errors[both]) / coefficients[both].sum() * SIDES
     remains = coefficients[0] + SHARE_ERRORS * errors[0] * SIDES
-    lowest, left, highest = 1 - shares[::-1] * (1 - remains[1])
+    lowest, remainder, highest = 1 - shares[::-1] * (1 - remains[1])
     readings = [_reading(s, r) for s in shares for r in remains]
     return TwoVoltages(
         ahead=0 if own == AFTER else -1,
         reading=_reading(share, remains[1]) if np.ptp(readings) < MAX_SPREAD else None,
-        left=float(np.clip(left if lowest > 0 else highest, *REMAINING)),
+        left=float(np.clip(remainder if lowest > 0 else highest, *REMAINING)),
         sample_time=equation.sample_time,
     )
 
@@ -127,9 +139,11 @@ def settling(equation: ElectricalEquation, given: Prepared, fit: Fit) -> Settlin
     """What the settling of the currents tells of the fit."""
     motor = given.problem.parameters(fit.coordinates)
     by_fit = np.exp(-float(motor.R / motor.L) * equation.sample_time)
-    (remains, before, after, *_), errors, _ = equation.solve(  # of the current and both speeds
-        np.delete(np.arange(COLUMNS), [BEFORE, AFTER])
-    )
+    found = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))
+    (remains, before, after), errors = (
+        found.coefficients[:3],
+        found.errors,
+    )  # current and both speeds
     # the errors of both are opposite, because the speeds are nearly the same
     share, error = after / (before + after), SHARE_ERRORS * errors[2] / abs(before + after)
     if by_fit > MAX_REMAINING or share - error > 1:

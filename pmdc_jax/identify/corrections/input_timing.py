@@ -10,9 +10,8 @@ So they do for currents that a sensor or a recorder averages from sample to samp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from typing import NamedTuple
 
 import attrs
@@ -28,7 +27,7 @@ from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_lo
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
-from .electrical_equation import Settling, TwoVoltages, electrical_equation, settling, two_voltages
+from .electrical_equation import electrical_equation, settling, two_voltages
 from .reading_time import MARGIN, change_by_reading
 from .speed_averaging import (
     refitted,
@@ -94,44 +93,66 @@ def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
     """
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
         return []  # without a current, or without a speed, only a delay would show
-
-    equation = electrical_equation(given, fit)
-    seen = two_voltages(equation) if equation else None
-
-    def refit(other: Prepared) -> tuple[Prepared, Fit]:
-        return refitted(other, fit, _inductance(other, fit, seen) if seen else None)
-
-    def misfit(lead: float) -> float:
-        return refit(with_timing(given, Timing(lead)))[1].cost
-
-    @cache
-    def fitted(timing: Timing) -> tuple[Prepared, Fit]:
-        other = without_averaging(with_timing(given, timing))
-        # only a fit with the right timing can tell a mean over the last sample from a delay
-        return with_averaging(*with_even_clock(*refit(other)))
-
-    @cache
-    def unlikelihood(timing: Timing) -> float:
-        return negative_log_likelihood_within(*fitted(timing))
-
+    trials = _Trials(given, fit)
+    plausible = [
+        timing
+        for timing in (*_at_samples(given, fit), *_by_electrical_equation(trials))
+        if not only_current_is_late(*trials.fitted(timing))
+    ]
     limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
-    plausible = _at_samples(given, fit)
-    if seen:
-        plausible += _by_two_voltages(seen, misfit)
-    elif equation:
-        hidden = _hidden_by_inductance(settling(equation, given, fit), misfit)
-        plausible += [timing for timing in hidden if leaves_only_noise(*fitted(timing))]
-    plausible = [timing for timing in plausible if not only_current_is_late(*fitted(timing))]
-    likelier = [timing for timing in plausible if unlikelihood(timing) < limit]
+    likelier = [timing for timing in plausible if trials.unlikelihood(timing) < limit]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     simpler = [timing for timing in likelier if not timing.current_mean]
-    limit = min(map(unlikelihood, simpler), default=np.inf) - MIN_LOG_LIKELIHOOD_GAIN
-    likelier = simpler + [t for t in likelier if t.current_mean and unlikelihood(t) < limit]
+    limit = min(map(trials.unlikelihood, simpler), default=np.inf) - MIN_LOG_LIKELIHOOD_GAIN
+    likelier = simpler + [t for t in likelier if t.current_mean and trials.unlikelihood(t) < limit]
     if any(run.load is not None for run in given.training):
         likelier = [
-            t if t.reading else min(t, t._replace(load=True), key=unlikelihood) for t in likelier
+            t if t.reading else min(t, t._replace(load=True), key=trials.unlikelihood)
+            for t in likelier
         ]
-    return sorted(likelier, key=unlikelihood)
+    return sorted(likelier, key=trials.unlikelihood)
+
+
+class _Trials:
+    """Fits of the runs with other timings, each made once."""
+
+    def __init__(self, given: Prepared, fit: Fit) -> None:
+        """**Arguments**: as of `other_timings`."""
+        self.given, self.fit = given, fit
+        self.equation = electrical_equation(given, fit)
+        self.seen = two_voltages(self.equation) if self.equation else None
+        self._fitted: dict[Timing, tuple[Prepared, Fit]] = {}
+
+    def fitted(self, timing: Timing) -> tuple[Prepared, Fit]:
+        """The runs with this timing, and the fit to them."""
+        if timing not in self._fitted:
+            refit = self._refitted(without_averaging(with_timing(self.given, timing)))
+            # only a fit with the right timing can tell a mean over the last sample from a delay
+            self._fitted[timing] = with_averaging(*with_even_clock(*refit))
+        return self._fitted[timing]
+
+    def unlikelihood(self, timing: Timing) -> float:
+        """The negative log-likelihood of this timing."""
+        return negative_log_likelihood_within(*self.fitted(timing))
+
+    def best_lead(self, ahead: int) -> float:
+        """The lead that fits best, if the voltages act between two samples, at least so many ahead."""
+
+        def misfit(lead: float) -> float:
+            return self._refitted(with_timing(self.given, Timing(lead)))[1].cost
+
+        limits, tolerance = (ahead + MARGIN, ahead + 1 - MARGIN), {"xatol": LEAD_TOLERANCE}
+        best = minimize_scalar(misfit, bounds=limits, method="bounded", options=tolerance)
+        return float(best.x)
+
+    def _refitted(self, other: Prepared) -> tuple[Prepared, Fit]:
+        """The best fit to the runs with another timing, from the inductance with which the currents depend on two
+        voltages as they were seen to."""
+        timing, seen = other.timing, self.seen
+        if not (seen and timing and timing.reading and timing.ahead == seen.ahead):
+            return refitted(other, self.fit)
+        R = float(other.problem.parameters(self.fit.coordinates).R)
+        return refitted(other, self.fit, R * seen.time_constant(timing.reading))
 
 
 def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
@@ -144,36 +165,23 @@ def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
     return [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
 
 
-def _by_two_voltages(seen: TwoVoltages, misfit: Callable[[float], float]) -> list[Timing]:
-    """The plausible timings where the currents depend on two voltages."""
-    ahead, reading = seen.ahead, seen.reading
-    lead = _best_lead(ahead, misfit) if reading is None else ahead + reading
-    leads = (0, -1) if ahead < 0 else (1,)
-    means = [Timing(lead, current_mean=True) for lead in leads]
-    return [*_between_samples(lead), *means]
-
-
-def _hidden_by_inductance(settles: Settling, misfit: Callable[[float], float]) -> list[Timing]:
-    """The timings for which a wrong inductance may make up where the current settles from one sample to the next."""
-    means = [Timing(0, current_mean=True)] if any(settles) else []
-    return [*_between_samples(_best_lead(-1, misfit)), *means] if settles.sooner else means
-
-
-def _inductance(other: Prepared, fit: Fit, seen: TwoVoltages) -> float | None:
-    """The inductance, H, with which the currents depend on two voltages as they were seen to, if these act as the
-    timing of the runs says; None if any does."""
-    timing = other.timing
-    if timing is None or timing.reading is None or timing.ahead != seen.ahead:
-        return None
-    R = float(other.problem.parameters(fit.coordinates).R)
-    return R * seen.time_constant(timing.reading)
-
-
-def _best_lead(ahead: int, misfit: Callable[[float], float]) -> float:
-    """The lead that fits best, if the voltages act between two samples, at least so many ahead."""
-    limits, tolerance = (ahead + MARGIN, ahead + 1 - MARGIN), {"xatol": LEAD_TOLERANCE}
-    best = minimize_scalar(misfit, bounds=limits, method="bounded", options=tolerance)
-    return float(best.x)
+def _by_electrical_equation(trials: _Trials) -> list[Timing]:
+    """The timings that the electrical equation makes plausible."""
+    if trials.equation is None:
+        return []
+    if trials.seen:
+        ahead, reading = trials.seen.ahead, trials.seen.reading
+        means = [Timing(lead, current_mean=True) for lead in ((0, -1) if ahead < 0 else (1,))]
+        told = [] if reading is None else _between_samples(ahead + reading)
+        # the equation takes the speed as straight between samples
+        if any(leaves_only_noise(*trials.fitted(timing)) for timing in told + means):
+            return told + means
+        return [*_between_samples(trials.best_lead(ahead)), *told, *means]
+    settles = settling(trials.equation, trials.given, trials.fit)
+    # a wrong inductance may make up for these where the current settles from one sample to the next
+    hidden = _between_samples(trials.best_lead(-1)) if settles.sooner else []
+    hidden += [Timing(0, current_mean=True)] if any(settles) else []
+    return [timing for timing in hidden if leaves_only_noise(*trials.fitted(timing))]
 
 
 def _between_samples(lead: float) -> list[Timing]:

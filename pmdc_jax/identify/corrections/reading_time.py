@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ..likelihood import leaves_only_noise
 from ..polish import Fit, polish
 from ..prepare import Prepared
-from ..problem import Problem, evaluate
+from ..problem import Nuisance, Problem, evaluate
 
 # Refits to the fitted instant, the change of it, in samples, by which the outputs are differentiated, and its least
 # distance from a sample
@@ -44,8 +44,8 @@ def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 
 def _with_nuisance(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the instant of reading as a nuisance parameter, and the fit to them."""
-    change = change_by_reading(given.problem, fit)
-    given = given._replace(problem=replace(given.problem, nuisance=change[..., None]))
+    nuisance = Nuisance(change_by_reading(given.problem, fit)[..., None], fit.noise)
+    given = given._replace(problem=replace(given.problem, nuisance=nuisance))
     return given, polish(given.problem, fit.optimum)
 
 
@@ -66,7 +66,7 @@ def _better_instant(problem: Problem, fit: Fit) -> float:
     """When the residuals of a fit say that the outputs were read. Its parameters do not respond, because their
     derivatives are orthogonal to the `change`."""
     assert problem.nuisance is not None
-    tape, change = problem.tape, problem.nuisance[..., 0]
+    tape, change = problem.tape, problem.nuisance.responses[..., 0]
     scale = tape.weight / fit.noise[:, None] * problem.fitted_blocks[:, None, None]
     left, column = (tape.measured - fit.evaluation.seen) * scale, change * scale
     later = float(jnp.sum(left * column) / jnp.sum(column**2))

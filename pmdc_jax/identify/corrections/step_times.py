@@ -21,7 +21,7 @@ from ...simulate.tape import BLOCK
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
-from ..problem import Problem
+from ..problem import Nuisance, Problem
 
 # A step is this many times the change of the voltage in the samples beside it, and this share of the voltage's range
 MIN_STEP_RATIO, MIN_STEP_SHARE = 10.0, 0.05
@@ -126,10 +126,10 @@ def _with_steps(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
     value = np.array(tape.value)
     rise = np.zeros_like(value) if tape.rise is None else np.array(tape.rise)
     most = max(len(s.at) for s in steps)
-    nuisance = np.zeros((*np.shape(tape.measured), most))
+    responses = np.zeros((*np.shape(tape.measured), most))
     for run, s in enumerate(steps):
         mine = np.flatnonzero(tape.blocks_of(run))
-        nuisance[mine, ..., : len(s.at)] = _responses(problem, fit, run, s)
+        responses[mine, ..., : len(s.at)] = _responses(problem, fit, run, s)
         share = np.clip(s.share, 0.0, 1.0)
         block, sample = np.divmod(s.at - 1, BLOCK)
         before = given.runs[run].voltage
@@ -139,7 +139,8 @@ def _with_steps(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
             value[mine[block], sample] = before[s.at - 1] + share * s.height
             rise[mine[block], sample] = 6 * share * (1 - share) * s.height
     tape = replace(tape, value=jnp.asarray(value), rise=jnp.asarray(rise))
-    problem = replace(problem, tape=tape, nuisance=jnp.asarray(nuisance))
+    nuisance = Nuisance(jnp.asarray(responses), fit.noise)
+    problem = replace(problem, tape=tape, nuisance=nuisance)
     return given._replace(problem=problem, stepped=True)
 
 
