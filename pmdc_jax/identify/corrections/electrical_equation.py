@@ -22,9 +22,6 @@ MIN_Z, MIN_EXPLAINED = 10.0, 0.05
 # ... and the share of what it explains together with one on the other side, or the largest effect of that relative to
 # its own: a noisy voltage seems to have both
 MIN_OF_THREE, MAX_OTHER_SIDE = 0.95, 0.3
-# ... and the largest share that the further columns of a filtered current may explain of what is left, and of what the
-# second voltage explains
-MAX_BY_FILTER, MAX_OF_TWO = 0.2, 0.01
 # A current settles from one sample to the next if this share of it is left at most, and very soon if this; the least
 # differences that count of the share of the later speed, if it is larger and if it is smaller
 MAX_REMAINING, MAX_HIDDEN, MIN_LATER, MIN_EARLIER = 0.4, 0.02, 0.02, 0.1
@@ -39,9 +36,8 @@ SIDES = np.array([-1.0, 0.0, 1.0])
 FLOWS, MIN_STEPS = 4.0, 0.2
 
 # Columns of the electrical equation: the current, both speeds, the voltage of the sample before, of this and of the
-# next one, a constant, the direction of the current; and those of a filtered one: the current and the voltage of one
-# sample further back
-BEFORE, NOW, AFTER, COLUMNS, WITH_FILTER = 3, 4, 5, 8, 10
+# next one, a constant, the direction of the current
+BEFORE, NOW, AFTER, COLUMNS = 3, 4, 5, 8
 
 
 class ElectricalEquation(NamedTuple):
@@ -64,7 +60,7 @@ class ElectricalEquation(NamedTuple):
         coefficients = inverse @ (Z.T @ self.current)
         left = self.current - X @ coefficients
         scores = inverse @ (Z * left[:, None]).T
-        of_all = np.zeros((2, WITH_FILTER))
+        of_all = np.zeros((2, COLUMNS))
         of_all[:, used] = coefficients / size, np.sqrt(np.square(scores).sum(1)) / size
         return Solution(of_all[0], of_all[1], float(np.mean(np.square(left))))
 
@@ -108,9 +104,6 @@ def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
         by_two = by_three
     coefficients, errors, left = by_two
     if coefficients[own] < MIN_Z * errors[own] or left > (1 - MIN_EXPLAINED) * by_one.left:
-        return None
-    by_filter = left - equation.solve(np.arange(WITH_FILTER)).left
-    if by_filter > max(MAX_BY_FILTER * left, MAX_OF_TWO * (by_one.left - left)):
         return None
     later = AFTER if own == AFTER else NOW
     both = [later - 1, later]
@@ -203,8 +196,7 @@ def electrical_equation(given: Prepared, fit: Fit) -> ElectricalEquation | None:
         shared = [voltage[1:-2], voltage[2:-1], voltage[3:], np.ones(len(used)), direction]
         currents.append(measured[3:, 0][used])
         for rows, x in ((columns, measured), (instruments, simulated)):
-            further = [x[1:-2, 0], voltage[:-3]]
-            row = [x[2:-1, 0], x[2:-1, 1], x[3:, 1], *shared, *further]
+            row = [x[2:-1, 0], x[2:-1, 1], x[3:, 1], *shared]
             rows.append(np.stack(row, 1)[used])
     rows = map(np.concatenate, (currents, columns, instruments))
     return ElectricalEquation(*rows, sample_time=tape.sample_time_of(runs[0][0]))

@@ -94,11 +94,7 @@ def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
         return []  # without a current, or without a speed, only a delay would show
     trials = _Trials(given, fit)
-    plausible = [
-        timing
-        for timing in (*_at_samples(given, fit), *_by_electrical_equation(trials))
-        if not only_current_is_late(*trials.fitted(timing))
-    ]
+    plausible = [*_at_samples(given, fit), *_by_electrical_equation(trials)]
     limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
     likelier = [timing for timing in plausible if trials.unlikelihood(timing) < limit]
     # where everything is a mean, voltages on straight lines are as good, and simpler
@@ -171,12 +167,17 @@ def _by_electrical_equation(trials: _Trials) -> list[Timing]:
         return []
     if trials.seen:
         ahead, reading = trials.seen.ahead, trials.seen.reading
-        means = [Timing(lead, current_mean=True) for lead in ((0, -1) if ahead < 0 else (1,))]
         told = [] if reading is None else _between_samples(ahead + reading)
+        means = [Timing(lead, current_mean=True) for lead in ((0, -1) if ahead < 0 else (1,))]
+        right = [t for t in told + means if leaves_only_noise(*trials.fitted(t))]
+        right = [t for t in right if not only_current_is_late(*trials.fitted(t))]
+        if right:
+            return right
         # the equation takes the speed as straight between samples
-        if any(leaves_only_noise(*trials.fitted(timing)) for timing in told + means):
-            return told + means
-        return [*_between_samples(trials.best_lead(ahead)), *told, *means]
+        between = [*told, *_between_samples(trials.best_lead(ahead))]
+        # a filtered current is more like a mean than like an instant
+        late = any(only_current_is_late(*trials.fitted(t)) for t in between)
+        return [] if late else between + means
     settles = settling(trials.equation, trials.given, trials.fit)
     # a wrong inductance may make up for these where the current settles from one sample to the next
     hidden = _between_samples(trials.best_lead(-1)) if settles.sooner else []
