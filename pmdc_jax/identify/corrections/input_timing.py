@@ -44,6 +44,8 @@ LEAD_TOLERANCE = 3e-3
 MIN_DISTANCE = 0.01
 # Share of the apparent lateness of the voltage, and standard errors, from which it is the current that is late
 MIN_LATE_SHARE, MIN_LATE_ERRORS = 0.3, 5.0
+# Largest difference, in samples, between the lateness of a current and that of a mean for which it may be one
+MAX_FROM_MEAN = 0.2
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
 MIN_LEAD = 0.3
 
@@ -181,7 +183,10 @@ def _by_electrical_equation(trials: _Trials) -> list[Timing]:
     settles = settling(trials.equation, trials.given, trials.fit)
     # a wrong inductance may make up for these where the current settles from one sample to the next
     hidden = _between_samples(trials.best_lead(-1)) if settles.sooner else []
-    hidden += [Timing(0, current_mean=True)] if any(settles) else []
+    # ... or where the voltages are smooth; the mean of a slow current is half a sample late
+    late, _ = _lateness_of_current(trials.given.problem, trials.fit)
+    if any(settles) or abs(late - 0.5) < MAX_FROM_MEAN:
+        hidden.append(Timing(0, current_mean=True))
     return [timing for timing in hidden if leaves_only_noise(*trials.fitted(timing))]
 
 
@@ -200,13 +205,21 @@ def only_current_is_late(given: Prepared, fit: Fit) -> bool:
     """
     if given.reading is None or given.timing is None or given.timing.ahead >= 0:
         return False
-    problem, current = given.problem, fit.evaluation.seen[:, 0]
+    late, error = _lateness_of_current(given.problem, fit, change_by_reading(given.problem, fit))
+    return late > max(MIN_LATE_SHARE * abs(given.timing.lead), MIN_LATE_ERRORS * error)
+
+
+def _lateness_of_current(
+    problem: Problem, fit: Fit, *changes: Float[Array, "blocks 2 samples"]
+) -> tuple[float, float]:
+    """How much later than assumed the current was read, and the standard error of that, in samples, beside other
+    `changes` of the outputs."""
+    current = fit.evaluation.seen[:, 0]
     rise = jnp.diff(current.reshape(-1), prepend=0.0).reshape(current.shape)
     rise = rise.at[jnp.asarray(problem.tape.begins), 0].set(0.0)
     later = jnp.stack([-rise, jnp.zeros_like(rise)], 1)
-    amplitudes, errors = _amplitudes(problem, fit, [change_by_reading(problem, fit), later])
-    least = max(MIN_LATE_SHARE * abs(given.timing.lead), MIN_LATE_ERRORS * errors[1])
-    return bool(amplitudes[1] > least)
+    amplitudes, errors = _amplitudes(problem, fit, [later, *changes])
+    return float(amplitudes[0]), float(errors[0])
 
 
 def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:
