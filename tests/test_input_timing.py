@@ -263,7 +263,7 @@ FAST = TRUE | {"L": 8e-5}
         pytest.param("late", "acts one sample later", marks=pytest.mark.slow),
         pytest.param("7 tenths", "acts 0.3 of a sample later", marks=pytest.mark.slow),
         pytest.param("3 tenths early", "acts 0.3 of a sample earlier", marks=pytest.mark.slow),
-        pytest.param("5 tenths early", "acts 0.5 of a sample earlier", marks=pytest.mark.slow),
+        ("5 tenths early", "acts 0.5 of a sample earlier"),
         pytest.param("held", None, marks=pytest.mark.slow),
     ],
 )
@@ -304,8 +304,9 @@ def test_what_looks_like_another_inductance_is_found(read, message, truth):
 
 @pytest.mark.parametrize(
     ("tenths", "effects"),
-    [(3, []), pytest.param(7, ["brush_voltage_drop"], marks=pytest.mark.slow)],
+    [(3, []), (7, ["brush_voltage_drop"])],
 )
+@pytest.mark.slow
 def test_the_timing_of_a_voltage_is_found_beside_brushes(tenths, effects):
     """The electrical equation shows it, although a fit without the drop of the brushes is poor at any timing."""
     truth = {name: getattr(vb.paper_motor(), name) for name in PARAMETERS}

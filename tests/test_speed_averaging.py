@@ -185,7 +185,7 @@ def test_counts_printed_in_few_digits_are_recognised():
         assert not _in_counts([(1.0003 * rpm * 2 * np.pi / 60, 0.01)])
 
 
-@pytest.mark.parametrize("known_by", ["angle", "difference"])
+@pytest.mark.parametrize("known_by", ["angle", pytest.param("difference", marks=pytest.mark.slow)])
 def test_differences_of_angles_are_exact_despite_voltage_steps(known_by):
     """Exact angles by the matrix exponential, sampled slowly: a spline is off by 0.27 rad/s and more."""
     plant, step = FAST_MOTOR | {"L": 3e-4}, 2e-3
