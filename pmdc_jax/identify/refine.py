@@ -13,6 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from ..compiled import quickly_compiled
+from .parameters import Parameters
 from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
 MAX_STEPS = 60
@@ -34,6 +35,13 @@ class Optimum(NamedTuple):
     def converged(self) -> bool:
         """Whether the minimum is near, by the gradient and not by a solver's own criterion."""
         return self.distance <= CONVERGED_DISTANCE
+
+    def moved(
+        self, parameters: Parameters, step: Float[Array | np.ndarray, " parameters"]
+    ) -> Optimum:
+        """A start whose coordinates are a step further on, within their bounds."""
+        further = jnp.clip(self.unknowns.coordinates + step, parameters.lower, parameters.upper)
+        return self._replace(unknowns=self.unknowns._replace(coordinates=further))
 
 
 Columns = Float[Array, " columns"]

@@ -133,12 +133,10 @@ def settling(equation: ElectricalEquation, given: Prepared, fit: Fit) -> Settlin
     motor = given.problem.parameters(fit.coordinates)
     by_fit = np.exp(-float(motor.R / motor.L) * equation.sample_time)
     found = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))
-    (remains, before, after), errors = (
-        found.coefficients[:3],
-        found.errors,
-    )  # current and both speeds
+    remains, before, after = found.coefficients[:3]  # of the current and of both speeds
     # the errors of both are opposite, because the speeds are nearly the same
-    share, error = after / (before + after), SHARE_ERRORS * errors[2] / abs(before + after)
+    share = after / (before + after)
+    error = SHARE_ERRORS * found.errors[2] / abs(before + after)
     if by_fit > MAX_REMAINING or share - error > 1:
         return Settling(False, False)  # slow currents, or speeds that are not those at the samples
     # very soon settled, it tells its inductance too inaccurately to exclude that

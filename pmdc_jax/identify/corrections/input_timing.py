@@ -27,7 +27,13 @@ from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_lo
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
-from .electrical_equation import electrical_equation, settling, two_voltages
+from .electrical_equation import (
+    ElectricalEquation,
+    TwoVoltages,
+    electrical_equation,
+    settling,
+    two_voltages,
+)
 from .reading_time import MARGIN, change_by_reading
 from .speed_averaging import (
     refitted,
@@ -133,6 +139,11 @@ class _Trials:
         """The negative log-likelihood of this timing."""
         return negative_log_likelihood_within(*self.fitted(timing))
 
+    def is_right(self, timing: Timing) -> bool:
+        """Whether nothing but noise is left with this timing, and not because the current alone was late."""
+        given, fit = self.fitted(timing)
+        return leaves_only_noise(given, fit) and not only_current_is_late(given, fit)
+
     def best_lead(self, ahead: int) -> float:
         """The lead that fits best, if the voltages act between two samples, at least so many ahead."""
 
@@ -167,27 +178,36 @@ def _by_electrical_equation(trials: _Trials) -> list[Timing]:
     """The timings that the electrical equation makes plausible."""
     if trials.equation is None:
         return []
-    if trials.seen:
-        ahead, reading = trials.seen.ahead, trials.seen.reading
-        told = [] if reading is None else _between_samples(ahead + reading)
-        means = [Timing(lead, current_mean=True) for lead in ((0, -1) if ahead < 0 else (1,))]
-        right = [t for t in told + means if leaves_only_noise(*trials.fitted(t))]
-        right = [t for t in right if not only_current_is_late(*trials.fitted(t))]
-        if right:
-            return right
-        # the equation takes the speed as straight between samples
-        between = [*told, *_between_samples(trials.best_lead(ahead))]
-        # a filtered current is more like a mean than like an instant
-        late = any(only_current_is_late(*trials.fitted(t)) for t in between)
-        return [] if late else between + means
-    settles = settling(trials.equation, trials.given, trials.fit)
-    # a wrong inductance may make up for these where the current settles from one sample to the next
+    return _hidden(trials, trials.equation) if trials.seen is None else _seen(trials, trials.seen)
+
+
+def _seen(trials: _Trials, seen: TwoVoltages) -> list[Timing]:
+    """The plausible timings where the currents depend on two voltages: only right ones, if there are any."""
+    told = [] if seen.reading is None else _between_samples(seen.ahead + seen.reading)
+    means = [Timing(lead, current_mean=True) for lead in ((0, -1) if seen.ahead < 0 else (1,))]
+    if right := [timing for timing in told + means if trials.is_right(timing)]:
+        return right
+    # the equation takes the speed as straight between samples
+    between = [*told, *_between_samples(trials.best_lead(seen.ahead))]
+    # a filtered current is more like a mean than like an instant
+    late = any(only_current_is_late(*trials.fitted(timing)) for timing in between)
+    return [] if late else between + means
+
+
+def _hidden(trials: _Trials, equation: ElectricalEquation) -> list[Timing]:
+    """The right timings for which a wrong inductance may make up, where the current settles from one sample to the next
+    or the voltages are smooth."""
+    settles = settling(equation, trials.given, trials.fit)
     hidden = _between_samples(trials.best_lead(-1)) if settles.sooner else []
-    # ... or where the voltages are smooth; the mean of a slow current is half a sample late
-    late, _ = _lateness_of_current(trials.given.problem, trials.fit)
-    if any(settles) or abs(late - 0.5) < MAX_FROM_MEAN:
+    if any(settles) or _current_seems_mean(trials.given.problem, trials.fit):
         hidden.append(Timing(0, current_mean=True))
-    return [timing for timing in hidden if leaves_only_noise(*trials.fitted(timing))]
+    return [timing for timing in hidden if trials.is_right(timing)]
+
+
+def _current_seems_mean(problem: Problem, fit: Fit) -> bool:
+    """Whether the current was read half a sample late, as the mean of a slow one is."""
+    late, _ = _lateness_of_current(problem, fit)
+    return abs(late - 0.5) < MAX_FROM_MEAN
 
 
 def _between_samples(lead: float) -> list[Timing]:

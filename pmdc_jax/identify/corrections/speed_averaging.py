@@ -19,10 +19,8 @@ from ...recording import OVER_BOTH, OVER_LAST, Averaging
 from ...simulate import Tape
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..noise import quantum
-from ..parameters import Parameters
 from ..polish import Fit, polish
 from ..prepare import Prepared
-from ..refine import Optimum
 
 # Most lines of an encoder, and by how much a computed number of lines may differ from a whole one
 MAX_LINES, LINES_TOLERANCE = 2e4, 0.02
@@ -133,20 +131,14 @@ def refitted(given: Prepared, fit: Fit, inductance: float | None = None) -> tupl
     starts = [fit.optimum]
     if "L" in parameters.names:
         L = parameters.names.index("L")
-        reduced = float(fit.coordinates[L]) - L_REDUCTION
+        along_L = np.eye(len(parameters.names))[L]
         if inductance is not None:
-            starts = [_moved(fit.optimum, parameters, L, np.log(inductance))]
+            change = np.log(inductance) - float(fit.coordinates[L])
+            starts = [fit.optimum.moved(parameters, change * along_L)]
         elif given.averaging == OVER_LAST or given.current_mean:
-            starts.append(_moved(fit.optimum, parameters, L, reduced))
+            starts.append(fit.optimum.moved(parameters, -L_REDUCTION * along_L))
     ends = [polish(given.problem, start) for start in starts]
     return given, min(ends, key=lambda end: end.cost)
-
-
-def _moved(start: Optimum, parameters: Parameters, k: int, coordinate: float) -> Optimum:
-    """A start with another value of one coordinate, within its bounds."""
-    inside = float(np.clip(coordinate, parameters.lower[k], parameters.upper[k]))
-    coordinates = start.unknowns.coordinates.at[k].set(inside)
-    return start._replace(unknowns=start.unknowns._replace(coordinates=coordinates))
 
 
 def _averaging_by_noise(given: Prepared) -> tuple[Averaging | None, float, bool]:

@@ -49,10 +49,8 @@ def with_even_clock(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 
 def _extrapolated(given: Prepared, fit: Fit, step: Float[np.ndarray, " parameters"]) -> Fit:
     """The fit evaluated a `step` further on, within the bounds (Irons and Tuck, doi:10.1002/nme.1620010306)."""
-    parameters, unknowns = given.problem.parameters, fit.unknowns
-    further = jnp.clip(unknowns.coordinates + step, parameters.lower, parameters.upper)
-    optimum = fit.optimum._replace(unknowns=unknowns._replace(coordinates=further))
-    return polish(given.problem, optimum, steps=0)
+    further = fit.optimum.moved(given.problem.parameters, step)
+    return polish(given.problem, further, steps=0)
 
 
 def _squares_between(before: Prepared, after: Prepared, fit: Fit) -> float:
