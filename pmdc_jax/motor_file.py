@@ -129,6 +129,10 @@ def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:
             raise InputError(where, f"effect {name} is listed twice", "Keep one of the two")
         fields = _numbers(where, entry.get("parameters", {}), EFFECTS[name].ranges, name)
         effects[name] = EFFECTS[name](**fields)
+        if not effects[name].is_possible():
+            given = ", ".join(f"{field} {value:g}" for field, value in fields.items())
+            what = f"{name} is physically impossible with {given}"
+            raise InputError(where, what, f"It needs {EFFECTS[name].condition}")
     return tuple(effects.values())
 
 
@@ -144,7 +148,8 @@ def _numbers(
         value = finite_number(where, f"{of}: {name}", given[name], "Give a number in SI")
         if name in PARAMETERS and not (value > 0 or (name == "f" and value == 0)):
             raise InputError(where, f"{of}: {name} is {value}, not positive", "Give a value in SI")
-        if name not in PARAMETERS and wanted[name].scale == "log" and value < 0:
-            raise InputError(where, f"{of}: {name} is {value}, below 0", "Give a value in SI")
+        if name not in PARAMETERS and wanted[name].scale == "log" and value <= 0:
+            mend = "Give a value in SI, or leave the effect out"
+            raise InputError(where, f"{of}: {name} is {value}, not positive", mend)
         numbers[name] = np.asarray(value)
     return numbers

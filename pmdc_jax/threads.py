@@ -31,12 +31,14 @@ def map_in_threads(function: Callable[[A], T], items: Iterable[A]) -> list[T]:
 def map_in_threads_until(
     function: Callable[[A], T], items: Sequence[A], enough: Callable[[list[T]], bool]
 ) -> list[T]:
-    """The same, in batches of one item per core, until the results so far are `enough`."""
+    """The same, until the results of the first items are `enough`: computed in batches of one item per core, but
+    counted one by one, so that the answer does not depend on the number of cores."""
     made: list[T] = []
     for first in range(0, len(items), CORES):
-        made += map_in_threads(function, items[first : first + CORES])
-        if enough(made):
-            break
+        for result in map_in_threads(function, items[first : first + CORES]):
+            made.append(result)
+            if enough(made):
+                return made
     return made
 
 

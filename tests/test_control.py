@@ -478,6 +478,23 @@ def test_drawn_motors_have_the_covariance_they_were_drawn_from():
     assert np.ptp(np.asarray(drawn.L)) == 0
 
 
+def test_no_physically_impossible_motor_is_drawn():
+    shaft = EFFECTS["shaft_compliance"](stiffness_Nm_rad=20.0, damping_Nms_rad=1e-3, load_share=0.9)
+    uncertainty = Uncertainty(("shaft_compliance.load_share",), np.array([[0.1**2]]))
+    drawn = drawn_motors(Motor(**PAPER, effects=(shaft,)), uncertainty, 400, 2)
+    shares = np.asarray(drawn.effects[0].load_share)
+    # without redrawing, 15 % would be above 1
+    assert 0.97 < shares.max() < 1
+    assert np.std(np.log(shares)) == pytest.approx(0.08, abs=0.01)
+
+
+def test_an_uncertainty_that_leaves_hardly_any_motor_possible_is_refused():
+    shaft = EFFECTS["shaft_compliance"](stiffness_Nm_rad=20.0, damping_Nms_rad=1e-3, load_share=1.5)
+    uncertainty = Uncertainty(("shaft_compliance.load_share",), np.array([[1e-4]]))
+    with pytest.raises(InputError, match="impossible"):
+        drawn_motors(Motor(**PAPER, effects=(shaft,)), uncertainty, 10, 0)
+
+
 def test_an_even_spread_applies_to_all_six_parameters():
     drawn = drawn_motors(MOTOR, even_spread(0.1), 4000, 1)
     for name in PARAMETERS:

@@ -82,6 +82,10 @@ def file_without(name: str) -> str:
     return json.dumps({"parameters": {n: x for n, x in PAPER.items() if n != name}})
 
 
+def effect(name: str, *values: float) -> dict[str, object]:
+    return {"name": name, "parameters": dict(zip(EFFECTS[name].ranges, values, strict=True))}
+
+
 INVALID = {
     "empty": ("", "JSON"),
     "not JSON": ("{'parameters': 1}", "JSON"),
@@ -121,6 +125,15 @@ INVALID = {
     "effect of negative size": (
         file_with("effects", 0, "parameters", "torque_Nm", to=-1.0),
         "torque_Nm",
+    ),
+    "effect of no size": (file_with("effects", 0, "parameters", "torque_Nm", to=0), "torque_Nm"),
+    "more than the whole inertia behind a shaft": (
+        file_with("effects", to=[effect("shaft_compliance", 50.0, 1e-3, 1.5)]),
+        "load_share",
+    ),
+    "friction that rises as motion begins": (
+        file_with("effects", to=[effect("stribeck_friction", 0.2, 0.1, 5.0)]),
+        "static_Nm",
     ),
     "twice the same effect": (file_with("effects", to=2 * VALID["effects"]), "coulomb_friction"),
     "effects not in a list": (file_with("effects", to={"coulomb_friction": 0.1}), "effect"),

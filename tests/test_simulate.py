@@ -19,6 +19,7 @@ from scipy import linalg, signal
 from scipy.integrate import solve_ivp
 
 import pmdc_jax
+from pmdc_jax import InputError
 from pmdc_jax.clock import is_even
 from pmdc_jax.effects import CoulombFriction, ResistanceHeating
 from pmdc_jax.motor import PARAMETERS, Motor
@@ -511,6 +512,12 @@ def test_simulate_accepts_a_motor_of_plain_numbers():
     run = recording()
     plain = pmdc_jax.simulate(Motor(**PAPER), run)
     np.testing.assert_array_equal(plain.speed, pmdc_jax.simulate(motor(), run).speed)
+
+
+def test_a_simulation_that_diverges_blames_the_motor():
+    run = recording(voltage=10 * np.ones(SAMPLES))
+    with pytest.raises(InputError, match="motor: its simulation of run diverges at"):
+        pmdc_jax.simulate(motor(L=-1e-7), run)
 
 
 def test_importing_changes_no_setting_and_prints_nothing():

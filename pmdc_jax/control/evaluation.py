@@ -27,12 +27,14 @@ SMALL_STEP = 0.05  # set point of the small step over that of the task
 
 @frozen
 class Robustness:
-    """Metrics over the drawn motors: 95th percentiles, that of settling None where more than 5 % never settle."""
+    """Metrics over the drawn motors: 95th percentiles, None where more than 5 % never settle or cannot be simulated."""
 
     samples: int
-    Overshoot_p95: float
+    Overshoot_p95: float | None
     SettlingTime_p95: float | None
-    overshoot: np.ndarray = field(repr=False)  # of each motor, %
+    overshoot: np.ndarray = field(
+        repr=False
+    )  # of each motor, %; infinite where it cannot be simulated
     settling: np.ndarray = field(repr=False)  # of each motor, s; infinite where it never settles
 
 
@@ -124,15 +126,13 @@ def evaluate_robustness(
     model = SampledMotor.of(motor, task.hardware.sample_time)
     score: Score = _exact_score(task, model, motors, controller)
     settling = np.nan_to_num(np.asarray(score.settling), nan=np.inf)
-    overshoot = np.asarray(score.overshoot)
-    settling_p95 = float(np.quantile(settling, 0.95, method="higher"))
-    return Robustness(
-        samples=len(settling),
-        Overshoot_p95=float(np.quantile(overshoot, 0.95, method="higher")),
-        SettlingTime_p95=settling_p95 if math.isfinite(settling_p95) else None,
-        overshoot=overshoot,
-        settling=settling,
-    )
+    overshoot = np.nan_to_num(np.asarray(score.overshoot), nan=np.inf)
+    return Robustness(len(settling), _p95(overshoot), _p95(settling), overshoot, settling)
+
+
+def _p95(values: np.ndarray) -> float | None:
+    p95 = float(np.quantile(values, 0.95, method="higher"))
+    return p95 if math.isfinite(p95) else None
 
 
 _exact_score = compiled(exact_score)

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ..effects import EFFECTS
+from ..errors import InputError
 from ..motor import PARAMETERS, Motor
 from ..motor_file import Uncertainty
+
+# Times that impossible motors are drawn anew at most
+MAX_DRAWS = 100
 
 
 def even_spread(spread: float) -> Uncertainty:
@@ -18,11 +25,34 @@ def even_spread(spread: float) -> Uncertainty:
 
 def drawn_motors(motor: Motor, uncertainty: Uncertainty, count: int, seed: int) -> Motor:
     """Draw `count` motors around `motor`, stacked. The coordinates are normally distributed: logarithms of the
-    parameters, or the parameters themselves where the `ranges` of an effect say linear."""
+    parameters, or the parameters themselves where the `ranges` of an effect say linear.
+
+    Physically impossible motors are drawn anew.
+
+    **Raises**: `InputError` if hardly any motor is possible.
+    """
     rng = np.random.default_rng(seed)
-    deviations = _antithetic_normal(rng, np.asarray(uncertainty.covariance, float), count)
-    stacked = jax.tree.map(lambda leaf: jnp.full(count, leaf, float), motor)
-    deviation = {name: deviations[:, k] for k, name in enumerate(uncertainty.names)}
+    covariance = np.asarray(uncertainty.covariance, float)
+    deviations = _antithetic_normal(rng, covariance, count)
+    for _ in range(MAX_DRAWS):
+        motors = _moved(motor, uncertainty.names, deviations)
+        impossible = ~np.broadcast_to(motors.is_possible, count)
+        if not impossible.any():
+            return motors
+        deviations[impossible] = _antithetic_normal(rng, covariance, int(impossible.sum()))
+    raise InputError(
+        "uncertainty of the motor",
+        f"{impossible.sum()} of {count} motors drawn from it are physically impossible",
+        "Identify the motor from more runs, or give an even --spread",
+    )
+
+
+def _moved(
+    motor: Motor, names: Sequence[str], deviations: Float[np.ndarray, "motors coordinates"]
+) -> Motor:
+    """Motors whose coordinates deviate by so much from those of `motor`, stacked."""
+    stacked = jax.tree.map(lambda leaf: jnp.full(len(deviations), leaf, float), motor)
+    deviation = dict(zip(names, deviations.T, strict=True))
     constants = {n: getattr(stacked, n) * np.exp(deviation.get(n, 0.0)) for n in PARAMETERS}
     effects = []
     for effect in stacked.effects:

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from ..errors import InputError
 from ..motor import Motor
 from ..recording import Recording
-from ..simulate import simulate
+from ..simulate import Tape, free_run
 from .diagnosis import NextExperiment
 from .naming import Naming
 
@@ -99,13 +98,8 @@ def difference_between(
     Zero if one cannot be simulated: a motor fitted to other runs may be unstable in this one.
     """
     zero = np.zeros_like(time)
-    run = Recording("next", time, voltage, current=zero, speed=zero, load=zero)
-    try:
-        one, other = (simulate(motor, run) for motor in motors)
-    except InputError:
-        return 0.0
-    differences = [
-        (getattr(one, c) - getattr(other, c)) / s
-        for c, s in zip(("current", "speed"), noise, strict=True)
-    ]
-    return float(np.sqrt(np.sum(np.square(differences))))
+    tape = Tape.from_recordings([Recording("next", time, voltage, zero, zero, load=zero)])
+    one, other = (np.asarray(free_run(motor, tape)) for motor in motors)
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = np.linalg.norm((one - other) * np.asarray(tape.weight) / noise[:, None])
+    return float(size) if np.isfinite(size) else 0.0

@@ -99,11 +99,13 @@ class AbstractEffect(eqx.Module):
     # with it the motor is still a linear system with inputs, as long as no dry element changes direction and no teeth
     # touch or part
     affine: ClassVar[bool] = False
+    # what `is_possible` requires, as told to a user
+    condition: ClassVar[str] = ""
     # the longest step in s that resolves the effect, or its changes of direction
     longest_step: ClassVar[float] = 1e-3
 
-    def is_possible(self) -> bool:
-        """Whether the combination of its parameters is physically possible; each by itself is within its range."""
+    def is_possible(self) -> Bool[Array | np.ndarray, "*#batch"] | bool:
+        """Whether its parameters, which have the signs that their `ranges` say, are physically possible."""
         return True
 
     def terminal_voltage(self, voltage: Scalars) -> Scalars:

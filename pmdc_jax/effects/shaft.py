@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
 
 from .base import AbstractEffect, ParameterRange, Scalars, State, Teeth
 
@@ -17,10 +19,14 @@ class _TwoInertias(AbstractEffect):
     """A rotor and a load at the ends of a shaft; its `states` are the load's speed and the twist of the shaft."""
 
     equation: ClassVar = "mechanical"
+    condition: ClassVar = "load_share below 1"
 
     stiffness_Nm_rad: Scalars
     damping_Nms_rad: Scalars
     load_share: Scalars
+
+    def is_possible(self) -> Bool[Array | np.ndarray, "*#batch"]:
+        return self.load_share < 1
 
     def slip(self, state: State) -> Scalars:
         """Speed of the rotor relative to the load, rad/s."""

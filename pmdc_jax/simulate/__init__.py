@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..errors import InputError
 from ..motor import Motor
 from ..precision import double_precision
 from ..recording import Recording
@@ -41,6 +42,8 @@ def simulate(motor: Motor, recording: Run) -> Recording:
 
     **Returns**: the recording with current (A) and speed (rad/s) simulated at the same time stamps. A run that
     is not driven by voltage has no simulated current.
+
+    **Raises**: `InputError` if the simulation diverges.
     """
     motor = jax.tree.map(jnp.asarray, motor)
     (recording,) = recordings_of(recording, to_simulate=True)
@@ -51,5 +54,12 @@ def simulate(motor: Motor, recording: Run) -> Recording:
     seen = np.stack([tape.samples_of(0, outputs[:, c], len(even)) for c in range(2)], 1)
     if even.resampled_from is not None:
         seen = seen_at_record(motor, tape.drive_of(0), even, seen)
+    finite = np.isfinite(seen).all(1)
+    if not finite.all():
+        raise InputError(
+            "motor",
+            f"its simulation of {recording.name} diverges at {recording.time[finite.argmin()]:.6g} s",
+            "Check the parameters of the motor and its effects",
+        )
     current = seen[:, 0] if recording.drive == "voltage" else recording.current
     return attrs.evolve(recording, current=current, speed=seen[:, 1], angle=None)
