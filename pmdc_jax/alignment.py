@@ -108,7 +108,7 @@ def _mechanical_misfit(edge: _Edge, shift: int) -> float:
 
 
 def _misfit(y: np.ndarray, *regressors: np.ndarray) -> float:
-    _, explained = regress(y, dict(zip("abcde", regressors, strict=False)))
+    _, explained = regress(y, {str(k): x for k, x in enumerate(regressors)})
     return float(np.sqrt(max(1 - explained, 0.0)))
 
 

@@ -219,29 +219,31 @@ def tune(
     from .files import check_outputs
 
     check_outputs({"--save": save, "--json": json, "--report": report}, [motor])
-    from .control.specification import LoopRequirements
-    from .control.tuning import design
+    from .control.tuning import tune
     from .motor_file import load_motor, load_uncertainty
     from .report.terminal import print_messages, print_tables, progress
 
     subject, uncertainty = load_motor(motor), load_uncertainty(motor)
-    requirements = LoopRequirements(
-        controller=controller,
-        setpoint=setpoint,
-        voltage_limit=voltage_limit,
-        current_limit=current_limit,
-        sample_time=sample_time,
-        max_overshoot=max_overshoot,
-        max_settling=max_settling,
-        load_torque=load_torque,
-        delay=delay,
-        speed_step=speed_step,
-        speed_noise=speed_noise,
-        measures_current=current_sensor,
-        spread=None if spread is None else spread / 100,
-    )
     with progress() as on_progress:
-        tuning = design(subject, requirements, uncertainty, seed=seed, progress=on_progress)
+        tuning = tune(
+            subject,
+            controller,
+            setpoint=setpoint,
+            voltage_limit=voltage_limit,
+            current_limit=current_limit,
+            sample_time=sample_time,
+            max_overshoot=max_overshoot,
+            max_settling=max_settling,
+            load_torque=load_torque,
+            delay=delay,
+            speed_step=speed_step,
+            speed_noise=speed_noise,
+            measures_current=current_sensor,
+            spread=None if spread is None else spread / 100,
+            uncertainty=uncertainty,
+            seed=seed,
+            progress=on_progress,
+        )
     from .report.tuning import tuning_json, tuning_tables, write_tuning_report
 
     print_messages(tuning.messages)
@@ -251,12 +253,7 @@ def tune(
         save_controller(save, tuning.law)
     if report:
         write_tuning_report(tuning, report)
-    if json:
-        from .report.json import write_json
-
-        write_json(tuning_json(tuning), json)
-    if json != "-":
-        print_tables(tuning_tables(tuning))
+    _write_and_print(tuning, json, tuning_json, lambda result: print_tables(tuning_tables(result)))
 
 
 @app.command(epilog="Example: pmdc export controller.json --c controller.h")

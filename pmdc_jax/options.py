@@ -94,7 +94,7 @@ SampleTime = Annotated[
     float | None, typer.Option(metavar="S", help="Sample time; by default 1 ms, or less if needed.")
 ]
 MaxOvershoot = Annotated[
-    float, typer.Option(metavar="PCT", help="Largest overshoot, % of the step.")
+    float, typer.Option(min=0, metavar="PCT", help="Largest overshoot, % of the step.")
 ]
 MaxSettling = Annotated[float | None, typer.Option(metavar="S", help="Largest settling time.")]
 LoadTorque = Annotated[float | None, typer.Option(metavar="NM", help="Load torque step to reject.")]
@@ -109,7 +109,9 @@ CurrentSensor = Annotated[bool, typer.Option(help="Whether the controller measur
 Spread = Annotated[
     float | None,
     typer.Option(
-        metavar="PCT", help="Standard deviation of each parameter; by default from the motor file."
+        min=0,
+        metavar="PCT",
+        help="Standard deviation of each parameter; by default from the motor file.",
     ),
 ]
 SaveController = Annotated[

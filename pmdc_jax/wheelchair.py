@@ -142,7 +142,7 @@ def load_test(seed: int = 0) -> Recording:
 
 
 def recovered_by_paper_ga(seed: int = 0) -> Recovered:
-    """Identify by the paper's binary genetic algorithm alone: 20 chromosomes of 60 bits, 80 generations."""
+    """Identify by the paper's binary genetic algorithm alone: 20 chromosomes of 60 bits."""
     from .identify.bounds import search_bounds
     from .identify.parameters import Parameters
     from .identify.search import search

@@ -25,11 +25,11 @@ from pmdc_jax.diagnose.compare import Fitted
 from pmdc_jax.diagnose.effect_relations import FULLER, are_rivals, is_simpler_form
 from pmdc_jax.diagnose.evidence import Block, gather_evidence
 from pmdc_jax.diagnose.experiment import difference_between
+from pmdc_jax.diagnose.judgement import implausible_effect, may_be_absent
 from pmdc_jax.diagnose.library import Change, Library
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
 from pmdc_jax.diagnose.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.periodic import common_line, spectrum
-from pmdc_jax.diagnose.pipeline import implausible_effect, may_be_absent
 from pmdc_jax.diagnose.quantisation import ROUNDING_DRAWS, rounding_errors
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensor_changes
 from pmdc_jax.diagnose.rows import _batches

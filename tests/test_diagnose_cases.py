@@ -242,7 +242,7 @@ def test_stribeck_friction_too_weak_to_detect_remains_a_rival_of_coulomb_frictio
     found = diagnose(training, [held_out])
     assert found.verdict == "ambiguous"
     (effect,) = found.effects
-    assert (effect.name, effect.also_possible) == ("coulomb_friction", ("stribeck_friction",))
+    assert (effect.name, found.rivals) == ("coulomb_friction", (("stribeck_friction",),))
     assert found.next_experiment is not None
 
 
@@ -284,7 +284,7 @@ def test_effects_that_are_equivalent_in_the_given_runs_are_rivals():
     found = diagnose(runs[:2], runs[2:], unloaded=True)
     assert found.verdict == "ambiguous"
     chosen = {effect.name for effect in found.effects}
-    sets = [chosen, *(set(rival.split(" + ")) for rival in found.effects[0].also_possible)]
+    sets = [chosen, *map(set, found.rivals)]
     for equivalent in ("input_dead_zone", "coulomb_friction", "constant_load"):
         assert {equivalent, "speed_sensor_delay"} in sets
     assert found.closed_fraction > 0.99

@@ -60,6 +60,7 @@ def named(**changes) -> Diagnosis:
         "gap": {"train": Gap(5.1, 1.0, 1.0), "holdout": GAP},
         "gap_of_run": dict.fromkeys(base.fit, GAP),
         "closed_fraction": 0.998,
+        "rivals": (),
         "next_experiment": None,
         "curves": (),
         "detectable": (
@@ -93,11 +94,11 @@ def none_detected() -> Diagnosis:
 
 
 def ambiguous() -> Diagnosis:
-    rivals = ("brush_voltage_drop", "asymmetric_friction + constant_load")
     time = np.arange(5) * 1e-3
     return named(
         verdict="ambiguous",
-        effects=(EffectFound("coulomb_friction", "mechanical", COULOMB, 0.002, rivals),),
+        effects=(EffectFound("coulomb_friction", "mechanical", COULOMB, 0.002),),
+        rivals=(("brush_voltage_drop",), ("asymmetric_friction", "constant_load")),
         next_experiment=NextExperiment(
             "both explain these runs", "creep through zero, 6 s within 12 V", 0.93, time, 3 * time
         ),

@@ -27,7 +27,7 @@ from pmdc_jax.identify import problem as problems
 from pmdc_jax.identify.binary_ga import BinaryGA
 from pmdc_jax.identify.bounds import effect_bounds
 from pmdc_jax.identify.generalised_least_squares import last_fit, residuals_of
-from pmdc_jax.identify.identification import Identification
+from pmdc_jax.identify.identification import CONVERGED_DISTANCE, Identification
 from pmdc_jax.identify.nearby import best_nearby
 from pmdc_jax.identify.noise import common_divisor, is_coarse, quantum, white_noise
 from pmdc_jax.identify.noise_model import whitener
@@ -35,7 +35,7 @@ from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.polish import fit_run_unknowns, polish
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Problem, Unknowns, _evaluated, evaluate, normal_matrix
-from pmdc_jax.identify.refine import CONVERGED_DISTANCE, Optimum, refine
+from pmdc_jax.identify.refine import Optimum, refine
 from pmdc_jax.identify.results import results_of
 from pmdc_jax.identify.rotor_angle import with_rotor_angle
 from pmdc_jax.identify.search import METHODS, SearchResult, search

@@ -174,11 +174,11 @@ def test_the_command_refuses_an_impossible_specification_in_one_line(motor_file,
 def test_the_command_writes_the_requested_files(motor_file, capsys, monkeypatch):
     given = {}
 
-    def fake_design(motor, requirements, uncertainty, **options):
-        given.update(motor=motor, requirements=requirements, uncertainty=uncertainty, **options)
+    def fake_tune(motor, controller, **options):
+        given.update(motor=motor, controller=controller, **options)
         return example()
 
-    monkeypatch.setattr(importlib.import_module("pmdc_jax.control.tuning"), "design", fake_design)
+    monkeypatch.setattr(importlib.import_module("pmdc_jax.control.tuning"), "tune", fake_tune)
     arguments = (
         "tune motor.json --controller pid --setpoint 481 --voltage-limit 30 --current-limit 60"
         " --sample-time 1e-3 --max-overshoot 0.5 --max-settling 0.2 --load-torque 0.3 --spread 10"
@@ -187,10 +187,10 @@ def test_the_command_writes_the_requested_files(motor_file, capsys, monkeypatch)
     assert cli.main(arguments.split()) == 0
     assert PAPER["R"] == given["motor"].R
     assert (given["uncertainty"], given["seed"]) == (None, 3)
-    requirements = given["requirements"]
-    assert requirements.spread == pytest.approx(0.1)
-    assert not requirements.measures_current
-    assert (requirements.load_torque, requirements.max_settling) == (0.3, 0.2)
+    assert given["controller"] == "pid"
+    assert given["spread"] == pytest.approx(0.1)
+    assert not given["measures_current"]
+    assert (given["load_torque"], given["max_settling"]) == (0.3, 0.2)
     out, _ = capsys.readouterr()
     assert "PID controller" in out
     assert "fastest possible" in out
@@ -204,7 +204,7 @@ def test_the_command_writes_the_requested_files(motor_file, capsys, monkeypatch)
 @pytest.mark.slow
 def test_json_is_all_that_goes_to_standard_output(motor_file, capsys, monkeypatch):
     tuning = importlib.import_module("pmdc_jax.control.tuning")
-    monkeypatch.setattr(tuning, "design", lambda *_, **__: example())
+    monkeypatch.setattr(tuning, "tune", lambda *_, **__: example())
     assert cli.main(["tune", "motor.json", "--controller", "pid", "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out) == tuning_json(example())
 

@@ -39,7 +39,7 @@ class Robustness:
 
 
 @frozen
-class Candidate:
+class EvaluatedController:
     """A controller, named after how its gains were chosen, with its metrics; None where an event never happens."""
 
     name: str
@@ -58,13 +58,13 @@ def evaluate(
     motor: Motor,
     controller: AbstractController,
     validation_motors: Motor | None,
-) -> Candidate:
+) -> EvaluatedController:
     """A controller with its exact metrics; `validation_motors`, along a leading axis, give the percentiles."""
     controller = jax.tree.map(jnp.asarray, controller)
     law = Law.of(controller, task.hardware, motor)
     response = simulate_task(task, motor, law)
     step, loaded, second = task.parts(response, REPORTED_SUBSTEPS * task.substeps)
-    return Candidate(
+    return EvaluatedController(
         name=name,
         controller=controller,
         metrics=_finite_or_none(step_metrics(*step, task.setpoint)),

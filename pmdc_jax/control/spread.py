@@ -42,7 +42,7 @@ def drawn_motors(motor: Motor, uncertainty: Uncertainty, count: int, seed: int) 
         deviations[impossible] = _antithetic_normal(rng, covariance, int(impossible.sum()))
     raise InputError(
         "uncertainty of the motor",
-        f"{impossible.sum()} of {count} motors drawn from it are physically impossible",
+        "hardly any motor drawn from it is physically possible",
         "Identify the motor from more runs, or give an even --spread",
     )
 

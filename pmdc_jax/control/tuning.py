@@ -23,7 +23,7 @@ from .controllers import AbstractController
 from .descent import STARTS, best_coordinates
 from .evaluation import (
     SMALL_STEP,
-    Candidate,
+    EvaluatedController,
     Robustness,
     evaluate,
     evaluate_robustness,
@@ -61,7 +61,7 @@ class Tuning:
     task: Task
     requirements: LoopRequirements
     margins: Margins
-    candidates: tuple[Candidate, ...]  # the tuned one first
+    candidates: tuple[EvaluatedController, ...]  # the tuned one first
     response: Response = field(repr=False, converter=lambda r: Response(*map(np.asarray, r)))
     validation_speeds: np.ndarray | None = field(repr=False)  # (motors, samples) rad/s
     seed: int
@@ -127,6 +127,7 @@ class Tuning:
         return self.requirements.max_settling is None or settling <= self.requirements.max_settling
 
 
+@double_precision
 def tune(
     motor: Motor,
     controller: str = "pid",
@@ -168,6 +169,7 @@ def tune(
 
     **Raises**: `InputError`, stating the limit, for a specification that no controller can meet.
     """
+    begin = time.perf_counter()
     requirements = LoopRequirements(
         controller=controller,
         setpoint=setpoint,
@@ -184,41 +186,20 @@ def tune(
         spread=spread,
         max_sensitivity=max_sensitivity,
     )
-    return design(motor, requirements, uncertainty, starts, seed, progress)
-
-
-@double_precision
-def design(
-    motor: Motor,
-    requirements: LoopRequirements,
-    uncertainty: Uncertainty | None = None,
-    starts: int = STARTS,
-    seed: int = 0,
-    progress: ReportProgress | None = None,
-) -> Tuning:
-    """`tune`, with the specification in one object.
-
-    **Arguments**: `motor`, with scalar fields; `requirements`; `uncertainty` of the motor, replaced by the spread of
-    the requirements if they give one; `starts`, number of descents; `seed`; `progress`.
-
-    **Raises**: `InputError`, stating the limit, for requirements that no controller can meet.
-    """
-    begin = time.perf_counter()
     free_memory_maps()
     report = progress or silent
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
     specification = requirements.completed(motor)
-    spread = requirements.spread
     variation = uncertainty if spread is None else even_spread(spread)
     report("tuning from many starts")
     task_samples = PART_COUNT * specification.part_samples
     unit_noise = np.random.default_rng(seed).standard_normal(task_samples)
     task = _task(specification, motor, unit_noise)
     tuning_motors = _tuning_motors(motor, variation, seed)
-    controller = _best_controller(specification, task, tuning_motors, unit_noise, seed, starts)
+    best = _best_controller(specification, task, tuning_motors, unit_noise, seed, starts)
     report("evaluating the loop", fraction=0.8)
     validation_motors = None if variation is None else _validation_motors(motor, variation, seed)
-    result = _evaluated(specification, task, motor, controller, validation_motors, seed)
+    result = _evaluated(specification, task, motor, best, validation_motors, seed)
     return attrs.evolve(
         result,
         messages=(*specification.notes, *_undetermined_remark(uncertainty), *_remarks(result)),
@@ -323,7 +304,7 @@ def _evaluated(
 
 def _textbook_candidates(
     task: Task, motor: Motor, kind: str, validation_motors: Motor | None
-) -> Iterator[Candidate]:
+) -> Iterator[EvaluatedController]:
     """Controllers by textbook rules, for comparison."""
     if kind in ZIEGLER_NICHOLS_CONTROLLERS:
         controller = ziegler_nichols(motor, task.hardware, kind)

@@ -12,17 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..identify.corrections.electrical_equation import MIN_FLOW
 from ..identify.generalised_least_squares import residuals_of, series_of
 from ..identify.noise import noise_of_sensor, white_noise
 from ..identify.noise_model import Series
 from ..motor import Drive, Motor
 from ..recording import OVER_LAST
+from ..simulate.exponential import scalar_phi
 from .model import Model
 
 # A run with fewer usable samples is left out
 MIN_SAMPLES = 50
-# A current flows if it exceeds so many standard deviations of its sensor's noise
-FLOW_THRESHOLD = 4.0
 # Lags, in samples, at which residuals of the equation are correlated only by what the equation lacks. A sensor's error
 # enters two successive steps, with opposite signs, and the ripple of a bridge's pulses, where a step does not end with
 # one of them, only one. A positive correlation of successive steps shows what the equation lacks, too, unless samples
@@ -106,7 +106,7 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     )
     brushes = any(effect.holds == "current" for effect in model.motor.effects)
     if brushes:
-        threshold = FLOW_THRESHOLD * current_noise
+        threshold = MIN_FLOW * current_noise
         known = known & _flows(measured[:, 0], simulated[:, 0], threshold)
     pairs = known[1:] & known[:-1]
     if pairs.sum() < MIN_SAMPLES:
@@ -132,8 +132,7 @@ def _step_gains(motor: Motor, drive: Drive, seconds: float) -> _StepGains:
     """The gains of a step of so many seconds, with a speed on a straight line."""
     A, B = map(np.asarray, motor.state_space(drive))
     decay = A[0, 0] * seconds
-    mean = np.expm1(decay) / decay
-    later = (mean - 1) / decay
+    mean, later = scalar_phi(decay, 1), scalar_phi(decay, 2)
     by_speed, by_voltage = A[0, 1] * seconds, B[0, 0] * seconds
     return _StepGains(np.exp(decay), by_speed * (mean - later), by_speed * later, by_voltage * mean)
 

@@ -38,7 +38,6 @@ class EffectFound:
     equation: str  # "electrical", "mechanical", "input" or "sensor"
     parameters: Mapping[str, Estimate]  # by field of the effect
     p_value: float  # of the data if the effect were not there
-    also_possible: tuple[str, ...] = ()  # sets such as "coulomb_friction + constant_load"
 
 
 @frozen
@@ -76,7 +75,9 @@ class VaryingParameter:
     p_value: float  # of the data if it were the same in all runs
     also_possible: tuple[str, ...]  # parameters whose variation would explain the runs as well
     fit: Mapping[str, RunFit]  # of every training run, simulated with its own value
-    unlikelihood: float  # negative logarithm of the likelihood of these, up to a constant
+    negative_log_likelihood: (
+        float  # negative logarithm of the likelihood of these, up to a constant
+    )
 
 
 @frozen
@@ -120,6 +121,7 @@ class Diagnosis:
     gap_of_run: Mapping[str, Gap]
     # of the gap, in squares, on hold-outs where there are any; None without effects or gap
     closed_fraction: float | None
+    rivals: tuple[tuple[str, ...], ...]  # other sets of effects that would explain the runs as well
     next_experiment: NextExperiment | None  # for the verdict "ambiguous", where a run was found
     # what is left, for the verdict "not_in_library" or where it is an error of a sensor
     curves: tuple[LearnedCurve, ...]
@@ -136,12 +138,6 @@ class Diagnosis:
     varies: VaryingParameter | None = None  # what differs from run to run, if that is what is left
     # by training run: its misfit with a common value of what differs, and with its own
     gap_by_own_value: Mapping[str, Gap] = field(factory=dict)
-
-    @property
-    def rivals(self) -> list[list[str]]:
-        """Other sets of effects that would explain the runs as well."""
-        sets = dict.fromkeys(one for effect in self.effects for one in effect.also_possible)
-        return [one.split(" + ") for one in sets]
 
     @property
     def breaks_electrical_equation(self) -> bool:

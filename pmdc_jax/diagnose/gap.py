@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..identify.identification import Role, RunFit
-from ..identify.noise import MIN_RELATIVE_NOISE, noise_of_sensor
+from ..identify.noise import MIN_RELATIVE_NOISE, noise_of_sensor, rms
 from .diagnosis import Gap
 
 CHANNELS = ("current", "speed")
@@ -69,10 +69,11 @@ def _noise_of_runs(fits: Fits, channel: str, share: float) -> dict[str, float]:
     training = {name: f for name, f in fits.items() if f.role == "train"}
     white = {name: _white_noise(f, channel) for name, f in fits.items()}
     left = {name: getattr(f, f"{channel}_rmse") for name, f in training.items()}
-    measured = {name: _rms(getattr(f, channel)) for name, f in training.items()}
+    signals = {name: getattr(f, channel) for name, f in training.items()}
+    measured = {name: None if x is None else rms(x) for name, x in signals.items()}
 
-    def pooled(rms: Mapping[str, float | None]) -> float:
-        known = [(x, len(f.time)) for name, f in training.items() if (x := rms[name]) is not None]
+    def pooled(sizes: Mapping[str, float | None]) -> float:
+        known = [(x, len(f.time)) for name, f in training.items() if (x := sizes[name]) is not None]
         samples = sum(n for _, n in known)
         return float(np.sqrt(sum(x * x * n for x, n in known) / samples)) if samples else 0.0
 
@@ -89,8 +90,3 @@ def _white_noise(fit: RunFit, channel: str) -> float | None:
     """White noise in the residuals of a run's channel; None if it was not measured."""
     left = fit.residual(channel)
     return None if left is None else noise_of_sensor(getattr(fit, channel), left)
-
-
-def _rms(signal: np.ndarray | None) -> float | None:
-    """Root mean square of a signal without its gaps; None if there is none."""
-    return None if signal is None else float(np.sqrt(np.nanmean(np.square(signal))))

@@ -139,7 +139,7 @@ class Library:
         for name in EFFECTS:
             shapes = [c for c in self.candidates if c.effect == name]
             if shapes and shapes[0].full_simulation:
-                yield partial(self._simulated_change, shapes, tape)
+                yield partial(self._simulated_change, shapes)
             elif shapes:
                 settings = [values for c in shapes for values in c.columns]
                 units = np.array([unit for c in shapes for unit in c.units])
@@ -150,19 +150,20 @@ class Library:
                         _small_change, EFFECTS[name], values, units[part], self.bare, tape, path
                     )
 
-    def _simulated_change(self, shapes: Sequence[Candidate], tape: Tape) -> Change:
+    def _simulated_change(self, shapes: Sequence[Candidate]) -> Change:
         """What an effect at finite size changes in the records, by full simulations."""
-        seen = np.stack([self._simulated_response(c, tape) for c in shapes], -1)
+        seen = np.stack([self._simulated_response(c) for c in shapes], -1)
         return Change(seen.astype(np.float32), by_sensor=True)
 
-    def _simulated_response(self, candidate: Candidate, tape: Tape) -> np.ndarray:
+    def _simulated_response(self, candidate: Candidate) -> np.ndarray:
         """The response to a setting at finite size, simulated once and kept: (samples, 2, blocks)."""
         key = id(candidate)
         if key not in self._simulated:
             values = {field: jnp.asarray(x) for field, x in candidate.columns[0].items()}
             motor = self.bare.with_effects([EFFECTS[candidate.effect](**values)])
-            seen = free_run(motor, tape, self._base.fit.unknowns.runs)
-            change = np.asarray(seen) - np.asarray(self._base.fit.evaluation.seen)
+            given, fit = self._base.given, self._base.fit
+            seen = free_run(motor, given.problem.tape, fit.unknowns.runs)
+            change = np.asarray(seen) - np.asarray(fit.evaluation.seen)
             self._simulated[key] = change.transpose(2, 1, 0)
         return self._simulated[key]
 

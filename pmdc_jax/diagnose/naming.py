@@ -121,7 +121,7 @@ class StepwiseSelection:
         plain = self._naming(self.base)
         if plain.varies is None:
             return named
-        gain = plain.varies.unlikelihood - named.varies.unlikelihood
+        gain = plain.varies.negative_log_likelihood - named.varies.negative_log_likelihood
         more = len(named.chosen.fit.coordinates) - len(self.base.fit.coordinates)
         limit = more * np.log(self.base.given.problem.most_samples) + BIC_MARGIN
         return named if 2 * gain > limit else plain

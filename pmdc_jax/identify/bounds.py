@@ -9,6 +9,7 @@ import numpy as np
 
 from ..effects import AbstractEffect
 from ..recording import Recording
+from .noise import rms
 
 # How far a crude estimate may be off, as a factor either way. Wide: the search is cheap.
 CRUDE_FACTOR = 30.0
@@ -31,7 +32,7 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
     R and the time constants that the sampling can show, or from that balance if it is larger there.
     """
     R, Kb, L = _crude_armature(recordings)
-    typical = _typical_magnitudes(recordings, Kb)
+    typical = _typical_magnitudes(recordings, R, Kb)
     time_constant = np.sqrt(typical.sample_time * typical.duration)
     inertia = typical.torque * time_constant / typical.speed_change
     friction = typical.torque / typical.speed
@@ -51,18 +52,20 @@ def effect_bounds(
     """Search bounds of effect parameters by unit: three decades up to about the torque, speed, voltage or current of
     the recordings, and time constants that their length and sampling can show. Parameters in other units, or in that
     of a signal that was not recorded, keep the range of their table."""
-    _, Kb, _ = _crude_armature(recordings)
-    typical = _typical_magnitudes(recordings, Kb)
-    volts, amperes = (max(_largest_rms(recordings, n), 1e-9) for n in ("voltage", "current"))
+    R, Kb, _ = _crude_armature(recordings)
+    typical = _typical_magnitudes(recordings, R, Kb)
+    volts, amperes = (_largest_rms(recordings, name) for name in ("voltage", "current"))
     scales = {
         "N m": 3 * typical.torque,
         "N m s^2/rad^2": 3 * typical.torque / typical.speed**2,
         "rad/s": typical.speed,
-        "V": volts,
-        "A": amperes,
-        "1/W": 1 / (volts * amperes),
-        "1/A^2": 10 / amperes**2,
     }
+    if volts:
+        scales["V"] = volts
+    if amperes:
+        scales |= {"A": amperes, "1/A^2": 10 / amperes**2}
+    if volts and amperes:
+        scales["1/W"] = 1 / (volts * amperes)
     bounds = {}
     for effect in effects:
         for field, given in effect.ranges.items():
@@ -72,7 +75,7 @@ def effect_bounds(
                 low = max(low, high / DYNAMIC_RANGE if given.scale == "log" else -high)
             elif given.unit == "s":
                 low, high = max(low, typical.sample_time / 5), min(high, 3 * typical.duration)
-            # the range is empty if no signal of this unit was recorded
+            # the range is empty if the signal of this unit is too small for the effect
             bounds[f"{effect.name}.{field}"] = (
                 (low, high) if low < high else (given.lower, given.upper)
             )
@@ -80,7 +83,8 @@ def effect_bounds(
 
 
 def _largest_rms(recordings: Sequence[Recording], name: str) -> float:
-    return max(_rms(getattr(run, name)) for run in recordings)
+    signals = (getattr(run, name) for run in recordings)
+    return max((rms(signal) for signal in signals if signal is not None), default=0.0)
 
 
 def _crude_armature(recordings: Sequence[Recording]) -> tuple[float, float, float]:
@@ -102,12 +106,12 @@ def _crude_armature(recordings: Sequence[Recording]) -> tuple[float, float, floa
         guess = steady[1] if np.any(inputs[:, 1]) else TYPICAL_KB
         return (R if R > 0 else steady[0]), (Kb if Kb > 0 else guess), max(L, 0.0)
     volts_per_speed = [
-        _rms(r.voltage) / _rms(r.speed)
+        rms(r.voltage) / rms(r.speed)
         for r in recordings
         if r.voltage is not None and r.speed is not None
     ]
     volts_per_ampere = [
-        _rms(r.voltage) / _rms(r.current)
+        rms(r.voltage) / rms(r.current)
         for r in recordings
         if r.voltage is not None and r.current is not None
     ]
@@ -125,21 +129,21 @@ class _Typical(NamedTuple):
     duration: float  # s
 
 
-def _typical_magnitudes(recordings: Sequence[Recording], Kt: float) -> _Typical:
+def _typical_magnitudes(recordings: Sequence[Recording], R: float, Kt: float) -> _Typical:
     torque, speed, change = [1e-9], [1e-9], [1e-9]
     for run in recordings:
         if run.torque is not None:
-            torque.append(_rms(run.torque))
+            torque.append(rms(run.torque))
         elif run.current is not None:
-            torque.append(Kt * _rms(run.current))
-        elif run.speed is not None:
-            torque.append(Kt * _rms(run.voltage))
+            torque.append(Kt * rms(run.current))
+        elif run.voltage is not None and run.speed is not None:
+            torque.append(Kt * rms(run.voltage) / R)
         if run.speed is not None:
-            speed.append(_rms(run.speed))
+            speed.append(rms(run.speed))
             change.append(float(np.nanstd(run.speed)))
         elif run.voltage is not None and not run.held:  # no-load speed
-            speed.append(_rms(run.voltage) / Kt)
-            change.append(_rms(run.voltage) / Kt)
+            speed.append(rms(run.voltage) / Kt)
+            change.append(rms(run.voltage) / Kt)
     sample_time = min(run.sample_time for run in recordings)
     duration = max(run.duration for run in recordings)
     return _Typical(max(torque), max(speed), max(change), sample_time, duration)
@@ -156,7 +160,3 @@ def _stretch_means(columns: np.ndarray, sample_time: float) -> np.ndarray:
     parts = columns[:, : whole * length].reshape(len(columns), whole, length)
     change = parts[1, :, -1] - parts[1, :, 0]
     return np.vstack([parts.mean(2), change / ((length - 1) * sample_time)])
-
-
-def _rms(samples: np.ndarray | None) -> float:
-    return float(np.sqrt(np.nanmean(np.square(samples)))) if samples is not None else 0.0

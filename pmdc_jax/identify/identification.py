@@ -10,7 +10,10 @@ from attrs import field, frozen
 
 from ..motor import Motor
 from ..recording import Finding
-from .refine import CONVERGED_DISTANCE
+
+# A refinement that ends within so many standard errors of the minimum has converged: at the kinks of dry elements,
+# the linearised model predicts a reduction that no step attains
+CONVERGED_DISTANCE = 0.4
 
 Status = Literal["identified", "at_bound", "tied", "not_identifiable", "known"]
 Role = Literal["train", "holdout"]
@@ -70,7 +73,8 @@ class RunFit:
 
 @frozen
 class Search:
-    """Record of the search: best and median fitness of the generations, and the fitness of each refined start."""
+    """Record of the search: best and median fitness of the generations, those of repeated searches one after another,
+    and the fitness of each refined start."""
 
     method: str
     evaluations: int

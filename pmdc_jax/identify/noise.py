@@ -19,6 +19,11 @@ ROUNDING_ERROR = 1e-9
 ZERO_REMAINDER, MIN_DIVISOR = 1e-8, 1e-6
 
 
+def rms(signal: Float[np.ndarray, " samples"]) -> float:
+    """Root mean square of a signal without its gaps, which are NaN."""
+    return float(np.sqrt(np.nanmean(np.square(signal))))
+
+
 def white_noise(signals: Sequence[np.ndarray]) -> float | None:
     """Standard deviation of the white noise in signals of one kind, None if none has more than two samples.
 

@@ -13,13 +13,11 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from ..compiled import quickly_compiled
+from .identification import CONVERGED_DISTANCE
 from .parameters import Parameters
 from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
 MAX_STEPS = 60
-# A refinement that ends within so many standard errors of the minimum has converged: at the kinks of dry elements,
-# the linearised model predicts a reduction that no step attains
-CONVERGED_DISTANCE = 0.4
 
 
 class Optimum(NamedTuple):
@@ -46,20 +44,20 @@ class Optimum(NamedTuple):
 
 Columns = Float[Array, " columns"]
 # The problem, the start and the scales of its unknowns, and the sum of squares that normalises the residuals
-Task = tuple[Problem, Columns, Columns, Float[Array, ""]]
+Arguments = tuple[Problem, Columns, Columns, Float[Array, ""]]
 
 
 # Levenberg-Marquardt depends on the residuals r and their Jacobian J only through J'J, J'r and r'r. It is therefore
 # given the shortest residual vector with the same products: its length is the number of unknowns plus one, instead of
 # the number of samples.
 @eqx.filter_custom_jvp
-def compressed(flat: Columns, args: Task) -> Float[Array, " columns+1"]:
+def compressed(flat: Columns, args: Arguments) -> Float[Array, " columns+1"]:
     return _factor(flat, args)[:, -1]
 
 
 @compressed.def_jvp
 def _compressed_jvp(
-    primals: tuple[Columns, Task], tangents: tuple[Columns | None, Any]
+    primals: tuple[Columns, Arguments], tangents: tuple[Columns | None, Any]
 ) -> tuple[Float[Array, " columns+1"], Float[Array, " columns+1"]]:
     flat, args = primals
     factor = _factor(flat, args)
@@ -68,7 +66,7 @@ def _compressed_jvp(
     return factor[:, -1], change
 
 
-def _factor(flat: Columns, args: Task) -> Float[Array, "columns+1 columns+1"]:
+def _factor(flat: Columns, args: Arguments) -> Float[Array, "columns+1 columns+1"]:
     problem, flat_start, scale, size = args
     # optimistix promotes dtypes strictly; under standard promotion earlier traces are reused
     with jax.numpy_dtype_promotion("standard"):

@@ -14,7 +14,7 @@ from ..simulate import RunUnknowns, Tape
 from ..threads import map_in_threads
 from .identifiability import MIN_SHARE, explain_directions
 from .identification import Estimate, Identification, Role, RunFit, Status
-from .noise import ratio_to_noise, white_noise
+from .noise import ratio_to_noise, rms, white_noise
 from .parameters import Parameters, unit_of
 from .polish import Fit, fit_run_unknowns, polish
 from .prepare import Prepared
@@ -49,6 +49,7 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
     chosen = _with_Kt_equal_Kb(problem, released, info)
     visible = [_refit_with_visible(problem, chosen, k) for k in _invisible_alone(parameters, info)]
     others = [information_of(problem, fit) for fit in visible if fit is not None]
+    # what any fit as good does not determine is not determined
     info = max([info, *others], key=lambda i: i.unseen_share.sum())
     best = chosen.optimum
     motor = _with_numpy_arrays(parameters(best.unknowns.coordinates))
@@ -233,12 +234,11 @@ def run_fits(
     fitted = np.where(np.asarray(tape.weight) > 0, tape.measured, np.nan)
     fits = {}
     for index, (run, role) in enumerate(zip(runs, roles, strict=True)):
-        current, speed = (tape.samples_of(index, simulated[:, c], len(run)) for c in range(2))
+        current, speed = tape.samples_of(index, simulated, len(run)).T
+        i, w = tape.samples_of(index, fitted, len(run)).T
         driven = run.drive == "voltage"
-        i, w = (
-            None if signal is None else tape.samples_of(index, fitted[:, c], len(run))
-            for c, signal in enumerate((run.current if driven else None, run.speed))
-        )
+        i = i if driven and run.current is not None else None
+        w = w if run.speed is not None else None
         fits[run.name] = RunFit(
             role=role,
             current_rmse=_rmse(i, current),
@@ -258,11 +258,7 @@ def run_fits(
 
 
 def _rmse(measured: np.ndarray | None, simulated: np.ndarray) -> float | None:
-    return None if measured is None else _rms(measured - simulated)
-
-
-def _rms(signal: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(np.square(signal))))
+    return None if measured is None else rms(measured - simulated)
 
 
 def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | None:

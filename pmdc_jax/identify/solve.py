@@ -136,13 +136,21 @@ def search_and_refine(
     for attempt in range(1, searches):
         if found.interrupted or _agreed(ends, problem.outputs):
             break
-        before, found = found, run_search(seed + attempt)
-        found = found._replace(evaluations=before.evaluations + found.evaluations)
+        found = _continued(found, run_search(seed + attempt))
         ends = sorted([*ends, *_refine_all(problem, found)], key=_fitness)
     given, polished = polish_with_angle(given, ends[0])
     seconds = {"search": search_ended - began, "refine": time.perf_counter() - search_ended}
     record = _search_record(search, found, ends)
     return given, Solved(polished, record, seed, found.interrupted, seconds)
+
+
+def _continued(before: SearchResult, search: SearchResult) -> SearchResult:
+    """Another search, with the effort and the history of those before it."""
+    return search._replace(
+        evaluations=before.evaluations + search.evaluations,
+        best=np.append(before.best, search.best),
+        median=np.append(before.median, search.median),
+    )
 
 
 def _searched_parameters(given: Prepared) -> Parameters:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,7 +55,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     gap = {role: _gap(diagnosis.gap.get(role)) for role in ("train", "holdout")}
     found = {
         "verdict": diagnosis.verdict,
-        "effects": [_effect(effect) for effect in diagnosis.effects],
+        "effects": [_effect(effect, diagnosis.rivals) for effect in diagnosis.effects],
         "where": [asdict(region) for region in diagnosis.where],
         "gap": {**gap, "closed_fraction": diagnosis.closed_fraction},
         "gap_of_run": {run: _gap(one) for run, one in diagnosis.gap_of_run.items()},
@@ -71,9 +72,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def write_json(obj: Any, path: str | Path) -> None:
-    """Write `obj` to a file atomically, or to standard output if the path is "-"."""
+    """Write `obj` to a file atomically, or to standard output if the path is "-"; NaN and infinity become null."""
     to_stdout = str(path) == "-"  # its encoding is unknown, hence plain ASCII
-    text = json.dumps(obj, indent=2, ensure_ascii=to_stdout, allow_nan=False) + "\n"
+    text = json.dumps(_plain(obj), indent=2, ensure_ascii=to_stdout, allow_nan=False) + "\n"
     if to_stdout:
         sys.stdout.write(text)
         sys.stdout.flush()
@@ -91,13 +92,13 @@ def _estimate(estimate: Estimate) -> dict[str, Any]:
     }
 
 
-def _effect(effect: EffectFound) -> dict[str, Any]:
+def _effect(effect: EffectFound, rivals: Sequence[Sequence[str]]) -> dict[str, Any]:
     return {
         "name": effect.name,
         "equation": effect.equation,
         "parameters": {name: _estimate(one) for name, one in effect.parameters.items()},
         "p_value": effect.p_value,
-        "also_possible": list(effect.also_possible),
+        "also_possible": [" + ".join(names) for names in rivals],
     }
 
 

@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ..control.controller_file import gains_of, law_content
-from ..control.evaluation import SMALL_STEP, Candidate, Robustness
+from ..control.evaluation import SMALL_STEP, EvaluatedController, Robustness
 from ..control.objective import SECOND_SETPOINT
 from ..control.tuning import Tuning
 from .notation import NARROW_SPACE, UNKNOWN, percent, pretty_unit, significant
@@ -55,7 +55,7 @@ def tuning_json(tuning: Tuning) -> dict[str, Any]:
     }
 
 
-def _candidate_json(one: Candidate) -> dict[str, Any]:
+def _candidate_json(one: EvaluatedController) -> dict[str, Any]:
     return {
         "name": one.name,
         "gains": gains_of(one.controller),
@@ -180,7 +180,7 @@ def comparison(tuning: Tuning) -> list[tuple[str, ...]]:
     return [*(_candidate_row(one, fastest) for one in tuning.candidates), last]
 
 
-def _candidate_row(one: Candidate, fastest: float) -> tuple[str, ...]:
+def _candidate_row(one: EvaluatedController, fastest: float) -> tuple[str, ...]:
     settling, rise, robust = one.metrics["SettlingTime"], one.metrics["RiseTime"], one.robust
     return (
         one.name,

@@ -50,8 +50,7 @@ def simulate(motor: Motor, recording: Run) -> Recording:
     # the instantaneous speed is simulated, even if the recorded one is a mean
     even = attrs.evolve(uniform(recording), averaging=None)
     tape = Tape.from_recordings([even], unloaded=True)
-    outputs = free_run(motor, tape)
-    seen = np.stack([tape.samples_of(0, outputs[:, c], len(even)) for c in range(2)], 1)
+    seen = tape.samples_of(0, free_run(motor, tape), len(even))
     if even.resampled_from is not None:
         seen = seen_at_record(motor, tape.drive_of(0), even, seen)
     finite = np.isfinite(seen).all(1)

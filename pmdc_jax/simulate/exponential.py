@@ -1,4 +1,4 @@
-"""Functions phi_k of small matrices, for the exact step of a linear system."""
+"""Functions phi_k of numbers and of small matrices, for the exact step of a linear system."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 Matrix = Float[Array, "n n *#batch"]
 
 # Taylor order and halvings: exact to rounding for |A h| up to 0.25 * 2**HALVINGS
 ORDER = 10
 HALVINGS = 20
+# Below this size of a number a series is more accurate than a quotient
+SERIES_LIMIT = 3e-3
 
 
 def product(
@@ -61,3 +64,16 @@ def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
     half = jax.lax.fori_loop(0, HALVINGS - 1, lambda _, carry: double(carry), start)
     full = double(half)
     return [one + half[0], *half[1:]], [one + full[0], *full[1:]]
+
+
+def scalar_phi(z: ArrayLike, k: int) -> np.ndarray:
+    """phi_k(z) = sum_j z^j / (j + k)! of each number, real or complex, for k up to 2."""
+    z = np.asarray(z)
+    if k == 0:
+        return np.exp(z)
+    small = np.abs(z) < SERIES_LIMIT
+    safe = np.where(small, 1.0, z)
+    first = np.where(small, 1 + z / 2 + z**2 / 6 + z**3 / 24 + z**4 / 120, np.expm1(safe) / safe)
+    if k == 1:
+        return first
+    return np.where(small, 1 / 2 + z / 6 + z**2 / 24 + z**3 / 120, (first - 1) / safe)

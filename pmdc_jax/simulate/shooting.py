@@ -41,7 +41,7 @@ MAX_PASSES = 32
 Starts = Float[Array, "blocks states"]
 Start = Float[Array, " states"]  # of one block
 # A motor, and its propagators on the grids of a tape; or their derivatives, with the columns as first axis
-Prepared = tuple[Motor, Propagator]
+MotorOnGrids = tuple[Motor, Propagator]
 
 
 class Pass(NamedTuple):
@@ -107,7 +107,7 @@ def sensitivities(
     count = len(parameters)
     all_columns = count + UNKNOWNS_PER_RUN
 
-    def prepare(parameters: Float[Array, " parameters"]) -> Prepared:
+    def prepare(parameters: Float[Array, " parameters"]) -> MotorOnGrids:
         motor = assemble(parameters)
         return motor, grid_propagators(motor, tape)
 
@@ -200,7 +200,7 @@ class Joining(NamedTuple):
 
 
 def _join_blocks(
-    prepared: Prepared,
+    prepared: MotorOnGrids,
     tape: Tape,
     own: RunUnknowns,
     initial: Starts,
@@ -245,8 +245,8 @@ def _join_blocks(
 
 @eqx.filter_jit  # one trace serves `_join_blocks` and other callers with as many columns
 def _simulate_blocks(
-    prepared: Prepared,
-    d_prepared: Prepared,
+    prepared: MotorOnGrids,
+    d_prepared: MotorOnGrids,
     columns: int,
     tape: Tape,
     starts: Starts,

@@ -155,10 +155,11 @@ class Tape(eqx.Module):
         return np.asarray(self.run) == run
 
     def samples_of(
-        self, run: int, signal: Float[Samples, "blocks samples"], length: int
-    ) -> np.ndarray:
+        self, run: int, signal: Float[Samples, "blocks *outputs samples"], length: int
+    ) -> Float[np.ndarray, "length *outputs"]:
         """The `length` samples of one run, cut out of a signal laid out like the tape."""
-        return np.asarray(signal)[self.blocks_of(run)].reshape(-1)[:length]
+        part = np.moveaxis(np.asarray(signal)[self.blocks_of(run)], -1, 1)
+        return part.reshape(-1, *part.shape[2:])[:length]
 
     def grid_of(self, run: int) -> int:
         """The grid of one run."""

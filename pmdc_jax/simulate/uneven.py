@@ -12,14 +12,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..motor import Drive, Motor
+from .exponential import scalar_phi
 
 if TYPE_CHECKING:
     from ..recording import Recording
 
 # Closer eigenvalues are moved apart to this relative distance, which is then the relative error, too
 MIN_EIGENVALUE_GAP = 1e-7
-# Below this size of the argument a series is more accurate than the quotient
-SERIES_LIMIT = 3e-3
 
 
 class Pieces(NamedTuple):
@@ -156,20 +155,8 @@ def _phi_responses(A: Float[np.ndarray, "2 2"], length: np.ndarray) -> list[np.n
     distance = (one - other) or 1.0
     responses = []
     for k in range(3):
-        at_one, at_other = _phi(one * length, k), _phi(other * length, k)
+        at_one, at_other = scalar_phi(one * length, k), scalar_phi(other * length, k)
         slope = (at_one - at_other) / distance
         whole = at_one[:, None, None] * np.eye(2) + slope[:, None, None] * (A - one * np.eye(2))
         responses.append(whole.real * length[:, None, None] ** k)
     return responses
-
-
-def _phi(z: np.ndarray, k: int) -> np.ndarray:
-    """sum_j z^j / (j + k)!, k up to 2."""
-    if k == 0:
-        return np.exp(z)
-    small = np.abs(z) < SERIES_LIMIT
-    safe = np.where(small, 1.0, z)
-    first = np.where(small, 1 + z / 2 + z**2 / 6 + z**3 / 24 + z**4 / 120, np.expm1(safe) / safe)
-    if k == 1:
-        return first
-    return np.where(small, 1 / 2 + z / 6 + z**2 / 24 + z**3 / 120, (first - 1) / safe)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...recording import Recording
+from ...simulate.exponential import scalar_phi
 from ..polish import Fit
 from ..prepare import Prepared
 
@@ -31,9 +32,11 @@ REMAINING = (1e-9, 0.999)
 # the instant of reading may differ between these, in samples
 SHARE_ERRORS, MAX_SPREAD = 4.0, 0.05
 SIDES = np.array([-1.0, 0.0, 1.0])
-# Standard deviations of its noise from which a current flows for certain; samples in which it does not flow in one
-# direction are left out if this share of the squared steps of the voltage remains
-FLOWS, MIN_STEPS = 4.0, 0.2
+# Standard deviations of its noise from which a current flows for certain
+MIN_FLOW = 4.0
+# Samples in which the current does not flow in one direction are left out if this share of the squared steps of the
+# voltage remains
+MIN_STEPS = 0.2
 
 # Columns of the electrical equation: the current, both speeds, the voltage of the sample before, of this and of the
 # next one, a constant, the direction of the current
@@ -151,9 +154,8 @@ def settling(equation: ElectricalEquation, given: Prepared, fit: Fit) -> Settlin
 def _later_share(remains: float) -> float:
     """Share of the later speed in what two speeds, with a straight line between them, do to a current; `remains`, the
     share of a current that is left after a sample."""
-    remains = float(np.clip(remains, *REMAINING))
-    a = -np.log(remains)
-    return (a - 1 + remains) / (a * (1 - remains))  # phi_2(-a) / phi_1(-a)
+    z = np.log(np.clip(remains, *REMAINING))
+    return float(scalar_phi(z, 2) / scalar_phi(z, 1))
 
 
 def _reading(share: float, remains: float) -> float:
@@ -175,16 +177,16 @@ def electrical_equation(given: Prepared, fit: Fit) -> ElectricalEquation | None:
     if len({tape.grid_of(k) for k, _ in runs}) != 1:
         return None
     for k, run in runs:
-
-        def of_run(signal: np.ndarray, k: int = k, run: Recording = run) -> np.ndarray:
-            return np.stack([tape.samples_of(k, signal[:, c], len(run)) for c in range(2)], 1)
-
-        measured, simulated = of_run(np.asarray(tape.measured)), of_run(seen)
-        known = np.all(of_run(np.asarray(tape.weight)) > 0, axis=1)
-        voltage = np.asarray(tape.samples_of(k, tape.value, len(run)))
+        measured, simulated, weight, voltage = (
+            tape.samples_of(k, signal, len(run))
+            for signal in (tape.measured, seen, tape.weight, tape.value)
+        )
+        known = np.all(weight > 0, axis=1)
         used = known[1:-2] & known[2:-1] & known[3:]
         # where the current is next to nothing or reverses, brushes may drop any voltage
-        flow = np.sign(measured[:, 0]) * (np.abs(measured[:, 0]) > FLOWS * given.problem.noise[0])
+        flow = np.sign(measured[:, 0]) * (
+            np.abs(measured[:, 0]) > MIN_FLOW * given.problem.noise[0]
+        )
         flows = used & (flow[2:-1] != 0) & (flow[3:] != 0)
         one_way = flows & (flow[1:-2] == flow[2:-1]) & (flow[2:-1] == flow[3:])
         steps = np.square(np.diff(voltage[1:-1]))

@@ -104,17 +104,21 @@ def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
     trials = _Trials(given, fit)
     plausible = [*_at_samples(given, fit), *_by_electrical_equation(trials)]
     limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
-    likelier = [timing for timing in plausible if trials.unlikelihood(timing) < limit]
+    likelier = [timing for timing in plausible if trials.negative_log_likelihood(timing) < limit]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     simpler = [timing for timing in likelier if not timing.current_mean]
-    limit = min(map(trials.unlikelihood, simpler), default=np.inf) - MIN_LOG_LIKELIHOOD_GAIN
-    likelier = simpler + [t for t in likelier if t.current_mean and trials.unlikelihood(t) < limit]
+    limit = (
+        min(map(trials.negative_log_likelihood, simpler), default=np.inf) - MIN_LOG_LIKELIHOOD_GAIN
+    )
+    likelier = simpler + [
+        t for t in likelier if t.current_mean and trials.negative_log_likelihood(t) < limit
+    ]
     if any(run.load is not None for run in given.training):
         likelier = [
-            t if t.reading else min(t, t._replace(load=True), key=trials.unlikelihood)
+            t if t.reading else min(t, t._replace(load=True), key=trials.negative_log_likelihood)
             for t in likelier
         ]
-    return sorted(likelier, key=trials.unlikelihood)
+    return sorted(likelier, key=trials.negative_log_likelihood)
 
 
 class _Trials:
@@ -135,7 +139,7 @@ class _Trials:
             self._fitted[timing] = with_averaging(*with_even_clock(*refit))
         return self._fitted[timing]
 
-    def unlikelihood(self, timing: Timing) -> float:
+    def negative_log_likelihood(self, timing: Timing) -> float:
         """The negative log-likelihood of this timing."""
         return negative_log_likelihood_within(*self.fitted(timing))
 

@@ -202,7 +202,7 @@ def _band_powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
 
 
 def _speeds(given: Prepared) -> list[tuple[np.ndarray, float]]:
-    """The recorded speeds, rad/s, of all training runs long min_gain to show their noise, and their sample times, s."""
+    """The recorded speeds, rad/s, of all training runs long enough to show their noise, and their sample times, s."""
     recorded = [
         (run.speed, np.diff(run.time))
         for run, ours in zip(given.training, given.differentiated, strict=False)

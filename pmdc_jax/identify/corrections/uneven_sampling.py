@@ -67,7 +67,7 @@ def _shifted(given: Prepared, fit: Fit) -> Prepared:
     runs = []
     for k, run in enumerate(given.runs):
         if run.resampled_from is not None:
-            now = np.stack([tape.samples_of(k, seen[:, c], len(run)) for c in range(2)], 1)
+            now = tape.samples_of(k, seen, len(run))
             then = seen_at_record(motor, tape.drive_of(k), run, now, given.straight)
             run = _nearest_samples(run, now, then)
         runs.append(run)

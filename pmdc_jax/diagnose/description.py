@@ -1,0 +1,131 @@
+"""What a diagnosis tells beside its verdict: the effects found, where the motor without them is off, what is left, and
+what would have been detected."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from ..effects import EFFECTS
+from ..identify.identification import Identification
+from .assessment import FALSE_ALARM
+from .diagnosis import Detectable, EffectFound, LearnedCurve, Region
+from .evidence import MIN_EIGENVALUE, Block
+from .library import Curve
+from .naming import Naming
+from .signals import Screen, log_p_value
+
+# A knot of a curve is part of a region if its misfit is so many standard errors
+REGION_Z = 4.0
+
+
+def effects_found(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:
+    """The effects of the chosen set, with their parameters and the p-value of the data without each."""
+    return tuple(
+        EffectFound(
+            name,
+            EFFECTS[name].equation,
+            {f: final.parameters[f"{name}.{f}"] for f in EFFECTS[name].ranges},
+            naming.p_without[name],
+        )
+        for name in naming.chosen.effects
+    )
+
+
+def rival_sets(naming: Naming) -> tuple[tuple[str, ...], ...]:
+    """The other sets that explain the runs as well as the effects found, if any were."""
+    rivals = naming.rivals if naming.chosen.effects else ()
+    return tuple(tuple(sorted(rival.effects)) for rival in rivals)
+
+
+def regions_of_misfit(naming: Naming) -> tuple[Region, ...]:
+    """Where the curves of the motor without effects are far from zero, the clearest first; also a line in frequency."""
+    found, line = naming.base_screen, naming.line
+    base = found.evidence.regress().squares
+    regions = []
+    for curve, block in zip(found.curves, found.curve_blocks, strict=True):
+        if curve.per_run or curve.is_sensor_error:
+            continue
+        gain = base - found.evidence.regress([block]).squares
+        if log_p_value(gain, found.evidence.degrees_of_freedom(block)) > np.log(1e-4):
+            continue
+        z = np.array([_z_of_column(found, column) for column in block.columns])
+        regions += _regions_of_curve(curve, z)
+    if line is not None:
+        region = (line.low, line.high)
+        regions.append(Region("mechanical", "frequency", region, float(np.sqrt(line.height))))
+    return tuple(sorted(regions, key=lambda r: -abs(r.z))[:12])
+
+
+def _z_of_column(found: Screen, column: int) -> float:
+    """The misfit at one knot over its standard error; regressed alone, as neighbours would share what they explain."""
+    fit = found.evidence.regress([Block((column,))])
+    error = float(fit.errors[0][0])
+    return float(fit.coefficients[0][0]) / error if error > 0 else 0.0
+
+
+def _regions_of_curve(curve: Curve, z: np.ndarray) -> list[Region]:
+    """The stretches of neighbouring knots where a curve is clearly different from zero, with one sign."""
+    knots, clear = curve.knots, np.abs(z) > REGION_Z
+    regions, first = [], None
+    for k in range(len(knots) + 1):
+        inside = k < len(knots) and clear[k] and (first is None or z[k] * z[first] > 0)
+        if first is not None and not inside:
+            part = z[first:k]
+            peak = float(part[np.argmax(np.abs(part))])
+            ends = float(knots[max(first - 1, 0)]), float(knots[min(k, len(knots) - 1)])
+            regions.append(Region(curve.equation, curve.variable, ends, peak))
+            first = k if k < len(knots) and clear[k] else None
+        elif inside and first is None:
+            first = k
+    return regions
+
+
+def learned_curves(naming: Naming) -> tuple[LearnedCurve, ...]:
+    """The curves that the data still show, at most three, the most significant first; none for a line in frequency."""
+    found = naming.chosen_screen
+    if naming.p_nothing_more >= FALSE_ALARM:
+        return ()
+    base = found.evidence.regress().squares
+    learned = []
+    for curve, block in zip(found.curves, found.curve_blocks, strict=True):
+        # directions that the motor's own parameters can imitate are no part of the curve
+        least = 1e-3 if curve.order > 1 else MIN_EIGENVALUE
+        fit = found.evidence.regress([block], min_eigenvalue=least)
+        log_p = log_p_value(base - fit.squares, found.evidence.degrees_of_freedom(block))
+        value, error = fit.coefficients[0], fit.errors[0]
+        if curve.per_run:  # of the run that shows it most clearly
+            clearest = np.argmax(np.sum(np.square(value / np.maximum(error, 1e-300)), axis=1))
+            value, error = value[clearest], error[clearest]
+        estimated = LearnedCurve(
+            curve.equation,
+            curve.variable,
+            curve.unit,
+            curve.knots,
+            curve.values(value),
+            curve.errors(error),
+            float(np.exp(log_p)),
+            curve.reverses,
+        )
+        learned.append((log_p, estimated))
+    return tuple(curve for _, curve in sorted(learned, key=lambda pair: pair[0])[:3])
+
+
+def detectable_effects(found: Screen) -> tuple[Detectable, ...]:
+    """The smallest amplitude of each effect that would be detected with a probability of 90 %, if it is physical."""
+    count = len(found.candidates) + len(found.curves)
+    needed = stats.norm.isf(FALSE_ALARM / count / 2) + stats.norm.isf(0.1)
+    smallest: dict[str, Detectable] = {}
+    for candidate, block in zip(found.candidates, found.candidate_blocks, strict=True):
+        field = candidate.amplitude
+        if field is None:
+            continue
+        error = float(np.min(found.evidence.regress([block]).errors[0][..., -1]))
+        error *= np.sqrt(found.evidence.rounding_dispersion(block))
+        least = max(found.sensor_floor(candidate), candidate.min_amplitude)
+        amplitude = max(float(needed * error * candidate.unit), least)
+        known = smallest.get(candidate.effect)
+        if error > 0 and amplitude < (known.amplitude if known else candidate.max_amplitude):
+            unit = EFFECTS[candidate.effect].ranges[field].unit
+            smallest[candidate.effect] = Detectable(candidate.effect, field, amplitude, unit)
+    return tuple(smallest.values())

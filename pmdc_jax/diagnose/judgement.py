@@ -1,0 +1,98 @@
+"""The verdict, and effects that are dropped before it."""
+
+from __future__ import annotations
+
+from ..effects import EFFECTS, ShaftCompliance
+from ..identify.identification import Identification
+from ..motor import Motor
+from .assessment import FALSE_ALARM
+from .diagnosis import Verdict, breaks_electrical_equation, is_disturbed, unlike_held_out
+from .gap import Noise, gaps_by_role, gaps_of_runs, noise_of_runs
+from .library import Library
+from .naming import Naming
+
+# An effect with a smaller p-value without it is kept even if the runs give no interval of any of its parameters
+CERTAIN_P_VALUE = 1e-30
+# ... and one whose interval of the amplitude reaches down to this share of the estimate may be absent
+ABSENT_SHARE = 1e-2
+# Damping over critical damping from which a shaft is none: couplings of rubber reach 0.3
+MAX_DAMPING_RATIO = 2.0
+
+
+def implausible_effect(motor: Motor) -> str | None:
+    """The shaft, if its damping keeps it from any oscillation: it then stands for something else that is missing, such
+    as a current that was read late.
+
+    Judged only once a set is chosen: on the way to a gear, the play may appear as damping of a shaft.
+    """
+    shafts = (e for e in motor.effects if isinstance(e, ShaftCompliance))
+    return next((e.name for e in shafts if e.damping_ratio(motor) > MAX_DAMPING_RATIO), None)
+
+
+def unneeded_effect(naming: Naming, final: Identification, library: Library) -> str | None:
+    """The one of several effects that the runs need least, if they do not need it: by its p-value, as its amplitude may
+    be zero, or as they determine none of its parameters and its p-value is not below `CERTAIN_P_VALUE`."""
+    if len(naming.p_without) < 2:
+        return None
+    amplitude = {c.effect: c.amplitude for c in library.candidates if c.amplitude}
+
+    def is_unneeded(effect: str, p_value: float) -> bool:
+        if p_value > FALSE_ALARM:
+            return True
+        if effect in amplitude and may_be_absent(final, effect, amplitude[effect]):
+            return True
+        intervals = [final.parameters[f"{effect}.{f}"].ci95 for f in EFFECTS[effect].ranges]
+        return p_value > CERTAIN_P_VALUE and all(interval is None for interval in intervals)
+
+    unneeded = {e: p for e, p in naming.p_without.items() if is_unneeded(e, p)}
+    return max(unneeded, key=lambda effect: unneeded[effect], default=None)
+
+
+def may_be_absent(final: Identification, effect: str, amplitude: str) -> bool:
+    """Whether the 95 % interval of an effect's amplitude includes zero, or, if it is strictly positive, the larger of
+    its lower bound and the share `ABSENT_SHARE` of the estimate."""
+    found, about = final.parameters[f"{effect}.{amplitude}"], EFFECTS[effect].ranges[amplitude]
+    if found.value is None or found.ci95 is None:
+        return False
+    least = about.lower * (1 + 1e-6)  # the bound after its logarithm and back
+    absent = max(least, ABSENT_SHARE * found.value) if about.scale == "log" else 0.0
+    return found.ci95[0] <= absent <= found.ci95[1]
+
+
+def judge(
+    naming: Naming,
+    base: Identification,
+    final: Identification,
+    electrical_misfits: tuple[float, float],
+) -> tuple[Verdict, Noise]:
+    """The verdict, and the noise of each run that it implies.
+
+    **Arguments**: `base` and `final`, the motor without and with the effects, and the `electrical_misfits` of both.
+    """
+    verdict = _by_evidence(naming)
+    if breaks_electrical_equation(*electrical_misfits):
+        verdict = "not_in_library"
+    fits, share = final.fit, naming.noise_share if verdict == "not_in_library" else 1.0
+    if naming.varies:  # what its own value leaves of each run is noise
+        fits, share = {**fits, **naming.varies.fit}, 1.0
+    noise = noise_of_runs(fits, share)
+    gaps = gaps_of_runs(base.fit, final.fit, noise)
+    if verdict == "none_detected" and is_disturbed(gaps, final):
+        # what is left is then no noise but that of the sensors
+        return "not_in_library", noise_of_runs(final.fit, share=0.0)
+    if unlike_held_out(gaps_by_role(gaps, base.fit)):
+        verdict = "not_in_library"
+    return verdict, noise
+
+
+def _by_evidence(naming: Naming) -> Verdict:
+    """The verdict by the evidence against the motor without effects and against the chosen one."""
+    if naming.line is not None:
+        return "not_in_library"
+    if naming.p_nothing >= FALSE_ALARM:
+        return "not_in_library" if naming.varies else "none_detected"
+    if naming.p_nothing_more < FALSE_ALARM and not naming.may_be_model_form_error:
+        return "not_in_library"
+    if not naming.chosen.effects:
+        return "not_in_library"
+    return "ambiguous" if naming.rivals else "named"
