@@ -40,7 +40,7 @@ from pmdc_jax.diagnose.trials import TRIALS
 from pmdc_jax.effects import EFFECTS, ShaftCompliance
 from pmdc_jax.identify.identification import Estimate, Identification
 from pmdc_jax.identify.noise_model import Series, whitener
-from pmdc_jax.identify.polish import polish
+from pmdc_jax.identify.polish import fit_at
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Unknowns
 from pmdc_jax.identify.refine import Optimum
@@ -732,7 +732,7 @@ def model_at(coordinates: list[float], effects: tuple[str, ...] = (), **missing:
     given = prepare([run], [], effects=[EFFECTS[e] for e in effects], unloaded=True)
     start = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1))))
     point = Optimum(start, np.inf, ())
-    return model_of(effects, given, polish(given.problem, point, steps=0))
+    return model_of(effects, given, fit_at(given.problem, point))
 
 
 def test_an_undetermined_effect_without_start_values_is_kept_as_it_is(x64):

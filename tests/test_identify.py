@@ -32,12 +32,13 @@ from pmdc_jax.identify.nearby import best_nearby
 from pmdc_jax.identify.noise import common_divisor, is_coarse, quantum, white_noise
 from pmdc_jax.identify.noise_model import whitener
 from pmdc_jax.identify.parameters import Parameters
-from pmdc_jax.identify.polish import fit_run_unknowns, polish
+from pmdc_jax.identify.polish import fit_at, polish
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Problem, Unknowns, _evaluated, evaluate, normal_matrix
 from pmdc_jax.identify.refine import Optimum, refine
 from pmdc_jax.identify.results import results_of
 from pmdc_jax.identify.rotor_angle import with_rotor_angle
+from pmdc_jax.identify.run_unknowns import fit_run_unknowns
 from pmdc_jax.identify.search import METHODS, SearchResult, search
 from pmdc_jax.identify.solve import _distinct, solve
 from pmdc_jax.identify.uncertainty import information, long_run_variance
@@ -638,7 +639,7 @@ def test_the_rotor_angle_is_that_of_the_true_speed_not_of_a_slow_sensor(x64, sen
     coordinates = [np.log(values[n]) if log else values[n] for n, log in logs]
     local = np.array([[truth["current_A"][0], speed[0], 0.0, 0.0, 0.0]])
     unknowns = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.asarray(local).T))
-    fit = polish(given.problem, Optimum(unknowns, np.inf, ()), steps=0)
+    fit = fit_at(given.problem, Optimum(unknowns, np.inf, ()))
     turn = np.asarray(with_rotor_angle(given.problem, fit).tape.turn).reshape(-1)
     angle = cumulative_simpson(speed, x=time, initial=0.0)
     angle_found = np.concatenate([[0.0], np.cumsum(turn)])[: len(angle)]
@@ -1011,7 +1012,7 @@ def test_a_population_finds_backlash_that_a_gradient_misses(options):
         columns = jnp.array([problem.parameters.names.index(name) for name in names])
         moved = truth.coordinates.at[columns].add(jnp.log(jnp.array([*error.values()])))
         poor = Optimum(truth._replace(coordinates=moved), np.inf, ())
-        start = polish(problem, poor, steps=0)
+        start = fit_at(problem, poor)
         search_factors = dict(zip(names, factors.values(), strict=True))
         by_gradient = polish(problem, poor)
         found = polish(problem, best_nearby(problem, start, search_factors, seed=0))

@@ -16,11 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..identify.by_run import FitByRun, errors_by_run, fit_by_run
+from ..identify.gauss_newton import squares_of_runs
 from ..identify.identification import Estimate
 from ..identify.likelihood import negative_log_likelihood
 from ..identify.parameters import unit_of
-from ..identify.polish import fit_run_unknowns, squares_of_runs
 from ..identify.results import run_fits
+from ..identify.run_unknowns import fit_run_unknowns
 from ..motor import PARAMETERS
 from ..simulate import RunUnknowns
 from .assessment import FALSE_ALARM, Assessment

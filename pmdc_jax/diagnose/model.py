@@ -17,7 +17,7 @@ from ..identify.generalised_least_squares import (
     with_whitening,
 )
 from ..identify.noise_model import Series, Whitener
-from ..identify.polish import Fit, polish, reweighted
+from ..identify.polish import Fit, fit_at, reweighted
 from ..identify.prepare import Prepared
 from ..identify.refine import Optimum
 from ..identify.rotor_angle import rotor_outputs, with_rotor_angle
@@ -160,7 +160,7 @@ def refit_from(effects: tuple[str, ...], given: Prepared, start: Optimum, white:
     given, whitened = polish_with_angle(with_whitening(given, white), start)
     given = given._replace(problem=replace(given.problem, whitening=None))
     # no step: the unfiltered residuals at the same point
-    unfiltered = polish(given.problem, whitened.optimum, steps=0)
+    unfiltered = fit_at(given.problem, whitened.optimum)
     optimum = whitened.optimum._replace(fitness=unfiltered.fitness)
     return model_of(effects, given, unfiltered._replace(optimum=optimum))
 

@@ -13,9 +13,10 @@ from ..identify.generalised_least_squares import residuals_of, with_whitening
 from ..identify.identifiability import moved_by
 from ..identify.nearby import best_nearby
 from ..identify.noise_model import Whitener, whitener
-from ..identify.polish import best_backlash_start, polish
+from ..identify.polish import fit_at, polish
 from ..identify.prepare import Prepared
 from ..identify.refine import Optimum
+from ..identify.run_unknowns import best_backlash_start
 from ..identify.solve import POOR_FIT, Solved, search_and_refine
 from ..identify.uncertainty import information_of
 from ..progress import ReportProgress
@@ -154,7 +155,7 @@ class Refits:
         key = frozenset(rest)
         if (key, model) not in self.refitted_from:
             self.refitted_from.add((key, model))
-            at_start = polish(given.problem, start, steps=0).fitness
+            at_start = fit_at(given.problem, start).fitness
             if at_start < (1 - MIN_IMPROVEMENT) * _misfit(smaller):
                 return self._stored_or_better(key, model, refit)
         return smaller
@@ -267,11 +268,11 @@ def _refit_with_population(
 ) -> Model:
     """A refit; or a second one from the best of a population around where the first ended, if that point is better and
     so is the refit, by the whitening filter of the residuals at the start."""
-    white = whitener(residuals_of(given, polish(given.problem, start, steps=0)))
+    white = whitener(residuals_of(given, fit_at(given.problem, start)))
     whitened = with_whitening(given, white).problem
 
     def whitened_misfit(model: Model) -> float:
-        return polish(whitened, model.fit.optimum, steps=0).fitness
+        return fit_at(whitened, model.fit.optimum).fitness
 
     model = refit_from(effects, given, start, white)
     nearer = {name: np.sqrt(factor) for name, factor in factors.items()}
@@ -285,7 +286,7 @@ def _best_around(
     given: Prepared, start: Optimum, factors: Mapping[str, float], seed: int
 ) -> Optimum:
     """The best point of a population search around a start; `factors` as in `best_nearby`."""
-    fit = polish(given.problem, start, steps=0)
+    fit = fit_at(given.problem, start)
     return best_nearby(given.problem, fit, factors, seed)
 
 

@@ -10,16 +10,22 @@ import numpy as np
 from jaxtyping import Float
 
 from ..simulate import UNKNOWNS_PER_RUN, RunUnknowns
-from .polish import (
+from .gauss_newton import (
     RIDGE,
     gauss_newton_step,
     residual_noise,
     ridge_of,
-    scaled,
-    select_blocks,
     squares_of_outputs,
 )
-from .problem import Evaluation, Problem, Unknowns, evaluate, normal_matrix
+from .problem import (
+    Evaluation,
+    Problem,
+    Unknowns,
+    evaluate,
+    normal_matrix,
+    scaled,
+    select_blocks,
+)
 from .uncertainty import information
 
 # Gauss-Newton steps at most, and the decrease of the cost from which another one is taken

@@ -14,9 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..simulate import Tape
+from .gauss_newton import TOLERANCE
 from .noise import MIN_RELATIVE_NOISE
 from .noise_model import Series, Whitener
-from .polish import TOLERANCE, Fit, polish, reweighted
+from .polish import Fit, fit_at, polish, reweighted
 from .prepare import Prepared
 from .whitening import Whitening
 
@@ -35,7 +36,7 @@ def last_fit(given: Prepared, plain_fit: Fit, start: Fit, white: Whitener) -> tu
     if white.is_white or _is_exact(given, plain_fit):
         return given, plain_fit
     problem, fit = fit_whitened(given, start, white)
-    fitness = polish(given.problem, fit.optimum, steps=0).fitness  # without whitening
+    fitness = fit_at(given.problem, fit.optimum).fitness  # without whitening
     keeps = fitness < MAX_FITNESS_RATIO * plain_fit.fitness
     return (problem, fit) if keeps else (given, plain_fit)
 

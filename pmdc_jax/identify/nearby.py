@@ -11,7 +11,7 @@ import numpy as np
 from ..motor import PARAMETERS
 from ..simulate import Tape
 from .parameters import Parameters
-from .polish import Fit, polish
+from .polish import Fit, fit_at
 from .problem import Problem
 from .refine import Optimum
 from .search import search
@@ -58,7 +58,7 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     for rank in TRIED_RANKS:
         coordinates[places] = found.candidates[rank]
         unknowns = fit.unknowns._replace(coordinates=jnp.asarray(coordinates))
-        best = polish(problem, Optimum(unknowns, np.inf, ()), steps=0).optimum
+        best = fit_at(problem, Optimum(unknowns, np.inf, ())).optimum
         if np.isfinite(best.fitness):
             return best
     return fit.optimum

@@ -129,6 +129,11 @@ def scaled(evaluation: Evaluation, stretch: Float[Array | np.ndarray, "2"]) -> E
     )
 
 
+def select_blocks(blocks: Bool[Array, " blocks"], one: Evaluation, other: Evaluation) -> Evaluation:
+    """`one` in the chosen blocks, `other` in the rest."""
+    return jax.tree.map(jax.vmap(jnp.where), *(Evaluation(*3 * [blocks]), one, other))
+
+
 def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
     """Simulate every run of the problem and compare it with the measurement."""
     # without whitening and nuisance, so that the simulation, slow to compile, is compiled only once

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .polish import gauss_newton_step, ridge_of
+from .gauss_newton import gauss_newton_step, ridge_of
 from .problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
 # For a coordinate (natural logarithm) with a smaller standard error the sum of squares is close enough to quadratic.

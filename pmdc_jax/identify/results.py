@@ -16,11 +16,12 @@ from .identifiability import MIN_SHARE, explain_directions
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import ratio_to_noise, rms, white_noise
 from .parameters import Parameters, unit_of
-from .polish import Fit, fit_run_unknowns, polish
+from .polish import Fit, fit_at, polish
 from .prepare import Prepared
 from .problem import Problem
 from .profile import QUADRATIC_STDERR, profile_interval
 from .refine import Optimum
+from .run_unknowns import fit_run_unknowns
 from .solve import FITNESS_TOLERANCE, Solved
 from .uncertainty import MIN_UNSEEN_STDERR, Information, information_of
 
@@ -142,7 +143,7 @@ def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
     refitted = polish(held, polished.optimum._replace(unknowns=unknowns))
     # false where the simulation failed: its fitness is infinite
     as_good = refitted.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE)
-    return polish(problem, refitted.optimum._replace(at_bound=()), steps=0) if as_good else None
+    return fit_at(problem, refitted.optimum._replace(at_bound=())) if as_good else None
 
 
 def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit:

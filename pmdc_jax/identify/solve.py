@@ -27,11 +27,12 @@ from .corrections.step_times import with_step_times
 from .corrections.uneven_sampling import with_even_clock
 from .identification import Search
 from .parameters import Parameters
-from .polish import Fit, polish, with_holdout_unknowns
+from .polish import Fit, polish
 from .prepare import Prepared
 from .problem import Evaluation, Problem, Unknowns
 from .refine import Optimum, refine
 from .rotor_angle import with_rotor_angle
+from .run_unknowns import with_holdout_unknowns
 from .search import SearchResult
 from .search import search as global_search
 

@@ -21,7 +21,7 @@ from ...simulate import Tape, uniform
 from ..generalised_least_squares import series_of
 from ..likelihood import negative_log_likelihood
 from ..noise_model import whitener
-from ..polish import Fit, polish
+from ..polish import Fit, fit_at, polish
 from ..prepare import Prepared
 from ..problem import Problem
 
@@ -52,7 +52,7 @@ def without_input_noise(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     if not any(map(np.any, rough)):
         return given, fit
     smooth = _with_drives(given, [d - r for d, r in zip(drives, rough, strict=True)])
-    felt = _felt_shares(given, fit, polish(smooth, fit.optimum, steps=0))
+    felt = _felt_shares(given, fit, fit_at(smooth, fit.optimum))
     if not any(share < 1 for share in felt):
         return given, fit
     lost = [(1 - share) * r for share, r in zip(felt, rough, strict=True)]

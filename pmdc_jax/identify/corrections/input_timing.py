@@ -24,7 +24,7 @@ from scipy.optimize import minimize_scalar
 from ...recording import Recording
 from ...simulate import Tape, uniform
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
-from ..polish import Fit, polish
+from ..polish import Fit, fit_at
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
 from .electrical_equation import (
@@ -260,7 +260,7 @@ def _apparent_lead(given: Prepared, fit: Fit) -> float:
     """
     means = with_timing(given, STRAIGHT).problem
     means = replace(means, tape=replace(means.tape, rise=None))
-    sooner, evaluation = polish(means, fit.optimum, steps=0).evaluation.seen, fit.evaluation
+    sooner, evaluation = fit_at(means, fit.optimum).evaluation.seen, fit.evaluation
     (amplitude,), _ = _amplitudes(given.problem, fit, [sooner - evaluation.seen])
     return float(amplitude)
 

@@ -15,7 +15,7 @@ from ...clock import GAP
 from ...recording import Recording
 from ...simulate import Tape
 from ...simulate.uneven import seen_at_record
-from ..polish import Fit, polish
+from ..polish import Fit, fit_at, polish
 from ..prepare import Prepared
 
 # Refits at most
@@ -50,7 +50,7 @@ def with_even_clock(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 def _extrapolated(given: Prepared, fit: Fit, step: Float[np.ndarray, " parameters"]) -> Fit:
     """The fit evaluated a `step` further on, within the bounds (Irons and Tuck, doi:10.1002/nme.1620010306)."""
     further = fit.optimum.moved(given.problem.parameters, step)
-    return polish(given.problem, further, steps=0)
+    return fit_at(given.problem, further)
 
 
 def _squares_between(before: Prepared, after: Prepared, fit: Fit) -> float:
