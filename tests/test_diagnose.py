@@ -329,10 +329,7 @@ def test_late_readings_are_noise_of_their_own_covariance():
     J, own, X, r = random_evidence(1)
     late, deviation = [x[:, :1] for x in X], 0.03
     pieces = [[np.hstack(p)] for p in zip(J, late, X, [y[:, None] for y in r], own, strict=True)]
-    known = np.zeros((1, pieces[0][0].shape[1]))
-    known[0, J[0].shape[1]] = 1 / deviation
-    pieces[0].append(known)
-    evidence = gather_evidence(pieces, J[0].shape[1], own[0].shape[1], late_readings=1)
+    evidence = gather_evidence(pieces, J[0].shape[1], own[0].shape[1], timing_errors=[deviation])
 
     c = np.concatenate(late)[:, 0]
     white = np.linalg.cholesky(np.linalg.inv(np.eye(len(c)) + deviation**2 * np.outer(c, c))).T

@@ -158,14 +158,15 @@ def gather_evidence(
     runs: Iterable[Iterable[Float[np.ndarray, "_ _"]]],
     parameters: int,
     run_unknowns: int,
-    late_readings: int = 0,
+    timing_errors: Sequence[float] = (),
     rounding_errors: int = 0,
 ) -> Evidence:
     """Gather the evidence from white rows, those of each run in several pieces.
 
-    **Arguments**: `runs`, the pieces of each run, with columns for the motor's `parameters`, the `late_readings`, what
+    **Arguments**: `runs`, the pieces of each run, with columns for the motor's `parameters`, the late readings, what
     may be missing, the simulated `rounding_errors` of coarse converters, the residual, and last the `run_unknowns`; the
-    numbers are how many columns each has.
+    numbers are how many columns each has. `timing_errors`, the standard deviations to within which it is known
+    beforehand that each output is not read late.
     """
     products = []
     for pieces in runs:
@@ -178,5 +179,7 @@ def gather_evidence(
         distinct = np.diag(projected) > MIN_EIGENVALUE * np.diag(total)[kept]
         products.append(projected * distinct * distinct[:, None])
     found, residual = np.array(products), products[0].shape[0] - 1
+    late = parameters + np.arange(len(timing_errors))
+    found[0, late, late] += 1 / np.square(timing_errors)
     rounding = (k for k in range(residual - rounding_errors, residual) if found[:, k, k].any())
-    return Evidence(found, parameters, late_readings, tuple(rounding))
+    return Evidence(found, parameters, len(late), tuple(rounding))

@@ -41,10 +41,7 @@ class Rows(NamedTuple):
     rounding: Float[np.ndarray, "samples outputs draws"]
 
     def white(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
-        """Whitened rows, `CHUNK` samples at a time; columns in the order that `gather_evidence` expects.
-
-        The last rows of the first run say that no output is read late, to within `TIMING_ERRORS`.
-        """
+        """Whitened rows, `CHUNK` samples at a time; columns in the order that `gather_evidence` expects."""
         shared, own, residual, _ = self.fit
         columns = (
             shared.values,
@@ -59,10 +56,6 @@ class Rows(NamedTuple):
             part = slice(first - back, first + CHUNK)
             values = np.concatenate([x[part] for x in columns], axis=-1)
             yield whiten(run, Series(values, residual.known[part], residual.kind))
-        if run == 0:
-            width, first = sum(x.shape[-1] for x in columns), shared.values.shape[-1]
-            late = slice(first, first + self.late.shape[-1])
-            yield np.eye(width)[late] / np.array(TIMING_ERRORS)[:, None]
 
 
 def gather_rows(

@@ -13,7 +13,7 @@ from .evidence import Block, Evidence, consecutive_blocks, gather_evidence
 from .library import Curve, Library, curves_along
 from .model import Model
 from .quantisation import ROUNDING_DRAWS
-from .rows import Rows, gather_rows
+from .rows import TIMING_ERRORS, Rows, gather_rows
 from .signals import Screen, Signal, signals
 
 
@@ -56,12 +56,11 @@ def share_beyond(found: Screen, blocks: Sequence[Block]) -> float:
 def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
     """The evidence from all rows, whitened by one filter."""
     white = (run.white(k, whiten) for k, run in enumerate(rows))
-    first = rows[0]
     return gather_evidence(
         white,
-        parameters=first.fit.shared.values.shape[-1],
+        parameters=rows[0].fit.shared.values.shape[-1],
         run_unknowns=UNKNOWNS_PER_RUN,
-        late_readings=first.late.shape[-1],
+        timing_errors=TIMING_ERRORS,
         rounding_errors=ROUNDING_DRAWS,
     )
 
