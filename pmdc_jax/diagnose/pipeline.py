@@ -10,8 +10,6 @@ import attrs
 
 from ..compiled import free_memory_maps
 from ..identify.corrections.input_timing import (
-    HELD,
-    Timing,
     negative_log_likelihood_within,
     only_current_is_late,
     other_timings,
@@ -20,6 +18,7 @@ from ..identify.identification import Identification
 from ..identify.prepare import Prepared, prepare
 from ..identify.results import results_of
 from ..identify.solve import Solved, solve
+from ..identify.timing import HELD, Timing
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..recording_file import Runs

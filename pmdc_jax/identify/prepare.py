@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +26,7 @@ from .identification import Role
 from .noise import white_noise
 from .parameters import Parameters, check_names
 from .problem import Problem
-
-if TYPE_CHECKING:
-    from .corrections.input_timing import Timing
+from .timing import Timing
 
 
 class Prepared(NamedTuple):

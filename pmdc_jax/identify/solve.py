@@ -15,13 +15,9 @@ from ..simulate import RunUnknowns, Tape
 from ..threads import map_in_threads_until, submit
 from .bounds import effect_bounds
 from .corrections.input_noise import without_input_noise
-from .corrections.input_timing import (
-    Timing,
-    negative_log_likelihood_within,
-    other_timings,
-    with_timing,
-)
+from .corrections.input_timing import negative_log_likelihood_within, other_timings
 from .corrections.reading_time import with_fitted_reading
+from .corrections.retiming import with_timing
 from .corrections.speed_averaging import with_averaging, with_evident_averaging
 from .corrections.step_times import with_step_times
 from .corrections.uneven_sampling import with_even_clock
@@ -35,6 +31,7 @@ from .rotor_angle import with_rotor_angle
 from .run_unknowns import with_holdout_unknowns
 from .search import SearchResult
 from .search import search as global_search
+from .timing import Timing
 
 STARTS = 4
 # Two refinements found the same optimum if their fitness agrees to this share.

@@ -12,21 +12,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
-import attrs
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
-from ...recording import Recording
-from ...simulate import Tape, uniform
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
 from ..polish import Fit, fit_at
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
+from ..timing import EARLY, LATE, STRAIGHT, Timing
 from .electrical_equation import (
     ElectricalEquation,
     TwoVoltages,
@@ -35,6 +31,7 @@ from .electrical_equation import (
     two_voltages,
 )
 from .reading_time import MARGIN, change_by_reading
+from .retiming import with_timing
 from .speed_averaging import (
     refitted,
     seems_averaged,
@@ -56,44 +53,6 @@ MAX_FROM_MEAN = 0.2
 MIN_LEAD = 0.3
 
 
-class Timing(NamedTuple):
-    """When the voltages of a recording act, if they are not held from their sample to the next, and how its currents
-    were read."""
-
-    lead: float  # by how many samples they act before the sample beside which they were recorded, at least -1
-    straight: bool = False  # linear from sample to sample instead of held
-    load: bool = False  # whether the recorded loads have the same timing
-    current_mean: bool = False  # whether the recorded currents are means over the last sample
-
-    @property
-    def ahead(self) -> int:
-        """By how many whole samples they act earlier."""
-        return int(np.floor(self.lead))
-
-    @property
-    def reading(self) -> float | None:
-        """The share of a sample between the instant at which a voltage begins to act and the reading of the outputs, if
-        not zero."""
-        return self.lead - self.ahead or None
-
-    @property
-    def what(self) -> str | None:
-        """What the voltages do, in words, if they are not held from their sample on."""
-        if self.lead == 0 and not self.straight:
-            return None
-        if self.straight:
-            return "is linear between samples instead of held"
-        if self.reading is not None:
-            sooner = "earlier" if self.lead > 0 else "later"
-            return f"acts {abs(self.lead):.2g} of a sample {sooner} than it was recorded"
-        if self.lead > 0:
-            return "was recorded one sample late, after it had been held instead of before"
-        return "acts one sample later than it was recorded"
-
-
-HELD, STRAIGHT, LATE, EARLY = Timing(0), Timing(0, straight=True), Timing(1), Timing(-1)
-
-
 def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
     """The timings of the voltages that are clearly likelier than the assumed one, the likeliest first.
 
@@ -103,22 +62,19 @@ def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
         return []  # without a current, or without a speed, only a delay would show
     trials = _Trials(given, fit)
     plausible = [*_at_samples(given, fit), *_by_electrical_equation(trials)]
-    limit = negative_log_likelihood_within(given, fit) - MIN_LOG_LIKELIHOOD_GAIN
-    likelier = [timing for timing in plausible if trials.negative_log_likelihood(timing) < limit]
+    score = trials.negative_log_likelihood
+
+    def likelier(timings: Sequence[Timing], than: float) -> list[Timing]:
+        return [timing for timing in timings if score(timing) < than - MIN_LOG_LIKELIHOOD_GAIN]
+
+    plausible = likelier(plausible, negative_log_likelihood_within(given, fit))
     # where everything is a mean, voltages on straight lines are as good, and simpler
-    simpler = [timing for timing in likelier if not timing.current_mean]
-    limit = (
-        min(map(trials.negative_log_likelihood, simpler), default=np.inf) - MIN_LOG_LIKELIHOOD_GAIN
-    )
-    likelier = simpler + [
-        t for t in likelier if t.current_mean and trials.negative_log_likelihood(t) < limit
-    ]
+    found = [timing for timing in plausible if not timing.current_mean]
+    means = [timing for timing in plausible if timing.current_mean]
+    found += likelier(means, min(map(score, found), default=np.inf))
     if any(run.load is not None for run in given.training):
-        likelier = [
-            t if t.reading else min(t, t._replace(load=True), key=trials.negative_log_likelihood)
-            for t in likelier
-        ]
-    return sorted(likelier, key=trials.negative_log_likelihood)
+        found = [t if t.reading else min(t, t._replace(load=True), key=score) for t in found]
+    return sorted(found, key=score)
 
 
 class _Trials:
@@ -286,38 +242,3 @@ def _amplitudes(
     covariance = np.linalg.pinv(products - slopes @ inverse @ slopes.T, hermitian=True)
     along = np.array([-float(jnp.sum(fit.evaluation.residuals * change)) for change in scaled])
     return covariance @ along, np.sqrt(np.diag(covariance))
-
-
-def with_timing(given: Prepared, timing: Timing) -> Prepared:
-    """The runs with voltages of this timing."""
-    tape = given.problem.tape
-    runs = [
-        attrs.evolve(uniform(_retimed(run, k, tape, timing)), current_averaged=timing.current_mean)
-        for k, run in enumerate(given.runs)
-    ]
-    driven = Tape.from_recordings(runs, straight=timing.straight, reading=timing.reading)
-    names = ("value", "load", "rise", "reading", "averaging")
-    tape = replace(tape, **jax.tree.map(jnp.asarray, {n: getattr(driven, n) for n in names}))
-    problem = replace(given.problem, tape=tape)
-    acting = given._replace(runs=runs, problem=problem, timing=timing)
-    # what acts during the first sample was not recorded: without outputs there, the initial state makes up for it
-    return without_ends(acting) if timing.ahead < 0 or timing.current_mean else acting
-
-
-def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
-    """The record of a run with its voltages, and its loads if the timing says so, moved to the samples where they act.
-
-    Voltages of an even clock are taken from the tape, where their noise may have been removed.
-    """
-    if run.drive != "voltage":
-        return run.recorded
-    even = run.resampled_from is None
-    voltage = tape.samples_of(k, tape.value, len(run)) if even else run.recorded.voltage
-    run, last = run.recorded, len(run.recorded) - 1
-    rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)
-    run = attrs.evolve(run, voltage=np.asarray(voltage)[rows])
-    if not timing.load or run.load is None:
-        return run
-    # a load varies slowly enough to be held at its means instead of going straight
-    ahead = np.minimum(rows + 1, last) if timing.straight else rows
-    return attrs.evolve(run, load=(run.load[rows] + run.load[ahead]) / 2)

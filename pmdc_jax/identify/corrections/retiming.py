@@ -1,0 +1,51 @@
+"""Runs with voltages of another timing than that of their record."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import attrs
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ...recording import Recording
+from ...simulate import Tape, uniform
+from ..prepare import Prepared
+from ..timing import Timing
+from .speed_averaging import without_ends
+
+
+def with_timing(given: Prepared, timing: Timing) -> Prepared:
+    """The runs with voltages of this timing."""
+    tape = given.problem.tape
+    runs = [
+        attrs.evolve(uniform(_retimed(run, k, tape, timing)), current_averaged=timing.current_mean)
+        for k, run in enumerate(given.runs)
+    ]
+    driven = Tape.from_recordings(runs, straight=timing.straight, reading=timing.reading)
+    names = ("value", "load", "rise", "reading", "averaging")
+    tape = replace(tape, **jax.tree.map(jnp.asarray, {n: getattr(driven, n) for n in names}))
+    problem = replace(given.problem, tape=tape)
+    acting = given._replace(runs=runs, problem=problem, timing=timing)
+    # what acts during the first sample was not recorded: without outputs there, the initial state makes up for it
+    return without_ends(acting) if timing.ahead < 0 or timing.current_mean else acting
+
+
+def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
+    """The record of a run with its voltages, and its loads if the timing says so, moved to the samples where they act.
+
+    Voltages of an even clock are taken from the tape, where their noise may have been removed.
+    """
+    if run.drive != "voltage":
+        return run.recorded
+    even = run.resampled_from is None
+    voltage = tape.samples_of(k, tape.value, len(run)) if even else run.recorded.voltage
+    run, last = run.recorded, len(run.recorded) - 1
+    rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)
+    run = attrs.evolve(run, voltage=np.asarray(voltage)[rows])
+    if not timing.load or run.load is None:
+        return run
+    # a load varies slowly enough to be held at its means instead of going straight
+    ahead = np.minimum(rows + 1, last) if timing.straight else rows
+    return attrs.evolve(run, load=(run.load[rows] + run.load[ahead]) / 2)

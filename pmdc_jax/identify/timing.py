@@ -1,0 +1,45 @@
+"""When the voltages of a recording act, and how its currents were read."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Timing(NamedTuple):
+    """When the voltages of a recording act, if they are not held from their sample to the next, and how its currents
+    were read."""
+
+    lead: float  # by how many samples they act before the sample beside which they were recorded, at least -1
+    straight: bool = False  # linear from sample to sample instead of held
+    load: bool = False  # whether the recorded loads have the same timing
+    current_mean: bool = False  # whether the recorded currents are means over the last sample
+
+    @property
+    def ahead(self) -> int:
+        """By how many whole samples they act earlier."""
+        return int(np.floor(self.lead))
+
+    @property
+    def reading(self) -> float | None:
+        """The share of a sample between the instant at which a voltage begins to act and the reading of the outputs, if
+        not zero."""
+        return self.lead - self.ahead or None
+
+    @property
+    def what(self) -> str | None:
+        """What the voltages do, in words, if they are not held from their sample on."""
+        if self.lead == 0 and not self.straight:
+            return None
+        if self.straight:
+            return "is linear between samples instead of held"
+        if self.reading is not None:
+            sooner = "earlier" if self.lead > 0 else "later"
+            return f"acts {abs(self.lead):.2g} of a sample {sooner} than it was recorded"
+        if self.lead > 0:
+            return "was recorded one sample late, after it had been held instead of before"
+        return "acts one sample later than it was recorded"
+
+
+HELD, STRAIGHT, LATE, EARLY = Timing(0), Timing(0, straight=True), Timing(1), Timing(-1)
