@@ -15,7 +15,7 @@ from rich.table import Table
 
 from experiments import emps, undcmotor
 from pmdc_jax import Diagnosis, diagnose
-from pmdc_jax.report.diagnosis import write_diagnosis
+from pmdc_jax.report.diagnosis import write_diagnosis_report
 
 OUT = Path(__file__).parent / "out"
 
@@ -71,7 +71,7 @@ def main() -> None:
     OUT.mkdir(exist_ok=True)
     for name in parser.parse_args().record or RECORDS:
         found, (before, after) = RECORDS[name]()
-        write_diagnosis(found, OUT / f"diagnosis_{name}.html")
+        write_diagnosis_report(found, OUT / f"diagnosis_{name}.html")
         effects = "\n".join(
             f"{effect.name}: "
             + ", ".join(f"{field} {e.value:.4g}" for field, e in effect.parameters.items())

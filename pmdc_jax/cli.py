@@ -58,6 +58,8 @@ from .options import (
 )
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from .identify.identification import Identification
 
 Result = TypeVar("Result")
@@ -110,14 +112,14 @@ def identify(
 
     identification = _read_and_fit(identify, runs, holdout, columns, options)
     from .report.json import identification_json
-    from .report.terminal import print_identification
+    from .report.terminal import identification_tables
 
     _print_findings_and_save(identification, save)
     if report:
-        from .report.identification import write_report
+        from .report.identification import write_identification_report
 
-        write_report(identification, report)
-    _write_and_print(identification, json, identification_json, print_identification)
+        write_identification_report(identification, report)
+    _write_and_print(identification, json, identification_json, identification_tables)
 
 
 @app.command(
@@ -152,7 +154,7 @@ def diagnose(
     from .diagnose import diagnose
 
     diagnosis = _read_and_fit(diagnose, runs, holdout, columns, options)
-    from .report.diagnosis_tables import print_diagnosis
+    from .report.diagnosis_tables import diagnosis_tables
     from .report.json import diagnosis_json
 
     _print_findings_and_save(diagnosis.final, save)
@@ -164,10 +166,10 @@ def diagnose(
                 f"note: no experiment was designed, so {experiment} was not written", err=True
             )
     if report:
-        from .report.diagnosis import write_diagnosis
+        from .report.diagnosis import write_diagnosis_report
 
-        write_diagnosis(diagnosis, report)
-    _write_and_print(diagnosis, json, diagnosis_json, print_diagnosis)
+        write_diagnosis_report(diagnosis, report)
+    _write_and_print(diagnosis, json, diagnosis_json, diagnosis_tables)
 
 
 @app.command(epilog="Example: pmdc simulate motor.json --input drive.csv --out simulated.csv")
@@ -221,7 +223,7 @@ def tune(
     check_outputs({"--save": save, "--json": json, "--report": report}, [motor])
     from .control.tuning import tune
     from .motor_file import load_motor, load_uncertainty
-    from .report.terminal import print_messages, print_tables, progress
+    from .report.terminal import print_messages, progress
 
     subject, uncertainty = load_motor(motor), load_uncertainty(motor)
     with progress() as on_progress:
@@ -253,7 +255,7 @@ def tune(
         save_controller(save, tuning.law)
     if report:
         write_tuning_report(tuning, report)
-    _write_and_print(tuning, json, tuning_json, lambda result: print_tables(tuning_tables(result)))
+    _write_and_print(tuning, json, tuning_json, tuning_tables)
 
 
 @app.command(epilog="Example: pmdc export controller.json --c controller.h")
@@ -295,14 +297,14 @@ def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
     Fits four runs, validates on a fifth, and writes results and reports to a folder.
     """
     from .demo import FILES, demo
-    from .report.diagnosis_tables import print_diagnosis
+    from .report.diagnosis_tables import diagnosis_tables
     from .report.terminal import print_findings, print_messages, print_tables, progress
     from .report.tuning import tuning_tables
 
     with progress() as on_progress:
         diagnosis, tuning = demo(out, seed=seed, progress=on_progress)
     print_findings(diagnosis.final)
-    print_diagnosis(diagnosis)
+    print_tables(diagnosis_tables(diagnosis))
     print_messages(tuning.messages)
     print_tables(tuning_tables(tuning))
     for name in FILES:
@@ -341,15 +343,17 @@ def _write_and_print(
     result: Result,
     json: str | None,
     as_json: Callable[[Result], dict[str, Any]],
-    print_result: Callable[[Result], None],
+    tables: Callable[[Result], RenderableType],
 ) -> None:
-    """Write JSON if a path is given; print the result unless the JSON went to standard output."""
+    """Write JSON if a path is given; print tables unless the JSON went to standard output."""
     if json:
         from .report.json import write_json
 
         write_json(as_json(result), json)
     if json != "-":
-        print_result(result)
+        from .report.terminal import print_tables
+
+        print_tables(tables(result))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

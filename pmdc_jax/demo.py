@@ -39,7 +39,7 @@ def demo(
     from .control.tuning import tune
     from .diagnose import diagnose
     from .motor_file import load_motor, load_uncertainty, save_motor
-    from .report.diagnosis import write_diagnosis
+    from .report.diagnosis import write_diagnosis_report
     from .report.json import diagnosis_json, write_json
     from .report.tuning import write_tuning_report
 
@@ -50,7 +50,7 @@ def demo(
     diagnosis = diagnose(training, holdout=held_out, seed=seed, progress=progress)
     save_motor(motor, diagnosis.final.motor, diagnosis.final)
     write_json(diagnosis_json(diagnosis), found)
-    write_diagnosis(diagnosis, report)
+    write_diagnosis_report(diagnosis, report)
     tuning = tune(
         load_motor(motor),
         "pid",

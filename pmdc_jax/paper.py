@@ -19,12 +19,12 @@ def paper(out: str | Path = "paper_out", progress: ReportProgress | None = None)
     drawn again; Table 2 is compared with what is physically possible.
     """
     from .report.json import write_json
-    from .report.paper import paper_json, write_paper
+    from .report.paper import paper_json, write_paper_report
     from .wheelchair import reproduce
 
     folder = result_folder(Path(out), "paper.html")
 
     result = reproduce(progress)
     write_json(paper_json(result), folder / "paper.json")
-    write_paper(result, folder / "paper.html")
+    write_paper_report(result, folder / "paper.html")
     return result

@@ -27,7 +27,7 @@ from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate
 from pmdc_jax.recording import Finding
 from pmdc_jax.report import notation
-from pmdc_jax.report.diagnosis import write_diagnosis
+from pmdc_jax.report.diagnosis import write_diagnosis_report
 from pmdc_jax.report.diagnosis_figures import averages
 from pmdc_jax.report.diagnosis_tables import diagnosis_tables
 from pmdc_jax.report.experiment import write_experiment
@@ -352,7 +352,7 @@ def test_tables_show_runs_effects_and_changes(case):
 @pytest.mark.parametrize("case", CASES)
 def test_the_page_is_complete_and_self_contained(case, tmp_path):
     diagnosis = CASES[case]()
-    write_diagnosis(diagnosis, tmp_path / "d.html")
+    write_diagnosis_report(diagnosis, tmp_path / "d.html")
     html = (tmp_path / "d.html").read_text(encoding="utf-8")
     page = Page(html)
     assert page.open == []

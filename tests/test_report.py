@@ -17,7 +17,7 @@ from pmdc_jax.identify.identification import Direction, Estimate, Identification
 from pmdc_jax.motor import Motor
 from pmdc_jax.recording import Finding
 from pmdc_jax.report import figures, notation
-from pmdc_jax.report.identification import write_report
+from pmdc_jax.report.identification import write_identification_report
 from pmdc_jax.report.json import identification_json, write_json
 from pmdc_jax.report.page import _commands
 from pmdc_jax.report.summary import MODEL_ASSUMPTION, summary
@@ -199,7 +199,7 @@ CASES = {"whole": fake_identification, "partial": partial_identification}
 @pytest.fixture(params=CASES)
 def case(request, tmp_path):
     identification = CASES[request.param]()
-    write_report(identification, tmp_path / "report.html")
+    write_identification_report(identification, tmp_path / "report.html")
     return identification, (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
@@ -242,7 +242,7 @@ def test_report_has_a_figure_for_every_run_the_search_and_the_correlations(case)
 
 
 def test_hold_out_runs_are_shown_first(tmp_path):
-    write_report(fake_identification(), tmp_path / "report.html")
+    write_identification_report(fake_identification(), tmp_path / "report.html")
     text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
     assert text.index("drive", text.index("Measured and simulated")) < text.index(
         "staircase", text.index("Measured and simulated")
@@ -271,7 +271,7 @@ def test_long_runs_are_thinned_and_the_page_stays_small(tmp_path):
     changes = {name: np.resize(getattr(run, name), length) for name in columns}
     changes["time"] = 1e-3 * np.arange(length)
     runs = {f"run {number}": evolve(run, **changes) for number in range(12)}
-    write_report(fake_identification(fit=runs), tmp_path / "report.html")
+    write_identification_report(fake_identification(fit=runs), tmp_path / "report.html")
     assert (tmp_path / "report.html").stat().st_size < 6_000_000
     assert "plot reduced to" in Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
 

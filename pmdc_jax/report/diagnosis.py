@@ -58,7 +58,7 @@ TRACES_OF_RESIDUALS = 4
 TRACES_OF_SIMULATION = 7
 
 
-def write_diagnosis(diagnosis: Diagnosis, path: str | Path) -> None:
+def write_diagnosis_report(diagnosis: Diagnosis, path: str | Path) -> None:
     """Write the report of a diagnosis to one self-contained HTML file."""
     write_page(
         path,

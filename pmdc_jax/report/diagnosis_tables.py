@@ -16,13 +16,8 @@ from .notation import (
     write_estimate,
 )
 from .summary import role_word, runs_in_order
-from .terminal import parameter_table, plain_table, print_tables, status_text
+from .terminal import parameter_table, plain_table, status_text
 from .verdict import detectable_others, drift_words, drifts, verdict_sentences
-
-
-def print_diagnosis(diagnosis: Diagnosis) -> None:
-    """Print the effects, what adding them changed, and the verdict to standard output."""
-    print_tables(diagnosis_tables(diagnosis))
 
 
 def diagnosis_tables(diagnosis: Diagnosis) -> RenderableType:

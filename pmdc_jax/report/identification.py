@@ -31,7 +31,7 @@ from .page import figure_json, write_page
 from .summary import role_word, runs_in_order, status_word, summary
 
 
-def write_report(identification: Identification, path: str | Path) -> None:
+def write_identification_report(identification: Identification, path: str | Path) -> None:
     """Write the report of an identification to one self-contained HTML file."""
     write_page(
         path,

@@ -165,7 +165,7 @@ def _as_printed_json(paper: Paper, kind: str) -> dict[str, float] | None:
     }
 
 
-def write_paper(paper: Paper, path: str | Path) -> None:
+def write_paper_report(paper: Paper, path: str | Path) -> None:
     """Write tables, figures and remarks to one self-contained HTML file."""
     steps = f"0 to {SETPOINT:g}, then to {LOWER_SETPOINT:g} rad/s"
     load_errors_title = "Error of the steady {} against load torque"

@@ -22,11 +22,6 @@ SEVERITY_STYLES = {"error": "red", "warning": "yellow"}
 PIPE_WIDTH = 100  # without a terminal, rich would fold tables at 80 columns
 
 
-def print_identification(identification: Identification) -> None:
-    """Print summary, parameters and fits to standard output."""
-    print_tables(identification_tables(identification))
-
-
 def print_tables(tables: RenderableType) -> None:
     """Print tables and sentences to standard output."""
     console_for(stderr=False).print(tables)
