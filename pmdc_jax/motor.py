@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .effects.base import AbstractEffect, Grip, Scalars, State
 
@@ -97,11 +96,6 @@ class Motor(eqx.Module):
         """Whether this is a linear system with inputs, as long as no dry element changes direction and no teeth touch
         or part."""
         return all(effect.affine for effect in self.effects)
-
-    @property
-    def is_possible(self) -> Bool[Array | np.ndarray, "*#batch"] | bool:
-        """Whether the parameters of its effects are physically possible."""
-        return reduce(np.logical_and, (effect.is_possible() for effect in self.effects), True)
 
     @property
     def switches(self) -> bool:

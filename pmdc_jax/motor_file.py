@@ -129,10 +129,6 @@ def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:
             raise InputError(where, f"effect {name} is listed twice", "Keep one of the two")
         fields = _numbers(where, entry.get("parameters", {}), EFFECTS[name].ranges, name)
         effects[name] = EFFECTS[name](**fields)
-        if not effects[name].is_possible():
-            given = ", ".join(f"{field} {value:g}" for field, value in fields.items())
-            what = f"{name} is physically impossible with {given}"
-            raise InputError(where, what, f"It needs {EFFECTS[name].condition}")
     return tuple(effects.values())
 
 
@@ -151,5 +147,8 @@ def _numbers(
         if name not in PARAMETERS and wanted[name].scale == "log" and value <= 0:
             mend = "Give a value in SI, or leave the effect out"
             raise InputError(where, f"{of}: {name} is {value}, not positive", mend)
+        if name not in PARAMETERS and value >= wanted[name].limit:
+            what = f"{of}: {name} is {value}, not below {wanted[name].limit:g}"
+            raise InputError(where, what, "Give a smaller value")
         numbers[name] = np.asarray(value)
     return numbers

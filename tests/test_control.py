@@ -125,6 +125,13 @@ def test_the_fastest_settling_includes_braking_within_the_band():
     assert best > without_braking * 1.01
 
 
+def test_a_motor_that_does_not_break_away_has_no_fastest_settling():
+    stribeck = EFFECTS["stribeck_friction"](coulomb_Nm=0.02, static_Nm=0.035, speed_rad_s=5.0)
+    stuck = MOTOR.with_effects([stribeck])
+    assert fastest_settling(stuck, 10.0, 24.0, 0.5) is None
+    assert fastest_settling(stuck, 10.0, 24.0, 0.9) is not None
+
+
 def test_an_unreachable_set_point_has_no_fastest_settling():
     assert fastest_settling(MOTOR, 600.0, 24.0) is None
     # a torque that drives the motor through the band, whatever the voltage
@@ -442,6 +449,33 @@ def test_margins_match_python_control(delay):
     assert found.gain_margin == pytest.approx(gain, rel=1e-3)
     assert found.phase_margin_deg == pytest.approx(phase, rel=1e-3)
     assert found.delay_margin_s == pytest.approx(np.radians(phase) / crossing, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("delay", [0, 1])
+def test_at_the_gain_margin_the_loop_becomes_unstable(name, delay):
+    """Without a delay, two of the loops oscillate there at half the sampling frequency."""
+    law = Law.of(LAWS[name], Hardware(1e-3, 30.0, None, None, delay), MOTOR)
+    loop, margin = linear_loop(MOTOR, law), margins(MOTOR, law).gain_margin
+
+    def is_stable(gain: float) -> bool:
+        closed = np.asarray(loop.A + gain * loop.B[:, None] * loop.C)
+        # the unused filter of some laws has an eigenvalue of 1
+        return np.abs(np.linalg.eigvals(closed)).max() < 1 + 1e-9
+
+    assert is_stable(0.999 * margin)
+    assert not is_stable(1.001 * margin)
+
+
+SLOW_SAMPLING = {"peaks within the sample": (2e-4, 20e-3), "rises to its end": (3e-4, 1e-4)}
+
+
+@pytest.mark.parametrize(("L", "step"), SLOW_SAMPLING.values(), ids=SLOW_SAMPLING.keys())
+def test_the_current_limit_holds_within_the_samples(L, step):
+    slow = Motor(**{**PAPER, "L": L, "J": 5e-3})
+    law = Law.of(PI(2.0, 0.0, 1.0, 1.0), Hardware(step, 30.0, 20.0, None, 0), slow)
+    response = closed_loop(slow, law, course(50), 400)
+    assert 0.97 * 20 < np.abs(np.asarray(response.current)).max() < 1.01 * 20
 
 
 def test_the_sensitivity_peak_matches_the_loop_gain():

@@ -89,6 +89,20 @@ def test_the_law_in_c_matches_python(tmp_path, name, hardware):
     np.testing.assert_allclose(single, expected, rtol=0, atol=2e-2)
 
 
+@needs_gcc
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_the_law_in_c_ignores_readings_that_are_no_numbers(tmp_path, bad):
+    law, samples = Law.of(LAWS["pid"], HARDWARE["delay, current limit"], MOTOR), inputs()
+    export(law, tmp_path / "controller.h")
+    for row, column in ((50, 1), (51, 2), (200, 0)):
+        samples = np.insert(samples, row, samples[row], axis=0)
+        samples[row, column] = bad
+    good = np.isfinite(samples).all(1)
+    found = in_c(tmp_path, samples=samples)
+    np.testing.assert_array_equal(found[good], in_c(tmp_path, samples=samples[good]))
+    np.testing.assert_array_equal(found[~good], found[np.flatnonzero(~good) - 1])
+
+
 @pytest.mark.parametrize("hardware", HARDWARE.values(), ids=HARDWARE.keys())
 @pytest.mark.parametrize("name", LAWS)
 def test_a_controller_file_round_trips_exactly(tmp_path, name, hardware):

@@ -131,10 +131,6 @@ INVALID = {
         file_with("effects", to=[effect("shaft_compliance", 50.0, 1e-3, 1.5)]),
         "load_share",
     ),
-    "friction that rises as motion begins": (
-        file_with("effects", to=[effect("stribeck_friction", 0.2, 0.1, 5.0)]),
-        "static_Nm",
-    ),
     "twice the same effect": (file_with("effects", to=2 * VALID["effects"]), "coulomb_friction"),
     "effects not in a list": (file_with("effects", to={"coulomb_friction": 0.1}), "effect"),
     "effects null": (file_with("effects", to=None), "effects"),

@@ -104,6 +104,16 @@ def test_a_loop_that_misses_its_specification_is_reported():
     assert not unsettled.meets_specification
 
 
+@pytest.mark.slow
+def test_a_small_step_is_tuned_for_what_the_sampling_allows():
+    """It would be over within a third of a sample."""
+    found = tune(MOTOR, "pi", setpoint=2.0, voltage_limit=24.0, sample_time=1e-3, starts=16)
+    assert found.fastest_possible_settling < 1e-3
+    assert found.meets_specification
+    assert found.margins.stable
+    assert found.metrics["SettlingTime"] < 0.05
+
+
 @pytest.mark.parametrize(("sample_time", "noted"), [(1e-3, False), (0.02, True)])
 def test_slow_sampling_is_noted(sample_time, noted):
     requirements = LoopRequirements(
@@ -141,7 +151,7 @@ IMPOSSIBLE = {
     ),
     "milliseconds": (
         {"setpoint": 481.0, "voltage_limit": 30.0, "sample_time": 1.0},
-        "1 s is far longer than the fastest settling, 0.0441 s",
+        "1 s is far longer than the motor's transients, 0.0441 s",
     ),
     "controller": ({"controller": "fuzzy"}, "unknown controller 'fuzzy'"),
 }

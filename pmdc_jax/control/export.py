@@ -12,18 +12,21 @@ from .law import Law
 HEADER = Template("""\
 /* A $type speed controller for a brushed permanent-magnet DC motor.
  *
- * Written by pmdc_jax. C99; no memory is allocated and nothing is called. Every $sample_time s:
+ * Written by pmdc_jax. C99; no memory is allocated and no function is called. Every $sample_time s:
  *
  *     voltage = pmdc_step(&state, reference, speed, current);
  *
  * reference and speed in rad/s, current in A${ignored}; the voltage, in V, is within the limits and is
  * to be applied $moment.
+ * After a reading that is no number (NaN or infinite) the last voltage remains, and nothing else changes.
  * Before the first step, with the motor at rest, call pmdc_start(&state).
  *
  * Double precision; #define PMDC_REAL float before including this file for single.
  */
 #ifndef PMDC_CONTROLLER_H
 #define PMDC_CONTROLLER_H
+
+#include <math.h>
 
 #ifndef PMDC_REAL
 #define PMDC_REAL double
@@ -101,7 +104,11 @@ def _constants(law: Law) -> dict[str, float]:
 
 def _body(law: Law) -> list[str]:
     """The statements of one step, in the order of `Law.step`."""
+    readings = ("reference", "speed", *(["current"] if law.hardware.measures_current else []))
     return [
+        f"if (!({' && '.join(f'isfinite({reading})' for reading in readings)})) {{",
+        "    return state->voltage;",
+        "}",
         *_predicted_state(law),
         *_command(law),
         *_limited_voltage(law),
@@ -149,10 +156,10 @@ def _limited_voltage(law: Law) -> list[str]:
     lines = ["pmdc_real applied = asked;"]
     if law.hardware.current_limit is not None:
         lines += [
-            "/* voltage that reaches the current limit at the end of the sample */",
-            "const pmdc_real drift = PMDC_MODEL_II * current + PMDC_MODEL_IW * ahead;",
-            "applied = pmdc_clip(applied, (-PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_IV,",
-            "                    (PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_IV);",
+            "/* voltage with which the current peaks at its limit */",
+            "const pmdc_real drift = PMDC_MODEL_PI * current + PMDC_MODEL_PW * ahead;",
+            "applied = pmdc_clip(applied, (-PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_PV,",
+            "                    (PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_PV);",
         ]
     return [*lines, "applied = pmdc_clip(applied, -PMDC_VOLTAGE_LIMIT, PMDC_VOLTAGE_LIMIT);"]
 

@@ -13,7 +13,8 @@ from ..motor import Motor
 from .controllers import CONTROLLERS, AbstractController, Number
 from .steady import steady_state
 
-# (lower, upper): the stiffness in units of voltage limit over set point, times in units of the fastest settling time.
+# (lower, upper): the stiffness in units of voltage limit over set point, times in units of the fastest settling time,
+# or of what the dead time of the loop allows.
 # The ranges are wide: in a long search for PI and PID at seven voltages, the best gains lay inside them by a factor of
 # at least three.
 RANGES: Mapping[str, tuple[float, float]] = {

@@ -15,7 +15,11 @@ from .hardware import Hardware
 
 
 class SampledMotor(NamedTuple):
-    """The law's discrete model of the linear motor: i[k+1] = ii i[k] + iw w[k] + iv v[k], and w[k+1] likewise."""
+    """The law's discrete model of the linear motor: i[k+1] = ii i[k] + iw w[k] + iv v[k], and w[k+1] likewise.
+
+    `pi`, `pw` and `pv` likewise give the current at its peak within the sample, after a step of the voltage from zero;
+    they are those of i[k+1] if it then still rises at the end of the sample.
+    """
 
     ii: Number
     iw: Number
@@ -23,12 +27,28 @@ class SampledMotor(NamedTuple):
     wi: Number
     ww: Number
     wv: Number
+    pi: Number
+    pw: Number
+    pv: Number
 
     @classmethod
     def of(cls, motor: Motor, sample_time: Number) -> SampledMotor:
         """Exact discretisation, with held voltage and no load, of the motor without its effects."""
-        A, B, *_ = make_propagator(motor.with_effects(()), jnp.asarray(sample_time, float), Drive())
-        return cls(ii=A[0, 0], iw=A[0, 1], iv=B[0, 0], wi=A[1, 0], ww=A[1, 1], wv=B[1, 0])
+        linear, sample_time = motor.with_effects(()), jnp.asarray(sample_time, float)
+        A, B, *_ = make_propagator(linear, sample_time, Drive())
+        to_peak = jnp.minimum(sample_time, _time_to_peak_current(linear))
+        P, Q, *_ = make_propagator(linear, to_peak, Drive())
+        return cls(
+            ii=A[0, 0],
+            iw=A[0, 1],
+            iv=B[0, 0],
+            wi=A[1, 0],
+            ww=A[1, 1],
+            wv=B[1, 0],
+            pi=P[0, 0],
+            pw=P[0, 1],
+            pv=Q[0, 0],
+        )
 
     def next(self, current: Number, speed: Number, voltage: Number) -> tuple[Number, Number]:
         """Current and speed one sample later."""
@@ -36,6 +56,18 @@ class SampledMotor(NamedTuple):
             self.ii * current + self.iw * speed + self.iv * voltage,
             self.wi * current + self.ww * speed + self.wv * voltage,
         )
+
+
+def _time_to_peak_current(motor: Motor) -> Number:
+    """When the current of the linear motor peaks after a step of the voltage from rest, s: where the derivative of
+    (s + f/J) / ((s - a) (s - b)) in the time domain is zero, with the eigenvalues a and b."""
+    A, _ = motor.state_space()
+    middle, decay = (A[0, 0] + A[1, 1]) / 2, -A[1, 1]
+    root = jnp.sqrt((middle**2 - A[0, 0] * A[1, 1] + A[0, 1] * A[1, 0]).astype(complex))
+    # critically damped, the quotient has a limit
+    root = jnp.where(jnp.abs(root) < 1e-6 * jnp.abs(middle), 1e-6 * jnp.abs(middle), root)
+    a, b = middle + root, middle - root
+    return jnp.real(jnp.log((b + decay) / (a + decay)) / (a - b))
 
 
 class LawState(NamedTuple):
@@ -99,12 +131,11 @@ class Law(eqx.Module):
         return LawState(memory, next_current, limited), limited
 
     def _limited(self, voltage: Number, current: Number, speed: Number) -> Number:
-        """The voltage limited so that the current at the end of the sample keeps its limit, then to the voltage
-        limit."""
+        """The voltage limited so that the current keeps its limit throughout the sample, then to the voltage limit."""
         hardware, model = self.hardware, self.model
         if hardware.current_limit is not None:
-            unforced_current = model.ii * current + model.iw * speed
-            lowest = (-hardware.current_limit - unforced_current) / model.iv
-            highest = (hardware.current_limit - unforced_current) / model.iv
+            unforced_current = model.pi * current + model.pw * speed
+            lowest = (-hardware.current_limit - unforced_current) / model.pv
+            highest = (hardware.current_limit - unforced_current) / model.pv
             voltage = jnp.clip(voltage, lowest, highest)
         return jnp.clip(voltage, -hardware.voltage_limit, hardware.voltage_limit)

@@ -150,7 +150,8 @@ def _gain_margin(gain: np.ndarray) -> float | None:
     x, y = np.real(gain), np.imag(gain)
     k = np.flatnonzero((y[:-1] * y[1:] <= 0) & (x[:-1] < 0))
     share = y[k] / (y[k] - y[k + 1] + 1e-300)
-    crossing = x[k] + share * (x[k + 1] - x[k])  # of the real axis
+    # of the real axis, where the gain is at half the sampling frequency, too
+    crossing = np.append(x[k] + share * (x[k + 1] - x[k]), x[-1])
     factors = -1 / crossing[(crossing > -1) & (crossing < 0)]
     return float(factors.min()) if factors.size else None
 

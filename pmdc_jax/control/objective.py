@@ -1,4 +1,4 @@
-"""Cost that a tuning minimises: settling time over the fastest possible, plus penalties."""
+"""Cost that a tuning minimises: settling time over the fastest that the loop allows, plus penalties."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ OVERSHOOT_WIDTH = 0.3
 # Last share of each part, over which the steady error is averaged.
 STEADY_SHARE = 0.25
 
-# Weights in the cost. Two terms have weight 1: the settling time over the fastest settling, and the mean change of
-# voltage from sample to sample over the voltage limit.
+# Weights in the cost. Two terms have weight 1: the settling time over the `settling_scale` of the task, and the mean
+# change of voltage from sample to sample over the voltage limit.
 
-# Weight of the recovery from the load, over the fastest settling: less than that of the step, which comes first.
+# Weight of the recovery from the load, over that scale: less than that of the step, which comes first.
 RECOVERY_WEIGHT = 0.1
-# Weight of the relative steady error: an error as large as the 2 % band costs as much as half the fastest settling.
+# Weight of the relative steady error: an error as large as the 2 % band costs as much as half that scale.
 STEADY_ERROR_WEIGHT = 25.0
-# Weights of the second step's settling, over the fastest settling, and of its overshoot beyond the band. That step has
+# Weights of the second step's settling, over that scale, and of its overshoot beyond the band. That step has
 # no specification of its own, so an overshoot within the band is free.
 SECOND_SETTLING_WEIGHT = 0.05
 SECOND_OVERSHOOT_WEIGHT = 0.15
@@ -53,7 +53,7 @@ SECOND_OVERSHOOT_WEIGHT = 0.15
 RATIO_COST_LIMIT = 0.3
 COST_PER_PERCENT = 0.3
 
-# Settling time assigned to a loop that never settles, over the fastest settling.
+# Settling time assigned to a loop that never settles, over that scale: longer than a part of the task.
 UNSETTLED_TIME = 10.0
 # Share of the motors, those of highest cost, whose mean makes half of the cost: covers the tail beyond the 95th
 # percentile with some margin.
@@ -92,7 +92,8 @@ class Task(eqx.Module):
     set point. Gains tuned on the first part alone may rely on an integrator windup that happens to suit that step.
 
     **Fields**: `setpoint`, rad/s; `load`, N m, applied in the second and third part; `fastest_settling`, s, of any
-    controller within the limits; `max_overshoot`, %; `max_sensitivity`, limit of the peak sensitivity, None for no
+    controller within the limits; `settling_scale`, s, the same, or what the loop's dead time allows if that is longer;
+    `max_overshoot`, %; `max_sensitivity`, limit of the peak sensitivity, None for no
     limit; `noise`, rad/s, added to the measured speed at each sample; `part_samples`, samples of each part; `substeps`,
     simulation steps per sample, as the motor's effects need.
     """
@@ -101,6 +102,7 @@ class Task(eqx.Module):
     setpoint: Number
     load: Number
     fastest_settling: Number
+    settling_scale: Number
     max_overshoot: Number
     max_sensitivity: Number | None
     noise: Float[Array, " samples"]
@@ -219,18 +221,18 @@ def _score(
 
 
 def cost(task: Task, score: Score, strictness: Strictness) -> Float[Array, ""]:
-    """Cost to minimise, over all motors: settling over the fastest settling, plus the weighted penalties."""
+    """Cost to minimise, over all motors: settling over the scale of the task, plus the weighted penalties."""
 
-    def over_fastest(time: PerMotor) -> PerMotor:
-        return jnp.nan_to_num(time / task.fastest_settling, nan=UNSETTLED_TIME)
+    def relative(time: PerMotor) -> PerMotor:
+        return jnp.nan_to_num(time / task.settling_scale, nan=UNSETTLED_TIME)
 
     allowed = strictness.allowed_overshoot * task.max_overshoot
     costs = (
-        over_fastest(score.settling)
+        relative(score.settling)
         + strictness.overshoot * overshoot_cost(score.overshoot, allowed)
-        + RECOVERY_WEIGHT * over_fastest(score.recovery)
+        + RECOVERY_WEIGHT * relative(score.recovery)
         + strictness.tracking_error * score.tracking_error
-        + SECOND_SETTLING_WEIGHT * over_fastest(score.second_settling)
+        + SECOND_SETTLING_WEIGHT * relative(score.second_settling)
         + SECOND_OVERSHOOT_WEIGHT * overshoot_cost(score.second_overshoot, 100 * BAND)
         + STEADY_ERROR_WEIGHT * score.steady_error
         + score.effort

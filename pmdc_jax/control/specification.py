@@ -25,9 +25,10 @@ MAX_SENSITIVITY = 2.0  # default limit of the peak sensitivity
 MAX_DEFAULT_SAMPLE_TIME = 1e-3  # s
 SAMPLES_PER_SETTLING = 40  # least number of default sample times in the fastest settling
 SUFFICIENT_SAMPLES = 10  # in the fastest settling; with fewer the loop loses much performance
-MAX_SAMPLE_TIME_RATIO = (
-    10  # sample time over the fastest settling, above which it must be a mistake
-)
+MAX_SAMPLE_TIME_RATIO = 10  # sample time over the transients, above which it must be a mistake
+NO_OVERSHOOT = 0.01  # %; less is none
+# Dead times of a loop in the shortest settling that it can have
+LOOP_DEAD_TIMES = 4
 # Duration of each part of the task: at least 2.5 times the fastest settling, and at least the fastest settling plus 20
 # dead times of the loop.
 PART_SETTLINGS = 2.5
@@ -74,6 +75,11 @@ class LoopRequirements:
             _check_number(name, getattr(self, name), "a positive number", lambda x: x > 0)
         _check_number("max_sensitivity", self.max_sensitivity, "a positive number", lambda x: x > 0)
 
+    @property
+    def allowed_overshoot(self) -> float:
+        """Largest overshoot, %, that counts as none if none is wanted."""
+        return max(self.max_overshoot, NO_OVERSHOOT)
+
     def completed(self, motor: Motor) -> Specification:
         """The specification for a motor, with defaults for what is left open.
 
@@ -85,8 +91,9 @@ class LoopRequirements:
         if self.load_torque:
             check_reachable(*operation, self.load_torque, "--load-torque")
         fastest = check_settling(self.max_settling, fastest_settling(*operation), setpoint)
-        sample_time, sampling_notes = self._sampling(fastest)
+        sample_time, sampling_notes = self._sampling(motor, fastest)
         _check_sensor(motor, sample_time)
+        dead_time = _dead_time(motor, sample_time, self.delay)
         return Specification(
             requirements=self,
             setpoint=setpoint,
@@ -96,7 +103,8 @@ class LoopRequirements:
             if self.load_torque is None
             else self.load_torque,
             fastest_settling=fastest,
-            part_samples=_part_samples(motor, fastest, sample_time, self.delay),
+            settling_scale=max(fastest, LOOP_DEAD_TIMES * dead_time),
+            part_samples=_part_samples(fastest, dead_time, sample_time),
             notes=(*limit_notes, *sampling_notes),
         )
 
@@ -118,25 +126,28 @@ class LoopRequirements:
             )
         return setpoint, voltage_limit, notes
 
-    def _sampling(self, fastest: float) -> tuple[float, list[str]]:
+    def _sampling(self, motor: Motor, fastest: float) -> tuple[float, list[str]]:
         """Sample time (s) for a fastest settling of `fastest` (s), and a note if it is a default or rather long."""
-        suitable = min(MAX_DEFAULT_SAMPLE_TIME, _rounded_down(fastest / SAMPLES_PER_SETTLING))
+        # a tiny step may be over within a fraction of the motor's own time constants
+        transient = max(
+            fastest, float(motor.L / motor.R + motor.J * motor.R / (motor.Kt * motor.Kb))
+        )
+        suitable = min(MAX_DEFAULT_SAMPLE_TIME, _rounded_down(transient / SAMPLES_PER_SETTLING))
         if self.sample_time is None:
             return suitable, [f"no sample time given: using {suitable:g} s"]
         if self.sample_time <= fastest / SUFFICIENT_SAMPLES:
             return self.sample_time, []
-        if self.sample_time > MAX_SAMPLE_TIME_RATIO * fastest:
+        if self.sample_time > MAX_SAMPLE_TIME_RATIO * transient:
             raise InputError(
                 "--sample-time",
-                f"{self.sample_time:g} s is far longer than the fastest settling, {fastest:.3g} s:"
-                " the transient is over within one sample",
+                f"{self.sample_time:g} s is far longer than the motor's transients, {transient:.3g} s:"
+                " they are over within one sample",
                 f"The unit is seconds; {suitable:g} suits this motor",
             )
         samples = f"{fastest / self.sample_time:.2g} samples of {self.sample_time:g} s"
-        remark = (
-            f"the fastest settling, {fastest:.3g} s, takes {samples}:"
-            f" a sample time of {suitable:g} s would perform better"
-        )
+        remark = f"the fastest settling, {fastest:.3g} s, takes {samples}"
+        if suitable < self.sample_time:
+            remark += f": a sample time of {suitable:g} s would perform better"
         return self.sample_time, [remark]
 
 
@@ -145,8 +156,9 @@ class Specification:
     """Complete specification of a loop.
 
     **Fields**: `requirements`, the user's; `setpoint`, rad/s; `voltage_limit`, V; `sample_time`, s;
-    `load_torque`, N m; `fastest_settling`, s, of any controller within the limits; `part_samples`, in each part of
-    the task; `notes`, on the defaults chosen.
+    `load_torque`, N m; `fastest_settling`, s, of any controller within the limits; `settling_scale`, s, the same, or
+    what the dead time of the loop allows if that is longer; `part_samples`, in each part of the task; `notes`, on the
+    defaults chosen.
     """
 
     requirements: LoopRequirements
@@ -155,6 +167,7 @@ class Specification:
     sample_time: float
     load_torque: float
     fastest_settling: float
+    settling_scale: float
     part_samples: int
     notes: tuple[str, ...]
 
@@ -180,10 +193,14 @@ def _check_number(
         raise InputError(option, f"{value:g} is not {wanted}", "Give it in SI units")
 
 
-def _part_samples(motor: Motor, fastest: float, sample_time: float, delay: int) -> int:
+def _dead_time(motor: Motor, sample_time: float, delay: int) -> float:
+    """The hold of a loop, its delay and a quarter of the electrical time constant together, s: no loop is much
+    faster."""
+    return float(motor.L / motor.R) / 4 + (1 + delay) * sample_time
+
+
+def _part_samples(fastest: float, dead_time: float, sample_time: float) -> int:
     """Samples in one part of the task, rounded up to 2^k or 1.5 2^k so that few shapes are compiled."""
-    # no loop is much faster than its hold, its delay and a quarter of the electrical time constant together
-    dead_time = float(motor.L / motor.R) / 4 + (1 + delay) * sample_time
     duration = max(PART_SETTLINGS * fastest, fastest + PART_DEAD_TIMES * dead_time)
     needed = max(MIN_SAMPLES, math.ceil(duration / sample_time))
     if needed > MAX_SAMPLES:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..effects import EFFECTS
 from ..errors import InputError
@@ -36,7 +36,7 @@ def drawn_motors(motor: Motor, uncertainty: Uncertainty, count: int, seed: int) 
     deviations = _antithetic_normal(rng, covariance, count)
     for _ in range(MAX_DRAWS):
         motors = _moved(motor, uncertainty.names, deviations)
-        impossible = ~np.broadcast_to(motors.is_possible, count)
+        impossible = _beyond_limits(motors)
         if not impossible.any():
             return motors
         deviations[impossible] = _antithetic_normal(rng, covariance, int(impossible.sum()))
@@ -62,6 +62,15 @@ def _moved(
             fields[name] = value * np.exp(by) if allowed.scale == "log" else value + by
         effects.append(type(effect)(**fields))
     return Motor(**constants, effects=tuple(effects))
+
+
+def _beyond_limits(motors: Motor) -> Bool[np.ndarray, " motors"]:
+    """Which motors have a parameter of an effect that is impossible."""
+    beyond = np.zeros(motors.R.shape, bool)
+    for effect in motors.effects:
+        for name, allowed in effect.ranges.items():
+            beyond |= np.asarray(getattr(effect, name)) >= allowed.limit
+    return beyond
 
 
 def _antithetic_normal(rng: np.random.Generator, covariance: np.ndarray, count: int) -> np.ndarray:

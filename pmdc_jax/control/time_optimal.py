@@ -80,6 +80,8 @@ def _settling_with_one_switch(motor: Motor, duration: float, *bounds: Any) -> fl
     """Settling time (s) with the latest switch to full reverse that keeps the speed within the band; None if every
     switch lets it leave the band or never reach it."""
     unswitched = _bang_bang_step(motor, duration, INSTANTS, *bounds)
+    if math.isnan(unswitched.entry_time):
+        return None  # only coarse steps overcome the friction
     if unswitched.stays:
         return float(unswitched.entry_time)
     settling = None

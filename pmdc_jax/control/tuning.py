@@ -44,12 +44,11 @@ VALIDATION_MOTORS = 256  # motors drawn independently of these to judge the resu
 # Minimum standard deviation of the speed noise while tuning, over the set point: gains tuned without noise would make
 # the voltage jitter.
 TUNING_NOISE = 2e-4
-# Minimum of the allowed overshoot in the cost, %, because the excess is divided by it.
-MIN_ALLOWED_OVERSHOOT = 0.01
 # Thresholds for a message: overshoot of the small step, over the larger of the allowed overshoot and the overshoot of
-# the full step; and peak sensitivity, over its default limit.
+# the full step; peak sensitivity, over its default limit; and current, over its limit.
 OVERSHOOT_TO_REPORT = 1.2
 SENSITIVITY_TO_REPORT = 1.1
+CURRENT_TO_REPORT = 1.02
 
 
 @frozen
@@ -122,7 +121,7 @@ class Tuning:
     def meets_specification(self) -> bool:
         """Whether the overshoot, and the settling time if limited, meet the specification on the nominal motor."""
         overshoot, settling = self.metrics["Overshoot"], self.metrics["SettlingTime"]
-        if overshoot is None or settling is None or overshoot > self.requirements.max_overshoot:
+        if overshoot is None or settling is None or overshoot > self.requirements.allowed_overshoot:
             return False
         return self.requirements.max_settling is None or settling <= self.requirements.max_settling
 
@@ -159,7 +158,7 @@ def tune(
     **Arguments**: `motor`, with scalar fields; `controller`, a key of `CONTROLLERS`; `setpoint`, rad/s, by default 80 %
     of the speed that the voltage limit reaches; `voltage_limit`, V, by default 1.25 times the voltage that holds the
     set point, or 24 V if neither is given; `current_limit`, A; `sample_time`, s, by default at most 1 ms and at most a
-    fortieth of the fastest settling; `max_overshoot`, %; `max_settling`, s; `load_torque`, N m, a load step to
+    fortieth of the motor's transients; `max_overshoot`, %; `max_settling`, s; `load_torque`, N m, a load step to
     withstand, by default half of the torque that can still be held at the set point; `delay`, 0 or 1 samples from
     measurement to voltage; `speed_step`, rad/s, quantum of the speed sensor; `speed_noise`, rad/s, its standard
     deviation; `measures_current`, if False the law estimates the current; `uncertainty` of the motor, from its file, or
@@ -224,7 +223,8 @@ def _task(specification: Specification, motor: Motor, unit_noise: np.ndarray) ->
         setpoint=jnp.asarray(specification.setpoint),
         load=jnp.asarray(specification.load_torque),
         fastest_settling=jnp.asarray(specification.fastest_settling),
-        max_overshoot=jnp.asarray(max(requirements.max_overshoot, MIN_ALLOWED_OVERSHOOT)),
+        settling_scale=jnp.asarray(specification.settling_scale),
+        max_overshoot=jnp.asarray(requirements.allowed_overshoot),
         max_sensitivity=None
         if requirements.max_sensitivity is None
         else jnp.asarray(requirements.max_sensitivity),
@@ -259,10 +259,12 @@ def _best_controller(
     """Best controller of all starts, tuned with at least `TUNING_NOISE` even if the sensor has none."""
     requirements = specification.requirements
     nominal = jax.tree.map(lambda leaf: leaf[0], motors)
+    # of the voltage limit, which a loop needs that settles in its scale: at first the speed rises with voltage and time
+    share = task.fastest_settling / task.settling_scale
     space = GainSpace(
         kind=requirements.controller,
-        gain_unit=jnp.asarray(specification.voltage_limit / abs(specification.setpoint)),
-        time_unit=task.fastest_settling,
+        gain_unit=task.hardware.voltage_limit / jnp.abs(task.setpoint) * share,
+        time_unit=task.settling_scale,
         sample_time=task.hardware.sample_time,
         motor=nominal,
         setpoint=task.setpoint,
@@ -327,13 +329,19 @@ def _remarks(result: Tuning) -> Iterator[str]:
     peak = result.margins.sensitivity_peak
     if peak is not None and peak > SENSITIVITY_TO_REPORT * MAX_SENSITIVITY:
         yield f"the loop has small stability margins: its sensitivity peak is {peak:.2f}"
+    limit = result.requirements.current_limit
+    if limit is not None and result.peak_current > CURRENT_TO_REPORT * limit:
+        yield (
+            f"the current reaches {result.peak_current:.3g} A in simulation, beyond its limit of {limit:g} A, because"
+            " the controller limits that of the motor without its effects: choose a lower limit"
+        )
 
 
 def _unmet_requirements(result: Tuning) -> Iterator[str]:
     """Messages where settling or overshoot miss the specification."""
     overshoot, settling = result.metrics["Overshoot"], result.metrics["SettlingTime"]
     requirements = result.requirements
-    max_settling, max_overshoot = requirements.max_settling, requirements.max_overshoot
+    max_settling, max_overshoot = requirements.max_settling, requirements.allowed_overshoot
     if settling is None:
         yield "the loop does not settle: try another controller or a shorter sample time"
     elif max_settling is not None and settling > max_settling:

@@ -51,8 +51,8 @@ class Model:
     def is_possible(self) -> bool:
         """Whether it can be simulated, its effects are physical, and the runs show a periodic torque or a dead zone."""
         simulated = np.isfinite(self.fit.fitness)
-        possible = simulated and self.motor.is_possible
-        return bool(possible) and self._completes_periods and self._shows_dead_zone
+        plausible = all(effect.is_possible() for effect in self.motor.effects)
+        return bool(simulated) and plausible and self._completes_periods and self._shows_dead_zone
 
     @property
     def _completes_periods(self) -> bool:

@@ -70,13 +70,14 @@ class ParameterRange(NamedTuple):
     """Unit of an effect's parameter, and bounds for a search.
 
     `scale` is "log" for a strictly positive parameter, "linear" for one of either sign. A dimensionless parameter has
-    the unit "".
+    the unit "". From `limit` on, which the bounds keep away from, values are impossible.
     """
 
     unit: str
     lower: float
     upper: float
     scale: Literal["log", "linear"] = "log"
+    limit: float = np.inf
 
 
 class AbstractEffect(eqx.Module):
@@ -102,13 +103,11 @@ class AbstractEffect(eqx.Module):
     # with it the motor is still a linear system with inputs, as long as no dry element changes direction and no teeth
     # touch or part
     affine: ClassVar[bool] = False
-    # what `is_possible` requires, as told to a user
-    condition: ClassVar[str] = ""
     # the longest step in s that resolves the effect, or its changes of direction
     longest_step: ClassVar[float] = 1e-3
 
-    def is_possible(self) -> Bool[Array | np.ndarray, "*#batch"] | bool:
-        """Whether its parameters, which have the signs that their `ranges` say, are physically possible."""
+    def is_possible(self) -> bool:
+        """Whether the combination of its parameters is plausible; each by itself is within its range."""
         return True
 
     def terminal_voltage(self, voltage: Scalars) -> Scalars:

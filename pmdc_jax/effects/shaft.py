@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool
 
 from .base import AbstractEffect, ParameterRange, Scalars, State, Teeth
 
@@ -19,14 +17,10 @@ class _TwoInertias(AbstractEffect):
     """A rotor and a load at the ends of a shaft; its `states` are the load's speed and the twist of the shaft."""
 
     equation: ClassVar = "mechanical"
-    condition: ClassVar = "load_share below 1"
 
     stiffness_Nm_rad: Scalars
     damping_Nms_rad: Scalars
     load_share: Scalars
-
-    def is_possible(self) -> Bool[Array | np.ndarray, "*#batch"]:
-        return self.load_share < 1
 
     def slip(self, state: State) -> Scalars:
         """Speed of the rotor relative to the load, rad/s."""
@@ -75,7 +69,7 @@ class ShaftCompliance(_TwoInertias):
     ranges: ClassVar = {
         "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
         "damping_Nms_rad": ParameterRange("N m s/rad", 1e-11, 1e6),
-        "load_share": ParameterRange("", 1e-2, 0.99),
+        "load_share": ParameterRange("", 1e-2, 0.99, limit=1.0),
     }
 
     def torque(self, state: State) -> Scalars:
@@ -119,7 +113,7 @@ class GearBacklash(_TwoInertias):
     ranges: ClassVar = {
         "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
         "damping_Nms_rad": ParameterRange("N m s/rad", 1e-11, 1e6),
-        "load_share": ParameterRange("", 1e-2, 0.99),
+        "load_share": ParameterRange("", 1e-2, 0.99, limit=1.0),
         "gap_rad": ParameterRange("rad", 1e-6, 10.0),
     }
 

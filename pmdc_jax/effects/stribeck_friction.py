@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import ClassVar
 
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool
 
 from .base import AbstractEffect, Grip, ParameterRange, Scalars, State
 
@@ -27,7 +25,6 @@ class StribeckFriction(AbstractEffect):
     equation: ClassVar = "mechanical"
     variable: ClassVar = "speed"
     holds: ClassVar = "speed"
-    condition: ClassVar = "static_Nm at least coulomb_Nm"
     ranges: ClassVar = {
         "coulomb_Nm": ParameterRange("N m", 1e-10, 1e5),
         "static_Nm": ParameterRange("N m", 1e-10, 1e5),
@@ -38,8 +35,8 @@ class StribeckFriction(AbstractEffect):
     static_Nm: Scalars
     speed_rad_s: Scalars
 
-    def is_possible(self) -> Bool[Array | np.ndarray, "*#batch"]:
-        return self.static_Nm >= self.coulomb_Nm
+    def is_possible(self) -> bool:
+        return bool(self.static_Nm >= self.coulomb_Nm)
 
     def grip(self, state: State) -> Grip:
         slow = jnp.exp(-((state.speed * (1 / self.speed_rad_s)) ** 2))
