@@ -57,6 +57,11 @@ class Prepared(NamedTuple):
         return self.timing is not None and self.timing.straight
 
     @property
+    def smooth(self) -> bool:
+        """Whether the voltages are on a smooth curve through their samples."""
+        return self.timing is not None and self.timing.smooth
+
+    @property
     def reading(self) -> float | None:
         """The share of each sample after which its outputs are read, if not at its start."""
         return None if self.timing is None else self.timing.reading

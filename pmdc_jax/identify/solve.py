@@ -117,7 +117,9 @@ def search_and_refine(
     began = time.perf_counter()
     report = progress or silent
     problem = given.problem
-    searching = Tape.from_recordings(given.training, straight=given.straight, reading=given.reading)
+    searching = Tape.from_recordings(
+        given.training, straight=given.straight, smooth=given.smooth, reading=given.reading
+    )
     noise, parameters = np.asarray(problem.noise), _searched_parameters(given)
 
     def run_search(seed: int) -> SearchResult:

@@ -13,6 +13,7 @@ class Timing(NamedTuple):
 
     lead: float  # by how many samples they act before the sample beside which they were recorded, at least -1
     straight: bool = False  # linear from sample to sample instead of held
+    smooth: bool = False  # with `straight`: on a smooth curve through the samples
     load: bool = False  # whether the recorded loads have the same timing
     current_mean: bool = False  # whether the recorded currents are means over the last sample
 
@@ -32,6 +33,8 @@ class Timing(NamedTuple):
         """What the voltages do, in words, if they are not held from their sample on."""
         if self.lead == 0 and not self.straight:
             return None
+        if self.smooth:
+            return "is a smooth curve through its samples instead of held"
         if self.straight:
             return "is linear between samples instead of held"
         if self.reading is not None:
@@ -42,4 +45,5 @@ class Timing(NamedTuple):
         return "acts one sample later than it was recorded"
 
 
-HELD, STRAIGHT, LATE, EARLY = Timing(0), Timing(0, straight=True), Timing(1), Timing(-1)
+HELD, LATE, EARLY = Timing(0), Timing(1), Timing(-1)
+STRAIGHT, SMOOTH = Timing(0, straight=True), Timing(0, straight=True, smooth=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.interpolate import CubicSpline
 
 from ..motor import Drive
 from ..recording import OVER_LAST
@@ -71,6 +72,7 @@ class Tape(eqx.Module):
         unloaded: bool = False,
         follow: bool = False,
         straight: bool = False,
+        smooth: bool = False,
         reading: float | None = None,
     ) -> Tape:
         """Lay recordings end to end.
@@ -79,10 +81,11 @@ class Tape(eqx.Module):
         `unloaded` declares the load of runs without a load column to be zero instead of unknown; `follow` makes
         the rotor turn by the measured speed where there is one, so that torques that depend on its angle stay in phase
         with the real ones, which a free run would lose after a few turns; `straight`, whether voltages and torques
-        vary linearly from sample to sample instead of being held; `reading`, the share of a sample after which its
+        vary linearly from sample to sample instead of being held; `smooth`, whether those of an even clock are then on
+        a smooth curve through their samples; `reading`, the share of a sample after which its
         outputs are read, if not at its start.
         """
-        runs = [_Run(recording, straight) for recording in recordings]
+        runs = [_Run(recording, straight, smooth) for recording in recordings]
         rises = straight or any(recording.resampled_from is not None for recording in recordings)
         averaged = any(r.averaging is not None or r.current_averaged for r in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
@@ -181,7 +184,7 @@ Grid = tuple[float, str, bool]
 class _Run:
     """One recording as the tape needs it: drive, load, measurements and initial state."""
 
-    def __init__(self, recording: Recording, straight: bool) -> None:
+    def __init__(self, recording: Recording, straight: bool, smooth: bool) -> None:
         self.length = len(recording.time)
         self.blocks = -(-self.length // BLOCK)
         missing = np.full(self.length, np.nan)
@@ -201,6 +204,8 @@ class _Run:
         linear = straight or varies_linearly(recording)
         if recording.resampled_from is not None:
             self.value, self.rise = mean_and_rise(recording, pieces_of(recording, straight))
+        elif smooth:
+            self.value, self.rise = _smooth_mean_and_rise(value)
         else:
             self.rise = np.diff(value, append=value[-1]) if linear else np.zeros(self.length)
             self.value = value + self.rise / 2
@@ -219,6 +224,18 @@ class _Run:
     def to_blocks(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
         padding = self.blocks * BLOCK - self.length
         return np.pad(samples, (0, padding), mode="edge" if hold else "constant").reshape(-1, BLOCK)
+
+
+def _smooth_mean_and_rise(
+    value: Float[np.ndarray, " samples"],
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
+    """Mean over each sample of a cubic spline through all of them, and the rise of the straight line that has the same
+    mean and first moment; after the last sample its value is held."""
+    if len(value) < 2:
+        return value, np.zeros_like(value)
+    cubic, square, linear, constant = CubicSpline(np.arange(len(value)), value).c
+    mean = constant + linear / 2 + square / 3 + cubic / 4
+    return np.append(mean, value[-1]), np.append(linear + square + 0.9 * cubic, 0.0)
 
 
 def _laid_in_blocks(

@@ -22,7 +22,7 @@ from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_lo
 from ..polish import Fit, fit_at
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
-from ..timing import EARLY, LATE, STRAIGHT, Timing
+from ..timing import EARLY, LATE, SMOOTH, STRAIGHT, Timing
 from .electrical_equation import (
     ElectricalEquation,
     TwoVoltages,
@@ -68,6 +68,8 @@ def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
         return [timing for timing in timings if score(timing) < than - MIN_LOG_LIKELIHOOD_GAIN]
 
     plausible = likelier(plausible, negative_log_likelihood_within(given, fit))
+    if STRAIGHT in plausible and all(run.resampled_from is None for run in given.runs):
+        plausible += likelier([SMOOTH], score(STRAIGHT))
     # where everything is a mean, voltages on straight lines are as good, and simpler
     found = [timing for timing in plausible if not timing.current_mean]
     means = [timing for timing in plausible if timing.current_mean]

@@ -23,7 +23,9 @@ def with_timing(given: Prepared, timing: Timing) -> Prepared:
         attrs.evolve(uniform(_retimed(run, k, tape, timing)), current_averaged=timing.current_mean)
         for k, run in enumerate(given.runs)
     ]
-    driven = Tape.from_recordings(runs, straight=timing.straight, reading=timing.reading)
+    driven = Tape.from_recordings(
+        runs, straight=timing.straight, smooth=timing.smooth, reading=timing.reading
+    )
     names = ("value", "load", "rise", "reading", "averaging")
     tape = replace(tape, **jax.tree.map(jnp.asarray, {n: getattr(driven, n) for n in names}))
     problem = replace(given.problem, tape=tape)
