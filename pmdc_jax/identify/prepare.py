@@ -57,9 +57,9 @@ class Prepared(NamedTuple):
         return self.timing is not None and self.timing.straight
 
     @property
-    def smooth(self) -> bool:
-        """Whether the voltages are on a smooth curve through their samples."""
-        return self.timing is not None and self.timing.smooth
+    def smooth(self) -> float | None:
+        """R / L in 1/s, or zero, if the voltages are on smooth curves through their samples."""
+        return None if self.timing is None else self.timing.smooth
 
     @property
     def reading(self) -> float | None:

@@ -13,7 +13,8 @@ class Timing(NamedTuple):
 
     lead: float  # by how many samples they act before the sample beside which they were recorded, at least -1
     straight: bool = False  # linear from sample to sample instead of held
-    smooth: bool = False  # with `straight`: on a smooth curve through the samples
+    # with `straight`, R / L in 1/s, or zero if it is unknown, if they are on smooth curves between jumps
+    smooth: float | None = None
     load: bool = False  # whether the recorded loads have the same timing
     current_mean: bool = False  # whether the recorded currents are means over the last sample
 
@@ -33,8 +34,8 @@ class Timing(NamedTuple):
         """What the voltages do, in words, if they are not held from their sample on."""
         if self.lead == 0 and not self.straight:
             return None
-        if self.smooth:
-            return "is a smooth curve through its samples instead of held"
+        if self.smooth is not None:
+            return "changes smoothly between its samples, except at jumps, instead of being held"
         if self.straight:
             return "is linear between samples instead of held"
         if self.reading is not None:
@@ -46,4 +47,4 @@ class Timing(NamedTuple):
 
 
 HELD, LATE, EARLY = Timing(0), Timing(1), Timing(-1)
-STRAIGHT, SMOOTH = Timing(0, straight=True), Timing(0, straight=True, smooth=True)
+STRAIGHT, SMOOTH = Timing(0, straight=True), Timing(0, straight=True, smooth=0.0)

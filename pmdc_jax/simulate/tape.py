@@ -26,6 +26,10 @@ Samples = Array | np.ndarray
 # Samples in a block. A population is simulated block after block, one motor in all blocks in parallel: long enough that
 # the influence of a block's start has mostly decayed at its end, short enough that padding the last one costs little.
 BLOCK = 128
+# A drive jumps where it changes by this many times what it does in the samples beside, and by this share of its range
+MIN_JUMP_RATIO, MIN_JUMP_SHARE = 3.0, 0.05
+# Decays of a current over a sample, as exponents, beyond which nothing changes
+DECAYS = 1e-3, 200.0
 
 
 class Tape(eqx.Module):
@@ -72,7 +76,7 @@ class Tape(eqx.Module):
         unloaded: bool = False,
         follow: bool = False,
         straight: bool = False,
-        smooth: bool = False,
+        smooth: float | None = None,
         reading: float | None = None,
     ) -> Tape:
         """Lay recordings end to end.
@@ -81,9 +85,9 @@ class Tape(eqx.Module):
         `unloaded` declares the load of runs without a load column to be zero instead of unknown; `follow` makes
         the rotor turn by the measured speed where there is one, so that torques that depend on its angle stay in phase
         with the real ones, which a free run would lose after a few turns; `straight`, whether voltages and torques
-        vary linearly from sample to sample instead of being held; `smooth`, whether those of an even clock are then on
-        a smooth curve through their samples; `reading`, the share of a sample after which its
-        outputs are read, if not at its start.
+        vary linearly from sample to sample instead of being held; `smooth`, R / L of the motor in 1/s or zero, if
+        those of an even clock are then on smooth curves through their samples, with jumps at some of them; `reading`,
+        the share of a sample after which its outputs are read, if not at its start.
         """
         runs = [_Run(recording, straight, smooth) for recording in recordings]
         rises = straight or any(recording.resampled_from is not None for recording in recordings)
@@ -184,7 +188,7 @@ Grid = tuple[float, str, bool]
 class _Run:
     """One recording as the tape needs it: drive, load, measurements and initial state."""
 
-    def __init__(self, recording: Recording, straight: bool, smooth: bool) -> None:
+    def __init__(self, recording: Recording, straight: bool, smooth: float | None) -> None:
         self.length = len(recording.time)
         self.blocks = -(-self.length // BLOCK)
         missing = np.full(self.length, np.nan)
@@ -204,8 +208,9 @@ class _Run:
         linear = straight or varies_linearly(recording)
         if recording.resampled_from is not None:
             self.value, self.rise = mean_and_rise(recording, pieces_of(recording, straight))
-        elif smooth:
-            self.value, self.rise = _smooth_mean_and_rise(value)
+        elif smooth is not None:
+            decay = smooth * recording.sample_time
+            self.value, self.rise = smooth_mean_and_rise(value, decay)
         else:
             self.rise = np.diff(value, append=value[-1]) if linear else np.zeros(self.length)
             self.value = value + self.rise / 2
@@ -226,16 +231,36 @@ class _Run:
         return np.pad(samples, (0, padding), mode="edge" if hold else "constant").reshape(-1, BLOCK)
 
 
-def _smooth_mean_and_rise(
-    value: Float[np.ndarray, " samples"],
+def smooth_mean_and_rise(
+    value: Float[np.ndarray, " samples"], decay: float
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
-    """Mean over each sample of a cubic spline through all of them, and the rise of the straight line that has the same
-    mean and first moment; after the last sample its value is held."""
-    if len(value) < 2:
-        return value, np.zeros_like(value)
-    cubic, square, linear, constant = CubicSpline(np.arange(len(value)), value).c
-    mean = constant + linear / 2 + square / 3 + cubic / 4
-    return np.append(mean, value[-1]), np.append(linear + square + 0.9 * cubic, 0.0)
+    """Mean over each sample of a cubic spline through all samples between two jumps, and the rise of the straight line
+    that has the same mean and the same effect on the current at the end of the sample.
+
+    In the sample before a jump, the straight line before it goes on.
+
+    **Arguments**: `value` of the drive at each sample; `decay`, R / L times the sample time.
+    """
+    share, weight = np.polynomial.legendre.leggauss(32)
+    share, weight = (share + 1) / 2, weight / 2
+    felt = np.exp(-np.clip(decay, *DECAYS) * (1 - share))  # at the end of the sample
+    felt = weight * (felt - weight @ felt)
+    of_square, of_cubic = felt @ share**2 / (felt @ share), felt @ share**3 / (felt @ share)
+    mean, rise = value.copy(), np.zeros(len(value))
+    size = np.pad(np.abs(np.diff(value)), 1)
+    beside = np.maximum(size[:-2], size[2:])
+    least = np.maximum(MIN_JUMP_RATIO * beside, MIN_JUMP_SHARE * np.ptp(value))
+    jumps = size[1:-1] > least
+    for first, end in pairwise([0, *(np.flatnonzero(jumps) + 1), len(value)]):
+        part = value[first:end]
+        if len(part) < 2 or not np.ptp(part):
+            continue
+        cubic, square, linear, constant = CubicSpline(np.arange(len(part)), part).c
+        mean[first : end - 1] = constant + linear / 2 + square / 3 + cubic / 4
+        rise[first : end - 1] = linear + of_square * square + of_cubic * cubic
+        rise[end - 1] = part[-1] - part[-2]
+        mean[end - 1] += rise[end - 1] / 2
+    return mean, rise
 
 
 def _laid_in_blocks(

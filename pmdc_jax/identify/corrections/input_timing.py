@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
+from ..generalised_least_squares import training_indices
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
 from ..polish import Fit, fit_at
 from ..prepare import Prepared
@@ -51,6 +52,8 @@ MIN_LATE_SHARE, MIN_LATE_ERRORS = 0.3, 5.0
 MAX_FROM_MEAN = 0.2
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
 MIN_LEAD = 0.3
+# ... nor, for one run, of less than so many standard errors
+MIN_LEAD_ERRORS = 5.0
 
 
 def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
@@ -68,8 +71,9 @@ def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
         return [timing for timing in timings if score(timing) < than - MIN_LOG_LIKELIHOOD_GAIN]
 
     plausible = likelier(plausible, negative_log_likelihood_within(given, fit))
-    if STRAIGHT in plausible and all(run.resampled_from is None for run in given.runs):
-        plausible += likelier([SMOOTH], score(STRAIGHT))
+    if SMOOTH in plausible and STRAIGHT in plausible and not likelier([SMOOTH], score(STRAIGHT)):
+        plausible.remove(SMOOTH)
+    plausible = [t if t.smooth is None else trials.with_fitted_rate(t) for t in plausible]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     found = [timing for timing in plausible if not timing.current_mean]
     means = [timing for timing in plausible if timing.current_mean]
@@ -101,6 +105,14 @@ class _Trials:
         """The negative log-likelihood of this timing."""
         return negative_log_likelihood_within(*self.fitted(timing))
 
+    def with_fitted_rate(self, timing: Timing) -> Timing:
+        """The timing of smooth voltages with the rate R / L of the motor fitted to them."""
+        for _ in range(2):  # the first fit takes it for slow
+            given, fit = self.fitted(timing)
+            motor = given.problem.parameters(fit.coordinates)
+            timing = timing._replace(smooth=float(motor.R / motor.L))
+        return timing
+
     def is_right(self, timing: Timing) -> bool:
         """Whether nothing but noise is left with this timing, and not because the current alone was late."""
         given, fit = self.fitted(timing)
@@ -128,12 +140,17 @@ class _Trials:
 
 def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
     """The timings without an instant between samples that the residuals make plausible."""
-    lead = _apparent_lead(given, fit)
+    lead, largest = _apparent_leads(given, fit)
     # a speed that is a mean over the last sample is half a sample late, too, and may hide the shift
     hidden = given.averaging is None and seems_averaged(given)
-    if abs(lead) <= MIN_LEAD and not hidden:
-        return []
-    return [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
+    found = []
+    if abs(lead) > MIN_LEAD or hidden:
+        found = [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
+    # voltages that step at samples in some runs and are smooth in others seem early in these alone
+    even = all(run.resampled_from is None for run in given.runs)
+    if even and (STRAIGHT in found or largest > MIN_LEAD):
+        found.append(SMOOTH)
+    return found
 
 
 def _by_electrical_equation(trials: _Trials) -> list[Timing]:
@@ -210,17 +227,20 @@ def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:
     return negative_log_likelihood(without_ends(given), fit)
 
 
-def _apparent_lead(given: Prepared, fit: Fit) -> float:
-    """How much earlier than assumed the voltages seem to act, in half samples: regression of the residuals on the
-    change that half a sample makes in the outputs, less the part that the parameters could explain.
+def _apparent_leads(given: Prepared, fit: Fit) -> tuple[float, float]:
+    """How much earlier than assumed the voltages seem to act, in half samples, in all runs together and, if clearly, in
+    one of them at most: regression of the residuals on the change that half a sample makes in the outputs, less the
+    part that the parameters could explain.
 
     Half a sample earlier is a held mean of the voltages at a sample and the next, which reuses compiled programs.
     """
     means = with_timing(given, STRAIGHT).problem
     means = replace(means, tape=replace(means.tape, rise=None))
-    sooner, evaluation = fit_at(means, fit.optimum).evaluation.seen, fit.evaluation
-    (amplitude,), _ = _amplitudes(given.problem, fit, [sooner - evaluation.seen])
-    return float(amplitude)
+    change = fit_at(means, fit.optimum).evaluation.seen - fit.evaluation.seen
+    (lead,), _ = _amplitudes(given.problem, fit, [change])
+    blocks = [given.problem.tape.blocks_of(run) for run in training_indices(given)]
+    leads, errors = _amplitudes(given.problem, fit, [change * b[:, None, None] for b in blocks])
+    return float(lead), float(np.max(leads[leads > MIN_LEAD_ERRORS * errors], initial=0.0))
 
 
 def _amplitudes(
