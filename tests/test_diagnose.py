@@ -644,7 +644,7 @@ def test_the_first_order_response_matches_the_change_of_the_simulation(x64, name
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
     own = RunUnknowns.as_recorded(tape)._replace(angle=INITIAL_ANGLES)
     without, with_it = (free_run(m, tape, own) for m in (bare, motor))
-    path = path_of(without, tape, INITIAL_ANGLES, False)
+    path = path_of(without, tape, INITIAL_ANGLES, False, False)
     if EFFECTS[name].equation == "sensor":
         found = sensor_changes(motor, bare, tape, path)
     else:
@@ -655,6 +655,28 @@ def test_the_first_order_response_matches_the_change_of_the_simulation(x64, name
         scale = np.abs(expected[:, c] * weight[:, c]).max()
         error = np.abs((found - expected)[:, c] * weight[:, c]).max()
         assert error <= 0.02 * scale + 1e-12, (name, c, error, scale)
+
+
+def test_the_response_lasts_while_the_rotor_coasts(x64):
+    """Where the brushes block the current, no back-EMF brakes."""
+    time, zero = 1e-3 * np.arange(500), np.zeros(500)
+    run = Recording("coasting", time, np.where(time < 0.15, 12.0, 5.0), zero, zero, load=zero)
+    tape = jax.tree.map(jnp.asarray, Tape.from_recordings([run]))
+    brushes = EFFECTS["brush_voltage_drop"](voltage_V=jnp.asarray(3.0))
+    drag = EFFECTS["quadratic_drag"](drag_Nms2_rad2=jnp.asarray(1e-9))
+    bare = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()})
+    own = RunUnknowns.as_recorded(tape)
+    without, with_it = (
+        free_run(bare.with_effects(e), tape, own) for e in ([brushes], [brushes, drag])
+    )
+    path = path_of(without, tape, jnp.zeros(1), False, True)
+    motor = bare.with_effects([drag])
+    found = respond(bare, tape, path, kicks(motor, bare, tape, path)[..., None])[..., 0]
+    expected = tape.samples_of(0, with_it - without, 500)
+    found = tape.samples_of(0, found.transpose(2, 1, 0), 500)
+    assert np.mean(without[:, 0] == 0) > 0.4
+    np.testing.assert_allclose(found[:, 1], expected[:, 1], atol=0.05 * np.ptp(expected[:, 1]))
+    assert abs(expected[499, 1]) > 3 * abs(expected[140, 1])
 
 
 @pytest.mark.parametrize("group_size", [1, 4, 5, 32])

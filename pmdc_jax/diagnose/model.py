@@ -132,10 +132,16 @@ class Model:
     @property
     def path(self) -> Path:
         """The free run of the fitted motor: the states of the rotor itself, before any sensor."""
-        can_stick = "speed" in {EFFECTS[name].holds for name in self.effects}
+        held = {EFFECTS[name].holds for name in self.effects}
         problem = self.given.problem
         start_angle = self.fit.unknowns.runs.angle
-        return path_of(rotor_outputs(problem, self.fit), problem.tape, start_angle, can_stick)
+        return path_of(
+            rotor_outputs(problem, self.fit),
+            problem.tape,
+            start_angle,
+            can_stick="speed" in held,
+            can_coast="current" in held,
+        )
 
     @property
     def relative_misfit(self) -> float:

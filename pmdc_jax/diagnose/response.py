@@ -31,12 +31,13 @@ Extra = dict[str, Scalars]  # states that effects add, by name
 
 
 class Path(NamedTuple):
-    """A free run, sample by sample: current (A) and speed (rad/s), and where dry friction holds the rotor."""
+    """A free run, sample by sample: current (A) and speed (rad/s), and where dry elements hold one of them at zero."""
 
     current: Signal
     speed: Signal
     angle: Signal  # rad, by the turns on the tape, or else by the simulated speed
-    held: Bool[Array, "samples blocks"]
+    stuck: Bool[Array, "samples blocks"]  # the rotor, by dry friction
+    coasting: Bool[Array, "samples blocks"]  # the rotor, without a current, which the brushes block
 
 
 @compiled
@@ -45,11 +46,13 @@ def path_of(
     tape: Tape,
     start_angle: Float[Array, " runs"],
     can_stick: bool | Array,
+    can_coast: bool | Array,
 ) -> Path:
     """The path of free runs.
 
     **Arguments**: `seen`, simulated current in A and speed in rad/s; `start_angle`, the angle in rad where each run
-    begins; `can_stick`, whether the motor has friction that can hold the rotor.
+    begins; `can_stick` and `can_coast`, whether the motor has friction that can hold the rotor, and brushes that can
+    block the current.
     """
     current, speed = seen[:, 0].T, seen[:, 1].T
     drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid], tape.drive)
@@ -61,7 +64,8 @@ def path_of(
     before = jnp.append(0.0, jnp.cumsum(turn.reshape(-1))[:-1]).reshape(turn.shape)
     first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
     angle = before - before[first, :1] + start_angle[tape.run][:, None]
-    return Path(current, speed, angle.T, (speed == 0) & can_stick)
+    coasting = (current == 0) & can_coast & (drive.voltage > 0)
+    return Path(current, speed, angle.T, (speed == 0) & can_stick, coasting)
 
 
 @compiled
@@ -120,22 +124,31 @@ def respond(
     """
     propagator, _ = _propagator_and_inputs(motor, tape)
     transition = propagator.transition[:, :, 0]
+    slowing = jnp.exp(-motor.f / motor.J * jnp.asarray(tape.sample_time)[tape.grid])
 
     def step(
         x: Columns,
-        sample: tuple[Float[Array | np.ndarray, "2 blocks columns"], Float[Array, " blocks"]],
+        sample: tuple[
+            Float[Array | np.ndarray, "2 blocks columns"],
+            Float[Array, " blocks"],
+            Float[Array, " blocks"],
+        ],
     ) -> tuple[Columns, Columns]:
-        kick, held = sample
+        kick, moves, conducts = sample
         # written out here and below: XLA multiplies such small matrices slowly
         after = transition[:, 0, :, None] * x[0] + transition[:, 1, :, None] * x[1] + kick
-        # a rotor that sticks keeps no change of speed
-        return after.at[1].multiply(1.0 - held[:, None]), x
+        coasting = slowing[:, None] * x[1] + kick[1]
+        # what is held at zero keeps no change
+        current = conducts[:, None] * after[0]
+        speed = moves[:, None] * jnp.where(conducts[:, None] > 0, after[1], coasting)
+        return jnp.stack([current, speed]), x
 
-    stuck = path.held.astype(kicks.dtype)
+    moves, conducts = (1.0 - held.astype(kicks.dtype) for held in (path.stuck, path.coasting))
     zero = jnp.zeros(kicks.shape[1:])
-    end, forced = jax.lax.scan(step, zero, (kicks, stuck))
+    end, forced = jax.lax.scan(step, zero, (kicks, moves, conducts))
     basis = jnp.broadcast_to(jnp.eye(2)[:, None, :], (2, kicks.shape[2], 2))
-    free_end, free = jax.lax.scan(step, basis, (jnp.zeros((*kicks.shape[:3], 2)), stuck))
+    without = jnp.zeros((*kicks.shape[:3], 2))
+    free_end, free = jax.lax.scan(step, basis, (without, moves, conducts))
 
     def next_block(
         start: Float[Array, "2 columns"],
@@ -148,7 +161,7 @@ def respond(
     blocks = (jnp.asarray(tape.begins), free_end.transpose(1, 0, 2), end.transpose(1, 0, 2))
     starts = jax.lax.scan(next_block, jnp.zeros((2, kicks.shape[3])), blocks)[1]
     response = forced + free[..., :1] * starts[:, 0] + free[..., 1:] * starts[:, 1]
-    at_start, moving = response, 1.0 - stuck[:, :, None]
+    at_start, varies = response, jnp.stack([conducts, moves], 1)[..., None]
     if propagator.reading is not None:
         # a kick builds up evenly over its sample
         part, share = propagator.reading
@@ -156,7 +169,7 @@ def respond(
             jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start)
             + jnp.asarray(share)[:, None, :, None] * kicks
         )
-        response = response.at[:, 1].multiply(moving)
+        response = response * varies
     if propagator.mean is None:
         return response
 
@@ -166,7 +179,7 @@ def respond(
         """Over a share of each sample, of a kick that builds up evenly."""
         assert within.mean is not None
         by_start = jnp.einsum("ijsb,sjbc->sibc", within.mean.transition, at_start)
-        return (by_start + share / 2 * kicks).at[:, 1].multiply(moving)
+        return (by_start + share / 2 * kicks) * varies
 
     seen = [response, mean(propagator, 1.0)]
     if propagator.reading is not None:
