@@ -29,6 +29,8 @@ def negative_log_likelihood(given: Prepared, fit: Fit | FitByRun) -> float:
     for run in training_indices(given):
         measured = series_of(tape, run, np.asarray(tape.measured))
         simulated = series_of(tape, run, seen).values
+        if not np.isfinite(simulated).all():
+            return np.inf  # it diverges
         residual = Series(measured.values - simulated, measured.known, measured.kind)
         white = whitener([residual])
         rest = white(0, residual).reshape(-1, simulated.shape[1])
