@@ -1,4 +1,4 @@
-"""Are motors identified whose voltages are not held from sample to sample? Random motors, seven kinds of log each.
+"""Are motors identified whose voltages are not held from sample to sample? Random motors, eight kinds of log each.
 
 `python -m experiments.timings [--motors 10] [--first 2000]`
 
@@ -6,7 +6,8 @@ Motors of 1 W to 20 kW, sampled every 0.1 to 20 times L / R, three runs of each;
 switched on and off in one run. SciPy simulates the linear motor exactly (`expm`), with voltages that are held from
 sample to sample; are linear between samples; are recorded a sample late, beside their response; act a sample late; act
 some fraction of a sample early or late; or are linear while the speed is the difference of encoder counts; and with
-currents that are means over the last sample. `identify` gets only the recordings.
+currents that are means over the last sample. In the eighth kind voltages jump at samples in some runs and are sines
+and chirps in others, as in a simulation in continuous time. `identify` gets only the recordings.
 """
 
 import argparse
@@ -29,9 +30,13 @@ WAYS = (
     "between samples",
     "straight, counted",
     "mean current",
+    "continuous",
 )
 EXCITATIONS = ("steps", "prbs", "chirp", "sines", "one way")
+STEPPED = ("steps", "prbs")
 LINES = 2048
+# points of each sample of a voltage that is continuous
+FINE = 32
 
 
 class RandomMotor(NamedTuple):
@@ -112,11 +117,16 @@ def log(
         np.clip(rng.uniform(20, 60) * motor.time_constant_s / motor.sample_time, 600, 8000)
     )
     time = motor.sample_time * np.arange(samples)
-    v = voltage(kind, motor, time, rng)
+    fine = motor._replace(sample_time=motor.sample_time / FINE)
+    v_fine = voltage(kind, motor, fine.sample_time * np.arange(FINE * samples), rng)
+    v = v_fine[::FINE]
     torque = motor.parameters["Kt"] * motor.amperes * rng.uniform(0.3, 0.7)
     load = torque * loaded * (np.sin(19 * time / time[-1]) > 0)
     lead = {"between samples": lead, "acts late": -1.0}.get(way, 0.0)
-    seen = motion(motor, v, load, "straight" in way, read_after=lead % 1)
+    if way == "continuous" and kind not in STEPPED:
+        seen = motion(fine, v_fine, np.repeat(load, FINE), straight=True, read_after=0.0)[::FINE]
+    else:
+        seen = motion(motor, v, load, "straight" in way, read_after=lead % 1)
     if way == "mean current":
         seen[:, 0] = np.diff(seen[:, 3], prepend=0.0) / motor.sample_time
     noise = np.array([motor.amperes, motor.speed]) * 10 ** rng.uniform([-3.3, -3.7], [-1.7, -2.0])

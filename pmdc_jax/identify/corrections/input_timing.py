@@ -64,20 +64,12 @@ def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
     if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
         return []  # without a current, or without a speed, only a delay would show
     trials = _Trials(given, fit)
-    plausible = [*_at_samples(given, fit), *_by_electrical_equation(trials)]
-    score = trials.negative_log_likelihood
-
-    def likelier(timings: Sequence[Timing], than: float) -> list[Timing]:
-        return [timing for timing in timings if score(timing) < than - MIN_LOG_LIKELIHOOD_GAIN]
-
-    plausible = likelier(plausible, negative_log_likelihood_within(given, fit))
-    if SMOOTH in plausible and STRAIGHT in plausible and not likelier([SMOOTH], score(STRAIGHT)):
-        plausible.remove(SMOOTH)
-    plausible = [t if t.smooth is None else trials.with_fitted_rate(t) for t in plausible]
+    proposed = [*_at_samples(given, fit), *_by_electrical_equation(trials)]
+    plausible, score = _likelier(trials, proposed), trials.negative_log_likelihood
     # where everything is a mean, voltages on straight lines are as good, and simpler
     found = [timing for timing in plausible if not timing.current_mean]
     means = [timing for timing in plausible if timing.current_mean]
-    found += likelier(means, min(map(score, found), default=np.inf))
+    found += trials.likelier(means, min(map(score, found), default=np.inf))
     if any(run.load is not None for run in given.training):
         found = [t if t.reading else min(t, t._replace(load=True), key=score) for t in found]
     return sorted(found, key=score)
@@ -113,6 +105,11 @@ class _Trials:
             timing = timing._replace(smooth=float(motor.R / motor.L))
         return timing
 
+    def likelier(self, timings: Sequence[Timing], than: float) -> list[Timing]:
+        """Those with a negative log-likelihood clearly below a value."""
+        limit = than - MIN_LOG_LIKELIHOOD_GAIN
+        return [timing for timing in timings if self.negative_log_likelihood(timing) < limit]
+
     def is_right(self, timing: Timing) -> bool:
         """Whether nothing but noise is left with this timing, and not because the current alone was late."""
         given, fit = self.fitted(timing)
@@ -136,6 +133,20 @@ class _Trials:
             return refitted(other, self.fit)
         R = float(other.problem.parameters(self.fit.coordinates).R)
         return refitted(other, self.fit, R * seen.time_constant(timing.reading))
+
+
+def _likelier(trials: _Trials, proposed: Sequence[Timing]) -> list[Timing]:
+    """The proposed timings that are clearly likelier than the assumed one; smooth voltages only if they are likelier
+    than straight ones, too."""
+    given, fit = trials.given, trials.fit
+    found = trials.likelier(proposed, negative_log_likelihood_within(given, fit))
+    straight = trials.negative_log_likelihood(STRAIGHT) if STRAIGHT in found else np.inf
+    if SMOOTH in found and not trials.likelier([SMOOTH], straight):
+        found.remove(SMOOTH)
+    # of a slow difference the whitening filter takes most for noise
+    if SMOOTH in proposed and not found and not leaves_only_noise(given, fit):
+        found = [SMOOTH] if trials.is_right(SMOOTH) else []
+    return [t if t.smooth is None else trials.with_fitted_rate(t) for t in found]
 
 
 def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
