@@ -95,6 +95,7 @@ def runs_of_a_toy_motor() -> list[Recording]:
     return runs
 
 
+@pytest.mark.slow
 def test_a_mean_is_recognised_if_the_motor_settles_within_a_sample():
     """Taken for instantaneous speeds, the counts bias R by half of its value."""
     found = identify(runs_of_a_toy_motor(), unloaded=True, tie=[("Kt", "Kb")])
@@ -185,7 +186,8 @@ def test_counts_printed_in_few_digits_are_recognised():
         assert not _in_counts([(1.0003 * rpm * 2 * np.pi / 60, 0.01)])
 
 
-@pytest.mark.parametrize("known_by", ["angle", pytest.param("difference", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("known_by", ["angle", "difference"])
 def test_differences_of_angles_are_exact_despite_voltage_steps(known_by):
     """Exact angles by the matrix exponential, sampled slowly: a spline is off by 0.27 rad/s and more."""
     plant, step = FAST_MOTOR | {"L": 3e-4}, 2e-3
