@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from .plausibility import regress, speed_of
-from .recording import Finding, Recording
+from .recording import Finding, Recording, jumps_of
 
 MAX_SHIFT = 20  # samples, between channels
 SHIFTS = sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs)
 MAX_MISFIT_RATIO = 0.3  # a shift must leave less than this share of the misfit without one
-MIN_EDGE_RATIO = 2.0  # change of the voltage at an edge, over those in the samples beside it
+# Change of the voltage at an edge, over those in the samples beside it, and over its range
+MIN_EDGE_RATIO, MIN_EDGE_SHARE = 2.0, 0.1
 BEFORE_EDGE = 40  # samples
 AFTER_EDGE = 100  # samples, including that of the voltage edge
 # The effects that make a late speed harmless
@@ -75,10 +76,7 @@ def _average_edge(run: Recording) -> _Edge | None:
     if run.voltage is None or run.current is None or speed is None:
         return None
     jumps = np.diff(run.voltage)
-    size = np.pad(np.abs(jumps), 1)
-    beside = np.maximum(size[:-2], size[2:])
-    edges = (size[1:-1] > 0.1 * np.ptp(run.voltage)) & (size[1:-1] > MIN_EDGE_RATIO * beside)
-    rows = np.flatnonzero(edges) + 1
+    rows = jumps_of(run.voltage, MIN_EDGE_RATIO, MIN_EDGE_SHARE)
     rows = rows[(rows >= BEFORE_EDGE) & (rows <= len(run) - AFTER_EDGE)]
     rows = rows[:: len(rows) // 2000 + 1]
     about = rows[:, None] + np.arange(-BEFORE_EDGE, AFTER_EDGE)

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from attrs import field, frozen
 from attrs.converters import optional
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from .columns import QUANTITIES
@@ -247,3 +247,14 @@ def _faults_of_time(time: np.ndarray) -> Iterator[Fault]:
         what = f"the time stamp {now} s is repeated" + (f", as are {others} more" if others else "")
         mend = "Export time with more digits, or delete repeated lines"
     yield Fault("time", row, what, mend)
+
+
+def jumps_of(
+    signal: Float[np.ndarray, " samples"], ratio: float, share: float
+) -> Int[np.ndarray, " jumps"]:
+    """The samples at which a signal jumps: from the one before it changes by more than `ratio` times what it does in
+    the samples beside, and by more than this `share` of its range."""
+    size = np.abs(np.diff(signal))
+    padded = np.pad(size, 1)
+    beside = np.maximum(padded[:-2], padded[2:])
+    return np.flatnonzero(size > np.maximum(ratio * beside, share * np.ptp(signal))) + 1

@@ -32,9 +32,7 @@ class Robustness:
     samples: int
     Overshoot_p95: float | None
     SettlingTime_p95: float | None
-    overshoot: np.ndarray = field(
-        repr=False
-    )  # of each motor, %; infinite where it cannot be simulated
+    overshoot: np.ndarray = field(repr=False)  # of each motor, %; infinite if it diverges
     settling: np.ndarray = field(repr=False)  # of each motor, s; infinite where it never settles
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.interpolate import CubicSpline
 
 from ..motor import Drive
-from ..recording import OVER_LAST
+from ..recording import OVER_LAST, jumps_of
 from .uneven import mean_and_rise, pieces_of, varies_linearly
 
 if TYPE_CHECKING:
@@ -241,17 +241,10 @@ def smooth_mean_and_rise(
 
     **Arguments**: `value` of the drive at each sample; `decay`, R / L times the sample time.
     """
-    share, weight = np.polynomial.legendre.leggauss(32)
-    share, weight = (share + 1) / 2, weight / 2
-    felt = np.exp(-np.clip(decay, *DECAYS) * (1 - share))  # at the end of the sample
-    felt = weight * (felt - weight @ felt)
-    of_square, of_cubic = felt @ share**2 / (felt @ share), felt @ share**3 / (felt @ share)
+    of_square, of_cubic = _equivalent_rises(decay)
     mean, rise = value.copy(), np.zeros(len(value))
-    size = np.pad(np.abs(np.diff(value)), 1)
-    beside = np.maximum(size[:-2], size[2:])
-    least = np.maximum(MIN_JUMP_RATIO * beside, MIN_JUMP_SHARE * np.ptp(value))
-    jumps = size[1:-1] > least
-    for first, end in pairwise([0, *(np.flatnonzero(jumps) + 1), len(value)]):
+    jumps = jumps_of(value, MIN_JUMP_RATIO, MIN_JUMP_SHARE)
+    for first, end in pairwise([0, *jumps, len(value)]):
         part = value[first:end]
         if len(part) < 2 or not np.ptp(part):
             continue
@@ -261,6 +254,17 @@ def smooth_mean_and_rise(
         rise[end - 1] = part[-1] - part[-2]
         mean[end - 1] += rise[end - 1] / 2
     return mean, rise
+
+
+def _equivalent_rises(decay: float) -> tuple[float, float]:
+    """The rises of the straight lines that have the same mean over a sample, and the same effect on the current at its
+    end, as the square and the cube of the share of the sample that has passed."""
+    share, weight = np.polynomial.legendre.leggauss(32)
+    share, weight = (share + 1) / 2, weight / 2
+    felt = np.exp(-np.clip(decay, *DECAYS) * (1 - share))
+    felt = weight * (felt - weight @ felt)
+    square, cubic = (float(felt @ share**k / (felt @ share)) for k in (2, 3))
+    return square, cubic
 
 
 def _laid_in_blocks(

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import expm
 
-from ...recording import Averaging, Recording
+from ...recording import Averaging, Recording, jumps_of
 from ...simulate.tape import BLOCK
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..polish import Fit, polish
@@ -83,14 +83,9 @@ def steps_of(run: Recording) -> Steps:
         and run.resampled_from is None
         and len(run) > 3
     ):
-        rise = np.diff(run.voltage)
-        size = np.abs(rise)
-        padded = np.pad(size, 1)
-        beside = np.maximum(padded[:-2], padded[2:])
-        least = np.maximum(MIN_STEP_RATIO * beside, MIN_STEP_SHARE * np.ptp(run.voltage))
-        found = np.flatnonzero(size > least)
+        found = jumps_of(run.voltage, MIN_STEP_RATIO, MIN_STEP_SHARE)
         if len(found) <= len(run) / MIN_SAMPLES_PER_STEP:
-            at, height = found + 1, rise[found]
+            at, height = found, np.diff(run.voltage)[found - 1]
     return Steps(at, height, np.zeros(len(at)))
 
 
