@@ -20,9 +20,11 @@ from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recording import OVER_LAST, Recording
 from pmdc_jax.simulate import (
+    STRAIGHT,
     UNKNOWNS_PER_RUN,
     RunUnknowns,
     Tape,
+    Timing,
     free_run,
     sensitivities,
     squared_errors,
@@ -44,9 +46,9 @@ def run_by_sines(seed: int, samples: int, load: float = 0.0, step: float = STEP)
     return Recording(f"run{seed}", time, voltage, speed=np.zeros(samples), load=load + 0 * time)
 
 
-def simulated(run: Recording, motor: Motor, smooth: float | None = None) -> np.ndarray:
+def simulated(run: Recording, motor: Motor, timing: Timing = STRAIGHT) -> np.ndarray:
     """The package's free run from rest, (samples, 2)."""
-    tape = Tape.from_recordings([run], straight=True, smooth=smooth)
+    tape = Tape.from_recordings([run], timing=timing)
     return tape.samples_of(0, free_run(motor, tape, FROM_REST), len(run))
 
 
@@ -102,7 +104,10 @@ def test_a_smooth_voltage_is_followed_between_its_samples(x64):
     exact = outputs_of_sines(1, 500, run.load)[:, :2]
     by_lines = largest_error(simulated(run, motor_with()), exact)
     rate = TRUE["R"] / TRUE["L"]
-    assert largest_error(simulated(run, motor_with(), smooth=rate), exact) < 0.04 * by_lines
+    assert (
+        largest_error(simulated(run, motor_with(), STRAIGHT._replace(smooth=rate)), exact)
+        < 0.04 * by_lines
+    )
 
 
 def test_smooth_voltages_may_jump(x64):
@@ -163,17 +168,17 @@ def test_effects_match_an_independent_integrator(x64, name):
 @pytest.mark.parametrize(
     ("names", "timing"),
     [
-        (("coulomb_friction",), {"straight": True}),
-        (("speed_sensor_delay",), {"straight": True}),
-        (("speed_sensor_delay",), {"reading": 0.3}),
-        pytest.param(("coulomb_friction",), {"reading": 0.3}, marks=pytest.mark.slow),
+        (("coulomb_friction",), STRAIGHT),
+        (("speed_sensor_delay",), STRAIGHT),
+        (("speed_sensor_delay",), Timing(0.3)),
+        pytest.param(("coulomb_friction",), Timing(0.3), marks=pytest.mark.slow),
     ],
 )
 def test_sensitivities_match_central_differences(x64, names, timing):
     bounds = {n: (x / 2, x * 2) for n, x in TRUE.items()}
     parameters = Parameters.of(bounds, [EFFECTS[name] for name in names])
     at = np.log([*TRUE.values(), *[{"coulomb_friction": 0.02}.get(n, 0.003) for n in names]])
-    tape = Tape.from_recordings([run_by_sines(3, 300)], **timing)
+    tape = Tape.from_recordings([run_by_sines(3, 300)], timing=timing)
     found, jacobian = sensitivities(parameters, jnp.asarray(at), tape, FROM_REST)
 
     def run(at):
@@ -192,7 +197,7 @@ def test_outputs_are_read_within_a_sample_as_by_scipy(x64, averaged):
     run, tenths = run_by_sines(4, 300, load=0.02), 3
     if averaged:
         run = attrs.evolve(run, averaging=OVER_LAST)
-    tape = Tape.from_recordings([run], reading=tenths / 10)
+    tape = Tape.from_recordings([run], timing=Timing(tenths / 10))
     seen = free_run(motor_with(), tape, FROM_REST)
     current, speed = (tape.samples_of(0, seen[:, c], len(run)) for c in range(2))
     expected = outputs_within(run, tenths)
@@ -204,7 +209,7 @@ def test_outputs_are_read_within_a_sample_as_by_scipy(x64, averaged):
 
 def test_a_population_is_read_within_a_sample(x64):
     run = attrs.evolve(run_by_sines(5, 300), current=np.zeros(300))
-    tape = Tape.from_recordings([run], reading=0.3)
+    tape = Tape.from_recordings([run], timing=Timing(0.3))
     seen = np.asarray(free_run(motor_with(), tape, FROM_REST))
     population = jax.tree.map(lambda x: jnp.full(4, x), motor_with())
     for effects in ((), (EFFECTS["coulomb_friction"](torque_Nm=jnp.zeros(4)),)):

@@ -18,10 +18,10 @@ from ..identify.identification import Identification
 from ..identify.prepare import Prepared, prepare
 from ..identify.results import results_of
 from ..identify.solve import Solved, solve
-from ..identify.timing import HELD, Timing
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..recording_file import Runs
+from ..simulate import HELD, Timing
 from .assessment import FALSE_ALARM
 from .balance import electrical_misfit
 from .description import (
@@ -140,7 +140,7 @@ def _likeliest_attempt(
     chosen = first.naming.chosen
     if not chosen.effects:
         return first
-    if first.given.timing is not None:
+    if first.given.timing != HELD:
         return attempt(HELD) if only_current_is_late(chosen.given, chosen.fit) else first
     others = other_timings(chosen.given, chosen.fit)
     return min(first, *map(attempt, others[:1]), key=negative_log_likelihood) if others else first

@@ -19,14 +19,13 @@ from ..errors import InputError
 from ..motor import PARAMETERS
 from ..recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
 from ..recording_file import Runs, recordings_of
-from ..simulate import Tape, uniform
+from ..simulate import HELD, Tape, Timing, uniform
 from ..unmeasured import without_unmeasured
 from .bounds import search_bounds
 from .identification import Role
 from .noise import white_noise
 from .parameters import Parameters, check_names
 from .problem import Problem
-from .timing import Timing
 
 
 class Prepared(NamedTuple):
@@ -46,30 +45,9 @@ class Prepared(NamedTuple):
     input_noise: Mapping[str, float] = MappingProxyType({})
     # how the recorded speeds are averaged, None if they are instantaneous
     averaging: Averaging | None = None
-    # when the voltages act, None if they are held from their sample to the next
-    timing: Timing | None = None
+    timing: Timing = HELD
     # whether steps of the voltages were placed between samples
     stepped: bool = False
-
-    @property
-    def straight(self) -> bool:
-        """Whether the voltages are linear from sample to sample instead of held."""
-        return self.timing is not None and self.timing.straight
-
-    @property
-    def smooth(self) -> float | None:
-        """R / L in 1/s, or zero, if the voltages are on smooth curves through their samples."""
-        return None if self.timing is None else self.timing.smooth
-
-    @property
-    def reading(self) -> float | None:
-        """The share of each sample after which its outputs are read, if not at its start."""
-        return None if self.timing is None else self.timing.reading
-
-    @property
-    def current_mean(self) -> bool:
-        """Whether the recorded currents are means over the last sample."""
-        return self.timing is not None and self.timing.current_mean
 
     def with_tape(self, **fields: Array | None) -> Prepared:
         """The same runs with some fields of the tape replaced."""

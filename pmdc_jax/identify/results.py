@@ -295,10 +295,10 @@ def _messages(given: Prepared, solved: Solved, Kt_set_to_Kb: bool) -> tuple[str,
         for run in given.runs
         if run.name in given.input_noise
     ]
-    acts = "steps between samples" if given.stepped else given.timing and given.timing.what
+    acts = "steps between samples" if given.stepped else given.timing.what
     if acts:
         messages.append(f"the voltage {acts}: this is modelled")
-    if given.current_mean:
+    if given.timing.current_mean:
         messages.append("the current is a mean over the last sample interval: this is modelled")
     if given.averaging:
         messages.append(

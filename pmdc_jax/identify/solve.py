@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..progress import ReportProgress, silent
-from ..simulate import RunUnknowns, Tape
+from ..simulate import RunUnknowns, Tape, Timing
 from ..threads import map_in_threads_until, submit
 from .bounds import effect_bounds
 from .corrections.input_noise import without_input_noise
@@ -31,7 +31,6 @@ from .rotor_angle import with_rotor_angle
 from .run_unknowns import with_holdout_unknowns
 from .search import SearchResult
 from .search import search as global_search
-from .timing import Timing
 
 STARTS = 4
 # Two refinements found the same optimum if their fitness agrees to this share.
@@ -117,9 +116,7 @@ def search_and_refine(
     began = time.perf_counter()
     report = progress or silent
     problem = given.problem
-    searching = Tape.from_recordings(
-        given.training, straight=given.straight, smooth=given.smooth, reading=given.reading
-    )
+    searching = Tape.from_recordings(given.training, timing=given.timing)
     noise, parameters = np.asarray(problem.noise), _searched_parameters(given)
 
     def run_search(seed: int) -> SearchResult:

@@ -16,13 +16,20 @@ from .population import squared_errors
 from .reference import reference_solution
 from .shooting import UNKNOWNS_PER_RUN, RunUnknowns, free_run, sensitivities
 from .tape import Tape
+from .timing import EARLY, HELD, LATE, SMOOTH, STRAIGHT, Timing
 from .uneven import seen_at_record
 from .uniform import uniform
 
 __all__ = [
+    "EARLY",
+    "HELD",
+    "LATE",
+    "SMOOTH",
+    "STRAIGHT",
     "UNKNOWNS_PER_RUN",
     "RunUnknowns",
     "Tape",
+    "Timing",
     "free_run",
     "reference_solution",
     "sensitivities",

@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from ..motor import Drive
 from ..recording import OVER_LAST, jumps_of
+from .timing import HELD, Timing
 from .uneven import mean_and_rise, pieces_of, varies_linearly
 
 if TYPE_CHECKING:
@@ -75,22 +76,20 @@ class Tape(eqx.Module):
         recordings: Sequence[Recording],
         unloaded: bool = False,
         follow: bool = False,
-        straight: bool = False,
-        smooth: float | None = None,
-        reading: float | None = None,
+        timing: Timing = HELD,
     ) -> Tape:
         """Lay recordings end to end.
 
         **Arguments**: `recordings`, each with a uniform sample time (see `pmdc_jax.simulate.uniform`);
         `unloaded` declares the load of runs without a load column to be zero instead of unknown; `follow` makes
         the rotor turn by the measured speed where there is one, so that torques that depend on its angle stay in phase
-        with the real ones, which a free run would lose after a few turns; `straight`, whether voltages and torques
-        vary linearly from sample to sample instead of being held; `smooth`, R / L of the motor in 1/s or zero, if
-        those of an even clock are then on smooth curves through their samples, with jumps at some of them; `reading`,
-        the share of a sample after which its outputs are read, if not at its start.
+        with the real ones, which a free run would lose after a few turns; `timing`, how voltages and torques go on
+        from one sample to the next, and when the outputs are read; its `lead` in whole samples is not applied.
         """
-        runs = [_Run(recording, straight, smooth) for recording in recordings]
-        rises = straight or any(recording.resampled_from is not None for recording in recordings)
+        runs = [_Run(recording, timing) for recording in recordings]
+        rises = timing.straight or any(
+            recording.resampled_from is not None for recording in recordings
+        )
         averaged = any(r.averaging is not None or r.current_averaged for r in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
         sample_times, drives, free = (np.array(each) for each in zip(*grids, strict=True))
@@ -114,7 +113,7 @@ class Tape(eqx.Module):
             ),
             angle=of_runs(_first(r.angle) for r in recordings),
             angle_known=of_runs(r.angle is not None for r in recordings),
-            reading=None if reading is None else np.asarray(reading),
+            reading=None if timing.reading is None else np.asarray(timing.reading),
             longest=2.0 ** math.ceil(math.log2(sample_times.max() / 1e-3) - 1e-6) * 1e-3,
         )
 
@@ -188,7 +187,7 @@ Grid = tuple[float, str, bool]
 class _Run:
     """One recording as the tape needs it: drive, load, measurements and initial state."""
 
-    def __init__(self, recording: Recording, straight: bool, smooth: float | None) -> None:
+    def __init__(self, recording: Recording, timing: Timing) -> None:
         self.length = len(recording.time)
         self.blocks = -(-self.length // BLOCK)
         missing = np.full(self.length, np.nan)
@@ -205,11 +204,11 @@ class _Run:
             if recording.current_averaged:
                 self.current = OVER_LAST.with_ends_missing(self.current)
         value = getattr(recording, drive)
-        linear = straight or varies_linearly(recording)
+        linear = timing.straight or varies_linearly(recording)
         if recording.resampled_from is not None:
-            self.value, self.rise = mean_and_rise(recording, pieces_of(recording, straight))
-        elif smooth is not None:
-            decay = smooth * recording.sample_time
+            self.value, self.rise = mean_and_rise(recording, pieces_of(recording, timing.straight))
+        elif timing.smooth is not None:
+            decay = timing.smooth * recording.sample_time
             self.value, self.rise = smooth_mean_and_rise(value, decay)
         else:
             self.rise = np.diff(value, append=value[-1]) if linear else np.zeros(self.length)
@@ -265,6 +264,19 @@ def _equivalent_rises(decay: float) -> tuple[float, float]:
     felt = weight * (felt - weight @ felt)
     square, cubic = (float(felt @ share**k / (felt @ share)) for k in (2, 3))
     return square, cubic
+
+
+def rise_like_step(share: Float[np.ndarray, " steps"], decay: float) -> Float[np.ndarray, " steps"]:
+    """The rise of the straight line that has the same mean over a sample, and the same effect on the current at its
+    end, as a unit step with this `share` of the sample still to pass.
+
+    6 `share` (1 - `share`), the rise with the same first moment, where the current decays slowly.
+
+    **Arguments**: `decay`, R / L times the sample time.
+    """
+    decay = float(np.clip(decay, *DECAYS))
+    kept = -np.expm1(-decay)
+    return (-np.expm1(-decay * share) - kept * share) / (1 - kept / decay - kept / 2)
 
 
 def _laid_in_blocks(

@@ -73,7 +73,7 @@ def _with_drives(given: Prepared, drives: list[np.ndarray]) -> Problem:
         for run, drive in zip(given.runs, drives, strict=True)
     ]
     tape = given.problem.tape
-    driven = Tape.from_recordings(runs, straight=given.straight, smooth=given.smooth)
+    driven = Tape.from_recordings(runs, timing=given.timing)
     value, rise = jax.tree.map(jnp.asarray, (driven.value, driven.rise))
     return replace(given.problem, tape=replace(tape, value=value, rise=rise))
 

@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
+from ...simulate import EARLY, LATE, SMOOTH, STRAIGHT, Timing
 from ..generalised_least_squares import training_indices
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
 from ..polish import Fit, fit_at
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
-from ..timing import EARLY, LATE, SMOOTH, STRAIGHT, Timing
 from .electrical_equation import (
     ElectricalEquation,
     TwoVoltages,
@@ -129,7 +129,7 @@ class _Trials:
         """The best fit to the runs with another timing, from the inductance with which the currents depend on two
         voltages as they were seen to."""
         timing, seen = other.timing, self.seen
-        if not (seen and timing and timing.reading and timing.ahead == seen.ahead):
+        if not (seen and timing.reading and timing.ahead == seen.ahead):
             return refitted(other, self.fit)
         R = float(other.problem.parameters(self.fit.coordinates).R)
         return refitted(other, self.fit, R * seen.time_constant(timing.reading))
@@ -213,7 +213,7 @@ def only_current_is_late(given: Prepared, fit: Fit) -> bool:
     By regression of the residuals on the change that another lead makes in both outputs, and on that of a later reading
     in the current.
     """
-    if given.reading is None or given.timing is None or given.timing.ahead >= 0:
+    if given.timing.reading is None or given.timing.ahead >= 0:
         return False
     late, error = _lateness_of_current(given.problem, fit, change_by_reading(given.problem, fit))
     return late > max(MIN_LATE_SHARE * abs(given.timing.lead), MIN_LATE_ERRORS * error)

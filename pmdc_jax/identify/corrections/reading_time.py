@@ -29,7 +29,7 @@ def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 
     Where something else is missing from the motor, the instant stays: it would move to make up for that.
     """
-    instant = given.reading
+    instant = given.timing.reading
     if instant is None:
         return given, fit
     given, fit = _with_nuisance(given, fit)
@@ -75,6 +75,5 @@ def _better_instant(problem: Problem, fit: Fit) -> float:
 
 def _read_at(given: Prepared, reading: float) -> Prepared:
     """The runs with the outputs read after this share of a sample."""
-    assert given.timing is not None
     timing = given.timing._replace(lead=given.timing.ahead + reading)
     return given.with_tape(reading=jnp.asarray(reading))._replace(timing=timing)

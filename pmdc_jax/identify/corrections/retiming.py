@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...recording import Recording
-from ...simulate import Tape, uniform
+from ...simulate import Tape, Timing, uniform
 from ..prepare import Prepared
-from ..timing import Timing
 from .speed_averaging import without_ends
 
 
@@ -23,9 +22,7 @@ def with_timing(given: Prepared, timing: Timing) -> Prepared:
         attrs.evolve(uniform(_retimed(run, k, tape, timing)), current_averaged=timing.current_mean)
         for k, run in enumerate(given.runs)
     ]
-    driven = Tape.from_recordings(
-        runs, straight=timing.straight, smooth=timing.smooth, reading=timing.reading
-    )
+    driven = Tape.from_recordings(runs, timing=timing)
     names = ("value", "load", "rise", "reading", "averaging")
     tape = replace(tape, **jax.tree.map(jnp.asarray, {n: getattr(driven, n) for n in names}))
     problem = replace(given.problem, tape=tape)
@@ -37,12 +34,13 @@ def with_timing(given: Prepared, timing: Timing) -> Prepared:
 def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
     """The record of a run with its voltages, and its loads if the timing says so, moved to the samples where they act.
 
-    Voltages of an even clock are taken from the tape, where their noise may have been removed.
+    Voltages of an even clock, held or straight, are taken from the tape, where their noise may have been removed.
     """
     if run.drive != "voltage":
         return run.recorded
+    at_samples = tape.value if tape.rise is None else tape.value - tape.rise / 2
     even = run.resampled_from is None
-    voltage = tape.samples_of(k, tape.value, len(run)) if even else run.recorded.voltage
+    voltage = tape.samples_of(k, at_samples, len(run)) if even else run.recorded.voltage
     run, last = run.recorded, len(run.recorded) - 1
     rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)
     run = attrs.evolve(run, voltage=np.asarray(voltage)[rows])

@@ -135,7 +135,7 @@ def refitted(given: Prepared, fit: Fit, inductance: float | None = None) -> tupl
         if inductance is not None:
             change = np.log(inductance) - float(fit.coordinates[L])
             starts = [fit.optimum.moved(parameters, change * along_L)]
-        elif given.averaging == OVER_LAST or given.current_mean:
+        elif given.averaging == OVER_LAST or given.timing.current_mean:
             starts.append(fit.optimum.moved(parameters, -L_REDUCTION * along_L))
     ends = [polish(given.problem, start) for start in starts]
     return given, min(ends, key=lambda end: end.cost)
@@ -153,7 +153,7 @@ def _averaging_by_noise(given: Prepared) -> tuple[Averaging | None, float, bool]
     mean, min_gain = (
         averaging_of_counts(counts) if counts else averaging_of_differences([s for s, _ in speeds])
     )
-    if mean is None and speeds and not counts and given.current_mean:
+    if mean is None and speeds and not counts and given.timing.current_mean:
         mean = OVER_LAST
     if mean == OVER_LAST and not given.problem.samples[0] > 0:
         mean = None

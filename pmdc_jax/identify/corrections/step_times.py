@@ -17,11 +17,13 @@ from jaxtyping import Float, Int
 from scipy.linalg import expm
 
 from ...recording import Averaging, Recording, jumps_of
-from ...simulate.tape import BLOCK
+from ...simulate import SMOOTH, STRAIGHT
+from ...simulate.tape import BLOCK, rise_like_step
 from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Nuisance, Problem
+from .retiming import with_timing
 
 # A step is this many times the change of the voltage in the samples beside it, and this share of the voltage's range
 MIN_STEP_RATIO, MIN_STEP_SHARE = 10.0, 0.05
@@ -35,7 +37,8 @@ MAX_ELEMENTS = 2e7
 MIN_SPREAD, MARGIN, MAX_OUTLIERS = 0.15, 0.2, 0.2
 # Gain in log-likelihood that each step must bring
 MIN_GAIN_PER_STEP = 5.0
-REFITS = 5
+# Refits end when no step moves by more than this within its sample, in samples
+MAX_REFITS, TOLERANCE = 30, 5e-4
 # A combination of steps with less than this share of the largest eigenvalue of the normal matrix is not felt
 RANK_TOLERANCE = 1e-8
 
@@ -53,25 +56,61 @@ def with_step_times(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the steps of their voltages at the times when the motor felt them, and the fit to them; both
     unchanged if the steps coincide with samples or all have the same delay, which is a matter of `reading_time`."""
     problem = given.problem
-    steps = [steps_of(run) for run in given.runs]
-    if given.straight:  # a straight rise between two samples is a step in their middle
-        steps = [s._replace(share=s.share + 0.5) for s in steps]
+    steps = [_as_laid_out(given, run) for run in range(len(given.runs))]
     count, most = sum(len(s.at) for s in steps), max(len(s.at) for s in steps)
     too_many = 2 * problem.tape.value.size * most > MAX_ELEMENTS
-    if given.reading or not all(problem.samples > 0) or count < MIN_STEPS or too_many:
+    if given.timing.reading or not all(problem.samples > 0) or count < MIN_STEPS or too_many:
         return given, fit
     min_gain = MIN_LOG_LIKELIHOOD_GAIN + MIN_GAIN_PER_STEP * count
     steps, predicted_gain = _fit_times(problem, fit, steps)
     if predicted_gain < min_gain or not _are_unsynchronised(steps):
         return given, fit
-    placed, better = given, fit
-    for refit in range(REFITS):
-        if refit:
-            steps, _ = _fit_times(placed.problem, better, steps)
-        placed = _with_steps(given, better, steps)
-        better = polish(placed.problem, better.optimum)
-    gain = negative_log_likelihood(given, fit) - negative_log_likelihood(given, better)
-    return (placed, better) if gain > min_gain else (given, fit)
+    placed = _refitted(given, fit, steps)
+    if given.timing == STRAIGHT:  # so do smooth voltages look beside steps anywhere in a sample
+        placed = min(placed, _refitted_smooth(given, placed), key=_negative_log_likelihood)
+    gain = negative_log_likelihood(given, fit) - _negative_log_likelihood(placed)
+    return (placed.given, placed.fit) if gain > min_gain else (given, fit)
+
+
+class _Placed(NamedTuple):
+    """Runs with their steps at the times that fit best, and the fit to them."""
+
+    given: Prepared
+    fit: Fit
+    steps: Sequence[Steps]
+
+
+def _refitted(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> _Placed:
+    """The steps at the times that fit best, from the times and the fit given."""
+    placed = _placed(given, fit, steps)
+    for _ in range(MAX_REFITS):
+        steps, _ = _fit_times(placed.given.problem, placed.fit, placed.steps)
+        moved = np.clip(_shares(steps), 0, 1) - np.clip(_shares(placed.steps), 0, 1)
+        if np.max(np.abs(moved)) < TOLERANCE:
+            break
+        placed = _placed(given, placed.fit, steps)
+    return placed
+
+
+def _placed(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> _Placed:
+    """The steps at these times, and the fit to the runs with them, from another fit."""
+    with_steps = _with_steps(given, fit, steps)
+    return _Placed(with_steps, polish(with_steps.problem, fit.optimum), steps)
+
+
+def _refitted_smooth(given: Prepared, straight: _Placed) -> _Placed:
+    """The steps at the times that fit best if the voltages are on smooth curves between them, from the fit for straight
+    voltages."""
+    motor = given.problem.parameters(straight.fit.coordinates)
+    smooth = with_timing(given, SMOOTH._replace(smooth=float(motor.R / motor.L)))
+    steps = [
+        _as_laid_out(smooth, run)._replace(share=s.share) for run, s in enumerate(straight.steps)
+    ]
+    return _refitted(smooth, straight.fit, steps)
+
+
+def _negative_log_likelihood(placed: _Placed) -> float:
+    return negative_log_likelihood(placed.given, placed.fit)
 
 
 def steps_of(run: Recording) -> Steps:
@@ -89,12 +128,29 @@ def steps_of(run: Recording) -> Steps:
     return Steps(at, height, np.zeros(len(at)))
 
 
+def _as_laid_out(given: Prepared, k: int) -> Steps:
+    """The steps of a run as they are on its tape."""
+    steps, timing, tape = steps_of(given.runs[k]), given.timing, given.problem.tape
+    if timing.smooth is not None:  # the curve before a step goes on until it
+        assert tape.rise is not None
+        rise = tape.samples_of(k, tape.rise, len(given.runs[k]))
+        return steps._replace(height=steps.height - rise[steps.at - 1])
+    if timing.straight:  # a straight rise between two samples is a step in their middle
+        return steps._replace(share=steps.share + 0.5)
+    return steps
+
+
 def _are_unsynchronised(steps: Sequence[Steps]) -> bool:
     """Whether the steps are spread over a sample interval, instead of all at the same place in it or outside."""
-    share = np.concatenate([s.share for s in steps])
+    share = _shares(steps)
     inside = (share > -MARGIN) & (share < 1 + MARGIN)
     spread = np.std(np.clip(share, 0, 1))
     return bool(np.mean(inside) > 1 - MAX_OUTLIERS and spread > MIN_SPREAD)
+
+
+def _shares(steps: Sequence[Steps]) -> Float[np.ndarray, " steps"]:
+    """The shares of the steps of all runs."""
+    return np.concatenate([s.share for s in steps])
 
 
 def _fit_times(problem: Problem, fit: Fit, steps: Sequence[Steps]) -> tuple[list[Steps], float]:
@@ -120,19 +176,20 @@ def _with_steps(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
     problem, tape = given.problem, given.problem.tape
     value = np.array(tape.value)
     rise = np.zeros_like(value) if tape.rise is None else np.array(tape.rise)
-    most = max(len(s.at) for s in steps)
+    motor = problem.parameters(fit.coordinates)
+    most, rate = max(len(s.at) for s in steps), float(motor.R / motor.L)
     responses = np.zeros((*np.shape(tape.measured), most))
     for run, s in enumerate(steps):
         mine = np.flatnonzero(tape.blocks_of(run))
         responses[mine, ..., : len(s.at)] = _responses(problem, fit, run, s)
         share = np.clip(s.share, 0.0, 1.0)
         block, sample = np.divmod(s.at - 1, BLOCK)
-        before = given.runs[run].voltage
-        assert before is not None or not len(s.at), "only voltages step"
-        if before is not None:
-            # a straight line with the same mean and first moment as the step
-            value[mine[block], sample] = before[s.at - 1] + share * s.height
-            rise[mine[block], sample] = 6 * share * (1 - share) * s.height
+        at = mine[block], sample
+        if given.timing.smooth is None:
+            value[at] -= rise[at] / 2
+            rise[at] = 0.0
+        value[at] += share * s.height
+        rise[at] += rise_like_step(share, rate * tape.sample_time_of(run)) * s.height
     tape = replace(tape, value=jnp.asarray(value), rise=jnp.asarray(rise))
     nuisance = Nuisance(jnp.asarray(responses), fit.noise)
     problem = replace(problem, tape=tape, nuisance=nuisance)

@@ -68,7 +68,7 @@ def _shifted(given: Prepared, fit: Fit) -> Prepared:
     for k, run in enumerate(given.runs):
         if run.resampled_from is not None:
             now = tape.samples_of(k, seen, len(run))
-            then = seen_at_record(motor, tape.drive_of(k), run, now, given.straight)
+            then = seen_at_record(motor, tape.drive_of(k), run, now, given.timing.straight)
             run = _nearest_samples(run, now, then)
         runs.append(run)
     laid, begins = Tape.from_recordings(runs), np.asarray(tape.begins)
