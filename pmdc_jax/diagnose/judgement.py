@@ -7,13 +7,15 @@ from ..identify.identification import Identification
 from ..motor import Motor
 from .assessment import FALSE_ALARM
 from .diagnosis import Verdict, breaks_electrical_equation, is_disturbed, unlike_held_out
-from .gap import Noise, gaps_by_role, gaps_of_runs, noise_of_runs
+from .gap import Noise, closed_fraction, gaps_by_role, gaps_of_runs, noise_of_runs
 from .library import Library
 from .naming import Naming
 
 # An effect with a smaller p-value without it is kept even if the runs give no interval of any of its parameters
 CERTAIN_P_VALUE = 1e-30
-# ... and one whose interval of the amplitude reaches down to this share of the estimate may be absent
+# ... unless the effects leave what nothing explains: they are all dropped if they close less than this share of the gap
+MIN_CLOSED = 0.1
+# An effect whose interval of the amplitude reaches down to this share of the estimate may be absent
 ABSENT_SHARE = 1e-2
 # Damping over critical damping from which a shaft is none: couplings of rubber reach 0.3
 MAX_DAMPING_RATIO = 2.0
@@ -29,9 +31,19 @@ def implausible_effect(motor: Motor) -> str | None:
     return next((e.name for e in shafts if e.damping_ratio(motor) > MAX_DAMPING_RATIO), None)
 
 
-def unneeded_effect(naming: Naming, final: Identification, library: Library) -> str | None:
-    """The one of several effects that the runs need least, if they do not need it: by its p-value, as its amplitude may
-    be zero, or as they determine none of its parameters and its p-value is not below `CERTAIN_P_VALUE`."""
+def unneeded_effect(
+    naming: Naming, base: Identification, final: Identification, library: Library
+) -> str | None:
+    """The effect that the runs need least, if they do not need it: one of several by its p-value, as its amplitude may
+    be zero, or as they determine none of its parameters and its p-value is not below `CERTAIN_P_VALUE`; any as the
+    effects leave what nothing explains and close hardly any of the gap, where no p-value says much.
+
+    **Arguments**: `base` and `final`, the motor without and with the effects.
+    """
+    unexplained = _more_is_missing(naming) and naming.line is None and naming.varies is None
+    certain = 0.0 if unexplained else CERTAIN_P_VALUE
+    if unexplained and _closed_fraction(naming, base, final) < MIN_CLOSED:
+        return max(naming.p_without, key=lambda effect: naming.p_without[effect], default=None)
     if len(naming.p_without) < 2:
         return None
     amplitude = {c.effect: c.amplitude for c in library.candidates if c.amplitude}
@@ -42,7 +54,7 @@ def unneeded_effect(naming: Naming, final: Identification, library: Library) -> 
         if effect in amplitude and may_be_absent(final, effect, amplitude[effect]):
             return True
         intervals = [final.parameters[f"{effect}.{f}"].ci95 for f in EFFECTS[effect].ranges]
-        return p_value > CERTAIN_P_VALUE and all(interval is None for interval in intervals)
+        return p_value >= certain and all(interval is None for interval in intervals)
 
     unneeded = {e: p for e, p in naming.p_without.items() if is_unneeded(e, p)}
     return max(unneeded, key=lambda effect: unneeded[effect], default=None)
@@ -91,8 +103,18 @@ def _by_evidence(naming: Naming) -> Verdict:
         return "not_in_library"
     if naming.p_nothing >= FALSE_ALARM:
         return "not_in_library" if naming.varies else "none_detected"
-    if naming.p_nothing_more < FALSE_ALARM and not naming.may_be_model_form_error:
-        return "not_in_library"
-    if not naming.chosen.effects:
+    if _more_is_missing(naming) or not naming.chosen.effects:
         return "not_in_library"
     return "ambiguous" if naming.rivals else "named"
+
+
+def _more_is_missing(naming: Naming) -> bool:
+    """Whether the chosen effects leave what no other form of them could explain."""
+    return naming.p_nothing_more < FALSE_ALARM and not naming.may_be_model_form_error
+
+
+def _closed_fraction(naming: Naming, base: Identification, final: Identification) -> float:
+    """The share of the gap that the effects close; 1 if there is none."""
+    noise = noise_of_runs(final.fit, naming.noise_share)
+    closed = closed_fraction(gaps_by_role(gaps_of_runs(base.fit, final.fit, noise), base.fit))
+    return 1.0 if closed is None else closed

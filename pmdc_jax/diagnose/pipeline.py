@@ -69,7 +69,7 @@ def diagnose(
     given, naming_ended = found.given, time.perf_counter()
     report("estimating the uncertainty", found.naming.chosen.fit.fitness)
     base = results_of(given, found.solved)
-    naming, final = _without_unneeded_effects(found)
+    naming, final = _without_unneeded_effects(found, base)
     before, after = (electrical_misfit(m) for m in (found.selection.base, naming.chosen))
     verdict, noise = judge(naming, base, final, (before, after))
     gaps = gaps_of_runs(base.fit, final.fit, noise)
@@ -146,13 +146,16 @@ def _likeliest_attempt(
     return min(first, *map(attempt, others[:1]), key=negative_log_likelihood) if others else first
 
 
-def _without_unneeded_effects(found: _Attempt) -> tuple[Naming, Identification]:
-    """The naming without effects that are implausible or that the runs do not need, and the motor it identifies."""
+def _without_unneeded_effects(
+    found: _Attempt, base: Identification
+) -> tuple[Naming, Identification]:
+    """The naming without effects that are implausible or that the runs do not need, and the motor it identifies; `base`
+    is the motor without effects."""
     naming = found.naming
     final = _identification(naming, found.solved)
     while effect := (
         implausible_effect(naming.chosen.motor)
-        or unneeded_effect(naming, final, found.selection.library)
+        or unneeded_effect(naming, base, final, found.selection.library)
     ):
         naming = found.selection.without(naming, effect)
         final = _identification(naming, found.solved)

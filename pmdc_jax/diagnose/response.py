@@ -150,20 +150,46 @@ def respond(
     without = jnp.zeros((*kicks.shape[:3], 2))
     free_end, free = jax.lax.scan(step, basis, (without, moves, conducts))
 
+    starts = _starts_of_blocks(tape, free_end, end)
+    response = forced + free[..., :1] * starts[:, 0] + free[..., 1:] * starts[:, 1]
+    varies = jnp.stack([conducts, moves], 1)[..., None]
+    return _reported_response(motor, tape, propagator, response, kicks, varies)
+
+
+def _starts_of_blocks(
+    tape: Tape, free: Float[Array, "2 blocks 2"], forced: Float[Array, "2 blocks columns"]
+) -> Float[Array, "blocks 2 columns"]:
+    """The states at the start of each block: from zero at the start of each run, carried through the blocks.
+
+    **Arguments**: the states at the end of each block, from the unit states (`free`), and from zero with the kicks.
+    """
+
     def next_block(
         start: Float[Array, "2 columns"],
         block: tuple[Bool[Array, ""], Float[Array, "2 2"], Float[Array, "2 columns"]],
     ) -> tuple[Float[Array, "2 columns"], Float[Array, "2 columns"]]:
-        begins, block_transition, forced_end = block
+        begins, transition, forced_end = block
         start = jnp.where(begins, 0.0, start)
-        return block_transition @ start + forced_end, start
+        return transition @ start + forced_end, start
 
-    blocks = (jnp.asarray(tape.begins), free_end.transpose(1, 0, 2), end.transpose(1, 0, 2))
-    starts = jax.lax.scan(next_block, jnp.zeros((2, kicks.shape[3])), blocks)[1]
-    response = forced + free[..., :1] * starts[:, 0] + free[..., 1:] * starts[:, 1]
-    at_start, varies = response, jnp.stack([conducts, moves], 1)[..., None]
+    blocks = (jnp.asarray(tape.begins), free.transpose(1, 0, 2), forced.transpose(1, 0, 2))
+    return jax.lax.scan(next_block, jnp.zeros((2, forced.shape[2])), blocks)[1]
+
+
+def _reported_response(
+    motor: Motor,
+    tape: Tape,
+    propagator: Propagator,
+    at_start: Float[Array, "samples 2 blocks columns"],
+    kicks: Float[Array | np.ndarray, "samples 2 blocks columns"],
+    varies: Float[Array, "samples 2 blocks 1"],
+) -> Float[Array, "samples 2 blocks columns"]:
+    """The response when the outputs are read, as their sensors report it, from that at the start of each sample.
+
+    **Arguments**: `kicks`, each of which builds up evenly over its sample; `varies`, zero where an output is held.
+    """
+    response = at_start
     if propagator.reading is not None:
-        # a kick builds up evenly over its sample
         part, share = propagator.reading
         response = (
             jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start)
@@ -176,7 +202,7 @@ def respond(
     def mean(
         within: Propagator, share: Scalars | float
     ) -> Float[Array, "samples 2 blocks columns"]:
-        """Over a share of each sample, of a kick that builds up evenly."""
+        """Over a share of each sample."""
         assert within.mean is not None
         by_start = jnp.einsum("ijsb,sjbc->sibc", within.mean.transition, at_start)
         return (by_start + share / 2 * kicks) * varies
