@@ -3,7 +3,7 @@ of the measuring range, and values that a sensor repeated when it had failed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
 import attrs
 import numpy as np
@@ -25,6 +25,10 @@ MAX_STEP_OF_DRIVE = 0.2
 MAX_SPIKES = 0.01
 # Probability at which a run of equal values is still taken for chance
 CHANCE_OF_STAY = 1e-9
+# The same for the repeated values of stays at an extreme that begin and end with a leap of so many times the noise
+CHANCE_OF_REPEATS, MIN_LEAP = 1e-6, 5.0
+# Largest probability assumed for a value to repeat the one before, with a resolution far coarser than the noise
+MAX_CHANCE_TO_REPEAT = 0.9
 # Least number of equal values from a failed sensor, and the least jump after them, over the noise; at zero, where a
 # sensor may truly rest, before and after them, over the range of the signal
 MIN_FROZEN, MIN_JUMP, MIN_JUMP_AT_ZERO = 20, 10.0, 0.05
@@ -32,10 +36,24 @@ MIN_FROZEN, MIN_JUMP, MIN_JUMP_AT_ZERO = 20, 10.0, 0.05
 MAX_REPEATS = 0.02
 
 
-def without_unmeasured(run: Recording) -> Recording:
-    """The run with the spikes, the clipped and the frozen samples of its outputs set to NaN, and a note on each."""
-    outputs = ("speed", "current") if run.drive == "voltage" else ("speed",)
-    for name in outputs:
+def without_unmeasured(runs: Sequence[Recording]) -> list[Recording]:
+    """The runs with the spikes, the clipped and the frozen samples of their outputs set to NaN, and a note on each; an
+    extreme at which one run was clipped is the end of the measuring range in all."""
+    clipped_at = {
+        name: [
+            abs(end)
+            for run in runs
+            if name in _outputs(run) and getattr(run, name) is not None
+            for end, *_ in clipped_extremes(getattr(run, name))
+        ]
+        for name in ("speed", "current")
+    }
+    return [_without_unmeasured(run, clipped_at) for run in runs]
+
+
+def _without_unmeasured(run: Recording, clipped_at: Mapping[str, Sequence[float]]) -> Recording:
+    """One run; `clipped_at` are the magnitudes at which each output was clipped in any run."""
+    for name in _outputs(run):
         signal = getattr(run, name)
         if signal is None:
             continue
@@ -44,9 +62,11 @@ def without_unmeasured(run: Recording) -> Recording:
             run = _with_missing_samples(run, name, spikes, "has a single-sample spike", RANGE)
         signal = getattr(run, name)
         ends = [extreme for extreme, *_ in clipped_extremes(signal)]
-        clipped = np.isin(signal, ends)
+        extremes = np.array([np.nanmin(signal), np.nanmax(signal)])
+        at_end = np.isclose(np.abs(extremes)[:, None], clipped_at[name], rtol=1e-6).any(1)
+        clipped = np.isin(signal, [*ends, *extremes[at_end]])
         missing = np.mean(clipped | np.isnan(signal))
-        if ends and missing <= MAX_MISSING:
+        if clipped.any() and missing <= MAX_MISSING:
             run = _with_missing_samples(run, name, clipped, "looks clipped", RANGE)
         frozen = _frozen(getattr(run, name))
         if frozen.any():
@@ -54,6 +74,10 @@ def without_unmeasured(run: Recording) -> Recording:
                 run, name, frozen, "stays", "Check the sensor and its cable"
             )
     return run
+
+
+def _outputs(run: Recording) -> tuple[str, ...]:
+    return ("speed", "current") if run.drive == "voltage" else ("speed",)
 
 
 def _with_missing_samples(
@@ -93,11 +117,38 @@ def _drive_is_steady(run: Recording) -> Bool[np.ndarray, " samples"]:
 def clipped_extremes(
     values: Float[np.ndarray, " samples"],
 ) -> Iterator[tuple[float, int, int]]:
-    """Extremes at which a noisy signal stays longer than by chance, with start and length of the longest stay."""
-    for extreme in (np.nanmax(values), np.nanmin(values)) if _is_noisy(values) else ():
+    """Extremes at which a noisy signal stays longer than by chance, with start and length of the longest stay; or to
+    which it leaps too often, to stay for only a few samples each."""
+    if not _is_noisy(values):
+        return
+    ends = np.array([np.nanmax(values), np.nanmin(values)])
+    repeats = np.array([_repeats_between_leaps(values, extreme) for extreme in ends])
+    if np.isclose(*np.abs(ends), rtol=1e-6):  # the two ends of one measuring range
+        repeats[:] = repeats.sum()
+    leaps = _chance_to_repeat(values) ** repeats < CHANCE_OF_REPEATS
+    for extreme, leaps_there in zip(ends, leaps, strict=True):
         start, length, expected = _longest_stay_at(values, extreme)
-        if length > expected:
+        if length > expected or (leaps_there and length > 1):
             yield float(extreme), start, length
+
+
+def _repeats_between_leaps(values: Float[np.ndarray, " samples"], extreme: float) -> int:
+    """How many values repeat the one before in stays at an extreme that begin and end with a leap."""
+    starts, ends = _stays(values)
+    inside = (values[starts] == extreme) & (starts > 0) & (ends < len(values) - 1)
+    starts, ends = starts[inside], ends[inside]
+    leaps = np.minimum(*(np.abs(values[i] - extreme) for i in (starts - 1, ends + 1)))
+    far = leaps > MIN_LEAP * noise_by_differences(3, values)
+    return int(np.sum((ends - starts)[far]))
+
+
+def _chance_to_repeat(values: Float[np.ndarray, " samples"]) -> float:
+    """Probability that a value repeats the one before where the signal is steady: Gaussian noise in steps of the
+    sensor's resolution."""
+    noise = noise_by_differences(3, values)
+    resolution = np.min(np.diff(np.unique(values[np.isfinite(values)])))
+    steady = resolution / max(2 * np.sqrt(np.pi) * noise, resolution)
+    return min(steady, MAX_CHANCE_TO_REPEAT)
 
 
 def _is_noisy(values: np.ndarray) -> bool:

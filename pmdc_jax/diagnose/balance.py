@@ -11,12 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.optimize import least_squares
 
 from ..identify.corrections.electrical_equation import MIN_FLOW
 from ..identify.generalised_least_squares import residuals_of, series_of
 from ..identify.noise import noise_of_sensor, white_noise
 from ..identify.noise_model import Series
-from ..motor import Drive, Motor
+from ..motor import Motor
 from ..recording import OVER_LAST
 from ..simulate.exponential import scalar_phi
 from .model import Model
@@ -32,52 +33,94 @@ LAGS = range(2, 9)
 CHANCE_ERRORS = 3.0
 
 
-class _Balance(NamedTuple):
-    """One run's residuals of the electrical equation from sample to sample, over the white noise of the sensors."""
+# Bounds of the natural logarithms of R, Kb and L over those of the model, and the first guess of L, if it is less, as a
+# share of R times the sample time: a smaller one is not felt, and no gradient leads back
+MAX_LOGARITHM, MIN_GUESS = 7.0, 0.1
 
-    residuals: Float[np.ndarray, " samples"]  # of the current at the end of each step
-    # derivatives by R, Kb, a voltage drop that opposes the current, and L, each up to a factor
-    sensitivities: Float[np.ndarray, "samples 4"]
+
+class _Electrical(NamedTuple):
+    """What the electrical equation depends on."""
+
+    R: float
+    Kb: float
+    L: float
+    drop: float = 0.0  # V, opposes the current, beside that of the model
+
+    def changed(self, by: Float[np.ndarray, "4"]) -> _Electrical:
+        """With R, Kb and L changed by these natural logarithms, and this drop in V."""
+        R, Kb, L = np.array(self[:3]) * np.exp(by[:3])
+        return _Electrical(R, Kb, L, by[3])
+
+
+class _Steps(NamedTuple):
+    """The steps of one run from sample to sample: first what acts, each at the start and at the end of a step."""
+
+    seconds: float
+    current: Float[np.ndarray, " steps"]  # A, at the start
+    speed: Float[np.ndarray, "steps 2"]  # rad/s
+    voltage: Float[np.ndarray, "steps 2"]  # V
+    direction: Float[np.ndarray, " steps"]  # of the current, if brushes oppose it; else zero
+    # current at the end less what the model has there beside its electrical equation, A
+    reached: Float[np.ndarray, " steps"]
+    noise: float  # of the sensors, in a residual, A
     even_clock: bool
 
+    def residuals(self, motor: _Electrical) -> Float[np.ndarray, " steps"]:
+        """The residuals of the electrical equation, over the noise of the sensors."""
+        return (self.reached - self.predicted(motor)) / self.noise
 
-class _StepGains(NamedTuple):
-    """Derivatives of the current after a step."""
+    def predicted(self, motor: _Electrical) -> Float[np.ndarray, " steps"]:
+        """Current at the end of the steps by the electrical equation, with voltage and speed on straight lines."""
+        decay, weights = _weights(motor, self.seconds)
+        drop = motor.drop * self.direction[:, None]
+        return decay * self.current + (self.voltage - motor.Kb * self.speed - drop) @ weights
 
-    current: float  # by the current before the step, A/A
-    speed_before: float  # by the speed before the step, A per rad/s
-    speed_after: float  # by the speed after the step, A per rad/s
-    voltage: float  # by a voltage held during the step, A/V
+
+def _weights(motor: _Electrical, seconds: float) -> tuple[float, Float[np.ndarray, "2"]]:
+    """What a step leaves of a current, and the current at its end per V at its start and at its end, in A/V, if the
+    voltage changes linearly."""
+    decay = -motor.R / motor.L * seconds
+    mean, later = scalar_phi(decay, 1), scalar_phi(decay, 2)
+    return float(np.exp(decay)), seconds / motor.L * np.array([mean - later, later])
 
 
 def electrical_misfit(model: Model) -> float:
     """Residual of the electrical equation over the white noise of the sensors, as root mean square, of the worst run.
 
-    With residuals i and w of current and speed, R i + L di/dt + Kb w = 0 between two samples, with w on a straight
-    line. R, L, Kb and the brush voltage drop are fitted to these residuals by least squares over all runs, because
-    fluctuating torques bias the fit of a free run. Only what steps some samples apart (`LAGS`) have in common is added
-    to the noise: a rough voltage, whose errors differ from step to step, is no missing effect.
+    L di/dt = v - R i - Kb w between two samples, with v and w on straight lines, and with what the simulation of the
+    model has beside it, such as the drop of its brushes. R, Kb, L and a further drop of the brushes are fitted to the
+    measured steps of all runs, because torques that the model lacks bias the fit of a free run. Only what steps some
+    samples apart (`LAGS`) have in common is added to the noise: a rough voltage, whose errors differ from step to step,
+    is no missing effect.
 
     **Returns**: at least 1; 1 if no run has voltage, current and speed, or if the model is exact.
     """
     if model.is_exact:
         return 1.0
     series = residuals_of(model.given, model.fit)
-    balances = [
-        balance
+    runs = [
+        steps
         for run, residual in zip(model.training, series, strict=True)
-        if (balance := _balance(model, run, residual)) is not None
+        if (steps := _steps(model, run, residual)) is not None
     ]
-    if not balances:
+    if not runs:
         return 1.0
-    sensitivities = np.concatenate([b.sensitivities for b in balances])
-    residuals = np.concatenate([b.residuals for b in balances])
-    corrections = np.linalg.lstsq(sensitivities, residuals, rcond=None)[0]
-    covariances = [
-        _covariance_beyond_chance(b.residuals - b.sensitivities @ corrections, b.even_clock)
-        for b in balances
-    ]
-    return float(np.sqrt(1 + max(covariances)))
+    start = _electrical_part(model.motor)
+    guess = MIN_GUESS * start.R / start.L * min(steps.seconds for steps in runs)
+    largest = np.array([*3 * [MAX_LOGARITHM], np.inf])
+    best = least_squares(
+        lambda by: np.concatenate([steps.residuals(start.changed(by)) for steps in runs]),
+        [0.0, 0.0, np.clip(np.log(guess), 0.0, MAX_LOGARITHM / 2), 0.0],
+        bounds=(-largest, largest),
+        x_scale="jac",
+    )
+    motor = start.changed(best.x)
+    beyond = [_covariance_beyond_chance(steps.residuals(motor), steps.even_clock) for steps in runs]
+    return float(np.sqrt(1 + max(beyond)))
+
+
+def _electrical_part(motor: Motor) -> _Electrical:
+    return _Electrical(float(motor.R), float(motor.Kb), float(motor.L))
 
 
 def _covariance_beyond_chance(residuals: Float[np.ndarray, " samples"], even_clock: bool) -> float:
@@ -90,9 +133,8 @@ def _covariance_beyond_chance(residuals: Float[np.ndarray, " samples"], even_clo
     return float(max(0.0, *np.subtract(means, chance)))
 
 
-def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
-    """The residuals of the electrical equation in a run; None if they are too few, a signal was not recorded, or the
-    current is a mean."""
+def _steps(model: Model, run: int, residual: Series) -> _Steps | None:
+    """The steps of a run; None if they are too few, a signal was not recorded, or the current is a mean."""
     given, tape = model.given, model.given.problem.tape
     drive, known, residuals = tape.drive_of(run), residual.known, residual.values
     recorded = given.runs[run]
@@ -111,30 +153,39 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     pairs = known[1:] & known[:-1]
     if pairs.sum() < MIN_SAMPLES:
         return None
-    gains = _step_gains(model.motor, drive, tape.sample_time_of(run))
-    if recorded.averaging == OVER_LAST:  # the reported speed is the mean over just this step
-        both = gains.speed_before + gains.speed_after
-        gains = gains._replace(speed_before=0.0, speed_after=both)
-    by_current, by_before, by_after, by_voltage = gains
-    i, w = residuals.T
-    step_residuals = i[1:] - by_current * i[:-1] - by_before * w[:-1] - by_after * w[1:]
-    mean, change = (simulated[1:] + simulated[:-1]) / 2, np.diff(simulated[:, :1], axis=0)
-    sensors = current_noise**2 * (1 + by_current**2) + speed_noise**2 * (by_before**2 + by_after**2)
-    voltage_noise = given.input_noise.get(given.runs[run].name, 0.0)
-    noise = np.sqrt(sensors + (by_voltage * voltage_noise) ** 2)
-    drop = by_voltage * brushes * np.sign(mean[:, :1])
-    sensitivities = np.concatenate([by_voltage * mean, drop, change], axis=1)
-    even_clock = given.runs[run].resampled_from is None
-    return _Balance(step_residuals[pairs] / noise, sensitivities[pairs] / noise, even_clock)
+    motor, seconds = _electrical_part(model.motor), tape.sample_time_of(run)
+    # a speed that is the mean over just this step
+    is_mean = recorded.averaging == OVER_LAST
+    voltage = _voltage_between_readings(model, run, len(known))[pairs]
+
+    def steps(signals: Float[np.ndarray, "samples 2"], reached: np.ndarray, noise: float) -> _Steps:
+        i, w = signals[:-1, 0][pairs], signals[:, 1]
+        speed = np.stack([w[1:] if is_mean else w[:-1], w[1:]], 1)[pairs]
+        direction = brushes * np.sign(simulated[:-1, 0] + simulated[1:, 0])[pairs]
+        even_clock = recorded.resampled_from is None
+        return _Steps(seconds, i, speed, voltage, direction, reached, noise, even_clock)
+
+    by_model = steps(simulated, simulated[1:, 0][pairs], 1.0)
+    reached = residuals[1:, 0][pairs] + by_model.predicted(motor)
+    decay, weights = _weights(motor, seconds)
+    by_speed = motor.Kb * (weights.sum() if is_mean else np.hypot(*weights))
+    parts = (
+        current_noise * np.hypot(1, decay),
+        speed_noise * by_speed,
+        given.input_noise.get(recorded.name, 0.0) * weights.sum(),
+    )
+    return steps(measured, reached, float(np.linalg.norm(parts)))
 
 
-def _step_gains(motor: Motor, drive: Drive, seconds: float) -> _StepGains:
-    """The gains of a step of so many seconds, with a speed on a straight line."""
-    A, B = map(np.asarray, motor.state_space(drive))
-    decay = A[0, 0] * seconds
-    mean, later = scalar_phi(decay, 1), scalar_phi(decay, 2)
-    by_speed, by_voltage = A[0, 1] * seconds, B[0, 0] * seconds
-    return _StepGains(np.exp(decay), by_speed * (mean - later), by_speed * later, by_voltage * mean)
+def _voltage_between_readings(model: Model, run: int, length: int) -> Float[np.ndarray, "steps 2"]:
+    """The voltage at the start and at the end of each step between the samples of a run, of this number, V."""
+    given, tape = model.given, model.given.problem.tape
+    mean = tape.samples_of(run, tape.value, length)
+    rise = np.zeros(length) if tape.rise is None else tape.samples_of(run, tape.rise, length)
+    ends = np.stack([mean - rise / 2, mean + rise / 2], 1)
+    if (share := given.timing.reading) is not None:  # from one reading to the next two voltages act
+        ends[:-1] = (1 - share) * ends[:-1] + share * ends[1:]
+    return ends[:-1]
 
 
 def _flows(

@@ -92,9 +92,9 @@ def prepare(
     effects: Sequence[type[AbstractEffect]] = (),
 ) -> Prepared:
     """Check the recordings and lay them out; raises `InputError` where they cannot give an answer."""
-    recordings, holdout = (
-        [without_unmeasured(run) for run in recordings_of(runs)] for runs in (recordings, holdout)
-    )
+    recordings, holdout = recordings_of(recordings), recordings_of(holdout)
+    cleaned = without_unmeasured([*recordings, *holdout])
+    recordings, holdout = cleaned[: len(recordings)], cleaned[len(recordings) :]
     _check_arguments(recordings, holdout, tie, known)
     findings = check([*recordings, *holdout])
     _raise_errors(findings)
