@@ -353,6 +353,7 @@ def test_a_seizing_bearing_is_not_named_coulomb_friction():
     assert late.mean() - early.mean() == pytest.approx(0.05, rel=0.3)
 
 
+@pytest.mark.slow
 def test_an_eccentric_weight_behind_a_gear_is_not_in_the_library():
     """It turns once in 11.6 turns of the motor, as slowly as torque noise fluctuates."""
     plant = Plant(**PAPER, eccentric_Nm=0.02, eccentric_gear=11.6, eccentric_phase=1.0)

@@ -302,7 +302,7 @@ FAST = TRUE | {"L": 8e-5}
         pytest.param("late", "acts one sample later", marks=pytest.mark.slow),
         pytest.param("7 tenths", "acts 0.3 of a sample later", marks=pytest.mark.slow),
         pytest.param("3 tenths early", "acts 0.3 of a sample earlier", marks=pytest.mark.slow),
-        ("5 tenths early", "acts 0.5 of a sample earlier"),
+        pytest.param("5 tenths early", "acts 0.5 of a sample earlier", marks=pytest.mark.slow),
         pytest.param("held", None, marks=pytest.mark.slow),
     ],
 )

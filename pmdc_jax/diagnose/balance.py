@@ -31,8 +31,6 @@ MIN_SAMPLES = 50
 LAGS = range(2, 9)
 # Standard errors of a correlation that chance may bring
 CHANCE_ERRORS = 3.0
-
-
 # Bounds of the natural logarithms of R, Kb and L over those of the model, and the first guess of L, if it is less, as a
 # share of R times the sample time: a smaller one is not felt, and no gradient leads back
 MAX_LOGARITHM, MIN_GUESS = 7.0, 0.1
