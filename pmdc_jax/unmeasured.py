@@ -39,45 +39,46 @@ MAX_REPEATS = 0.02
 def without_unmeasured(runs: Sequence[Recording]) -> list[Recording]:
     """The runs with the spikes, the clipped and the frozen samples of their outputs set to NaN, and a note on each; an
     extreme at which one run was clipped is the end of the measuring range in all."""
-    clipped_at = {
-        name: [
-            abs(end)
-            for run in runs
-            if name in _outputs(run) and getattr(run, name) is not None
-            for end, *_ in clipped_extremes(getattr(run, name))
-        ]
-        for name in ("speed", "current")
-    }
-    return [_without_unmeasured(run, clipped_at) for run in runs]
+    runs = [_without_spikes(run) for run in runs]
+    clipped_at: dict[str, list[float]] = {"speed": [], "current": []}
+    for run in runs:
+        for name, signal in _outputs(run).items():
+            clipped_at[name] += [abs(extreme) for extreme, *_ in clipped_extremes(signal)]
+    return [_without_frozen(_without_clipped(run, clipped_at)) for run in runs]
 
 
-def _without_unmeasured(run: Recording, clipped_at: Mapping[str, Sequence[float]]) -> Recording:
-    """One run; `clipped_at` are the magnitudes at which each output was clipped in any run."""
-    for name in _outputs(run):
-        signal = getattr(run, name)
-        if signal is None:
-            continue
+def _without_spikes(run: Recording) -> Recording:
+    for name, signal in _outputs(run).items():
         spikes = _spikes(signal) & _drive_is_steady(run)
         if 0 < spikes.sum() <= MAX_SPIKES * len(run):
             run = _with_missing_samples(run, name, spikes, "has a single-sample spike", RANGE)
-        signal = getattr(run, name)
-        ends = [extreme for extreme, *_ in clipped_extremes(signal)]
-        extremes = np.array([np.nanmin(signal), np.nanmax(signal)])
-        at_end = np.isclose(np.abs(extremes)[:, None], clipped_at[name], rtol=1e-6).any(1)
-        clipped = np.isin(signal, [*ends, *extremes[at_end]])
-        missing = np.mean(clipped | np.isnan(signal))
-        if clipped.any() and missing <= MAX_MISSING:
-            run = _with_missing_samples(run, name, clipped, "looks clipped", RANGE)
-        frozen = _frozen(getattr(run, name))
-        if frozen.any():
-            run = _with_missing_samples(
-                run, name, frozen, "stays", "Check the sensor and its cable"
-            )
     return run
 
 
-def _outputs(run: Recording) -> tuple[str, ...]:
-    return ("speed", "current") if run.drive == "voltage" else ("speed",)
+def _without_clipped(run: Recording, clipped_at: Mapping[str, Sequence[float]]) -> Recording:
+    """**Arguments**: `clipped_at`, the magnitudes at which each output was clipped in any run."""
+    for name, signal in _outputs(run).items():
+        extremes = np.array([np.nanmin(signal), np.nanmax(signal)])
+        at_end = np.isclose(np.abs(extremes)[:, None], clipped_at[name], rtol=1e-6).any(1)
+        clipped = np.isin(signal, extremes[at_end])
+        if clipped.any() and np.mean(clipped | np.isnan(signal)) <= MAX_MISSING:
+            run = _with_missing_samples(run, name, clipped, "looks clipped", RANGE)
+    return run
+
+
+def _without_frozen(run: Recording) -> Recording:
+    for name, signal in _outputs(run).items():
+        frozen = _frozen(signal)
+        if frozen.any():
+            mend = "Check the sensor and its cable"
+            run = _with_missing_samples(run, name, frozen, "stays", mend)
+    return run
+
+
+def _outputs(run: Recording) -> dict[str, Float[np.ndarray, " samples"]]:
+    """The outputs of a run that were recorded, by name."""
+    names = ("speed", "current") if run.drive == "voltage" else ("speed",)
+    return {name: signal for name in names if (signal := getattr(run, name)) is not None}
 
 
 def _with_missing_samples(
@@ -122,30 +123,31 @@ def clipped_extremes(
     if not _is_noisy(values):
         return
     ends = np.array([np.nanmax(values), np.nanmin(values)])
-    repeats = np.array([_repeats_between_leaps(values, extreme) for extreme in ends])
+    noise = noise_by_differences(3, values)
+    repeats = np.array([_repeats_between_leaps(values, extreme, noise) for extreme in ends])
     if np.isclose(*np.abs(ends), rtol=1e-6):  # the two ends of one measuring range
         repeats[:] = repeats.sum()
-    leaps = _chance_to_repeat(values) ** repeats < CHANCE_OF_REPEATS
+    leaps = _chance_to_repeat(values, noise) ** repeats < CHANCE_OF_REPEATS
     for extreme, leaps_there in zip(ends, leaps, strict=True):
         start, length, expected = _longest_stay_at(values, extreme)
         if length > expected or (leaps_there and length > 1):
             yield float(extreme), start, length
 
 
-def _repeats_between_leaps(values: Float[np.ndarray, " samples"], extreme: float) -> int:
+def _repeats_between_leaps(
+    values: Float[np.ndarray, " samples"], extreme: float, noise: float
+) -> int:
     """How many values repeat the one before in stays at an extreme that begin and end with a leap."""
     starts, ends = _stays(values)
     inside = (values[starts] == extreme) & (starts > 0) & (ends < len(values) - 1)
     starts, ends = starts[inside], ends[inside]
     leaps = np.minimum(*(np.abs(values[i] - extreme) for i in (starts - 1, ends + 1)))
-    far = leaps > MIN_LEAP * noise_by_differences(3, values)
-    return int(np.sum((ends - starts)[far]))
+    return int(np.sum((ends - starts)[leaps > MIN_LEAP * noise]))
 
 
-def _chance_to_repeat(values: Float[np.ndarray, " samples"]) -> float:
+def _chance_to_repeat(values: Float[np.ndarray, " samples"], noise: float) -> float:
     """Probability that a value repeats the one before where the signal is steady: Gaussian noise in steps of the
     sensor's resolution."""
-    noise = noise_by_differences(3, values)
     resolution = np.min(np.diff(np.unique(values[np.isfinite(values)])))
     steady = resolution / max(2 * np.sqrt(np.pi) * noise, resolution)
     return min(steady, MAX_CHANCE_TO_REPEAT)

@@ -129,6 +129,7 @@ def test_a_motor_that_does_not_break_away_has_no_fastest_settling():
     stribeck = EFFECTS["stribeck_friction"](coulomb_Nm=0.02, static_Nm=0.035, speed_rad_s=5.0)
     stuck = MOTOR.with_effects([stribeck])
     assert fastest_settling(stuck, 10.0, 24.0, 0.5) is None
+    assert fastest_settling(stuck, 10.0, 24.0, 0.9) is not None
 
 
 def test_an_unreachable_set_point_has_no_fastest_settling():

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from linear_motor import exact_step
 from scipy.integrate import quad
 from scipy.linalg import expm
-from scipy.signal import chirp, cont2discrete, dlsim
+from scipy.signal import chirp, dlsim
 
 from pmdc_jax import Identification, diagnose, identify
 from pmdc_jax.recording import Recording
@@ -41,12 +42,11 @@ def run_with_steps(seed: int, *, synchronous: bool, load: float = 0.0) -> Record
 
 def run_with_chirp(seed: int) -> Recording:
     """A run from rest with a voltage in continuous time, held for 1/64 of a sample."""
-    fine, m = 64, TRUE
+    fine = 64
     time = STEP / fine * (np.arange(fine * SAMPLES) + 0.5)
     at_samples, voltage = (20 * chirp(t, 0.5, 2.0, 60.0, phi=90) for t in (time - time[0], time))
-    A = np.array([[-m["R"] / m["L"], -m["Kb"] / m["L"]], [m["Kt"] / m["J"], -m["f"] / m["J"]]])
-    B, C, D = np.array([[1 / m["L"]], [0.0]]), np.eye(2), np.zeros((2, 1))
-    seen = dlsim(cont2discrete((A, B, C, D), STEP / fine), voltage)[1][::fine]
+    A, B = exact_step(TRUE, STEP / fine)
+    seen = dlsim((A, B[:, :1], np.eye(2), np.zeros((2, 1)), STEP / fine), voltage)[1][::fine]
     seen += NOISE * np.random.default_rng(seed).standard_normal(seen.shape)
     return Recording(
         "chirp", STEP * np.arange(SAMPLES), at_samples[::fine], *seen.T, load=0 * seen[:, 0]

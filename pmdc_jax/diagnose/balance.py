@@ -51,13 +51,25 @@ class _Electrical(NamedTuple):
 
 
 class _Steps(NamedTuple):
-    """The steps of one run from sample to sample: first what acts, each at the start and at the end of a step."""
+    """What acts in the steps of one run from sample to sample, at the start and at the end of each."""
 
     seconds: float
     current: Float[np.ndarray, " steps"]  # A, at the start
     speed: Float[np.ndarray, "steps 2"]  # rad/s
     voltage: Float[np.ndarray, "steps 2"]  # V
     direction: Float[np.ndarray, " steps"]  # of the current, if brushes oppose it; else zero
+
+    def predicted(self, motor: _Electrical) -> Float[np.ndarray, " steps"]:
+        """Current at the end of the steps by the electrical equation, with voltage and speed on straight lines."""
+        decay, weights = _weights(motor, self.seconds)
+        drop = motor.drop * self.direction[:, None]
+        return decay * self.current + (self.voltage - motor.Kb * self.speed - drop) @ weights
+
+
+class _Balance(NamedTuple):
+    """The electrical equation in the measured steps of one run."""
+
+    measured: _Steps
     # current at the end less what the model has there beside its electrical equation, A
     reached: Float[np.ndarray, " steps"]
     noise: float  # of the sensors, in a residual, A
@@ -65,13 +77,7 @@ class _Steps(NamedTuple):
 
     def residuals(self, motor: _Electrical) -> Float[np.ndarray, " steps"]:
         """The residuals of the electrical equation, over the noise of the sensors."""
-        return (self.reached - self.predicted(motor)) / self.noise
-
-    def predicted(self, motor: _Electrical) -> Float[np.ndarray, " steps"]:
-        """Current at the end of the steps by the electrical equation, with voltage and speed on straight lines."""
-        decay, weights = _weights(motor, self.seconds)
-        drop = motor.drop * self.direction[:, None]
-        return decay * self.current + (self.voltage - motor.Kb * self.speed - drop) @ weights
+        return (self.reached - self.measured.predicted(motor)) / self.noise
 
 
 def _weights(motor: _Electrical, seconds: float) -> tuple[float, Float[np.ndarray, "2"]]:
@@ -96,24 +102,24 @@ def electrical_misfit(model: Model) -> float:
     if model.is_exact:
         return 1.0
     series = residuals_of(model.given, model.fit)
-    runs = [
-        steps
+    balances = [
+        balance
         for run, residual in zip(model.training, series, strict=True)
-        if (steps := _steps(model, run, residual)) is not None
+        if (balance := _balance(model, run, residual)) is not None
     ]
-    if not runs:
+    if not balances:
         return 1.0
     start = _electrical_part(model.motor)
-    guess = MIN_GUESS * start.R / start.L * min(steps.seconds for steps in runs)
+    guess = MIN_GUESS * start.R / start.L * min(b.measured.seconds for b in balances)
     largest = np.array([*3 * [MAX_LOGARITHM], np.inf])
     best = least_squares(
-        lambda by: np.concatenate([steps.residuals(start.changed(by)) for steps in runs]),
+        lambda by: np.concatenate([b.residuals(start.changed(by)) for b in balances]),
         [0.0, 0.0, np.clip(np.log(guess), 0.0, MAX_LOGARITHM / 2), 0.0],
         bounds=(-largest, largest),
         x_scale="jac",
     )
     motor = start.changed(best.x)
-    beyond = [_covariance_beyond_chance(steps.residuals(motor), steps.even_clock) for steps in runs]
+    beyond = [_covariance_beyond_chance(b.residuals(motor), b.even_clock) for b in balances]
     return float(np.sqrt(1 + max(beyond)))
 
 
@@ -131,8 +137,8 @@ def _covariance_beyond_chance(residuals: Float[np.ndarray, " samples"], even_clo
     return float(max(0.0, *np.subtract(means, chance)))
 
 
-def _steps(model: Model, run: int, residual: Series) -> _Steps | None:
-    """The steps of a run; None if they are too few, a signal was not recorded, or the current is a mean."""
+def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
+    """The measured steps of a run; None if they are too few, a signal was not recorded, or the current is a mean."""
     given, tape = model.given, model.given.problem.tape
     drive, known, residuals = tape.drive_of(run), residual.known, residual.values
     recorded = given.runs[run]
@@ -156,15 +162,14 @@ def _steps(model: Model, run: int, residual: Series) -> _Steps | None:
     is_mean = recorded.averaging == OVER_LAST
     voltage = _voltage_between_readings(model, run, len(known))[pairs]
 
-    def steps(signals: Float[np.ndarray, "samples 2"], reached: np.ndarray, noise: float) -> _Steps:
+    direction = brushes * np.sign(simulated[:-1, 0] + simulated[1:, 0])[pairs]
+
+    def steps(signals: Float[np.ndarray, "samples 2"]) -> _Steps:
         i, w = signals[:-1, 0][pairs], signals[:, 1]
         speed = np.stack([w[1:] if is_mean else w[:-1], w[1:]], 1)[pairs]
-        direction = brushes * np.sign(simulated[:-1, 0] + simulated[1:, 0])[pairs]
-        even_clock = recorded.resampled_from is None
-        return _Steps(seconds, i, speed, voltage, direction, reached, noise, even_clock)
+        return _Steps(seconds, i, speed, voltage, direction)
 
-    by_model = steps(simulated, simulated[1:, 0][pairs], 1.0)
-    reached = residuals[1:, 0][pairs] + by_model.predicted(motor)
+    reached = residuals[1:, 0][pairs] + steps(simulated).predicted(motor)
     decay, weights = _weights(motor, seconds)
     by_speed = motor.Kb * (weights.sum() if is_mean else np.hypot(*weights))
     parts = (
@@ -172,15 +177,14 @@ def _steps(model: Model, run: int, residual: Series) -> _Steps | None:
         speed_noise * by_speed,
         given.input_noise.get(recorded.name, 0.0) * weights.sum(),
     )
-    return steps(measured, reached, float(np.linalg.norm(parts)))
+    noise, even_clock = float(np.linalg.norm(parts)), recorded.resampled_from is None
+    return _Balance(steps(measured), reached, noise, even_clock)
 
 
 def _voltage_between_readings(model: Model, run: int, length: int) -> Float[np.ndarray, "steps 2"]:
     """The voltage at the start and at the end of each step between the samples of a run, of this number, V."""
     given, tape = model.given, model.given.problem.tape
-    mean = tape.samples_of(run, tape.value, length)
-    rise = np.zeros(length) if tape.rise is None else tape.samples_of(run, tape.rise, length)
-    ends = np.stack([mean - rise / 2, mean + rise / 2], 1)
+    ends = np.stack([tape.samples_of(run, tape.drive_at(end), length) for end in (0.0, 1.0)], 1)
     if (share := given.timing.reading) is not None:  # from one reading to the next two voltages act
         ends[:-1] = (1 - share) * ends[:-1] + share * ends[1:]
     return ends[:-1]

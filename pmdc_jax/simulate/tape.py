@@ -156,6 +156,10 @@ class Tape(eqx.Module):
             begins=taken.begins | is_padding,
         )
 
+    def drive_at(self, share: float) -> Samples:
+        """The drive after this share of each sample, V, A or N m."""
+        return self.value if self.rise is None else self.value + (share - 0.5) * self.rise
+
     def blocks_of(self, run: int) -> Bool[np.ndarray, " blocks"]:
         """Mask of the blocks of one run."""
         return np.asarray(self.run) == run

@@ -32,7 +32,7 @@ from .electrical_equation import (
     two_voltages,
 )
 from .reading_time import MARGIN, change_by_reading
-from .retiming import with_timing
+from .retiming import electrical_rate, with_timing
 from .speed_averaging import (
     refitted,
     seems_averaged,
@@ -101,8 +101,7 @@ class _Trials:
         """The timing of smooth voltages with the rate R / L of the motor fitted to them."""
         for _ in range(2):  # the first fit takes it for slow
             given, fit = self.fitted(timing)
-            motor = given.problem.parameters(fit.coordinates)
-            timing = timing._replace(smooth=float(motor.R / motor.L))
+            timing = timing._replace(smooth=electrical_rate(given.problem, fit))
         return timing
 
     def likelier(self, timings: Sequence[Timing], than: float) -> list[Timing]:

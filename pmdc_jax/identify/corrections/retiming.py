@@ -11,7 +11,9 @@ import numpy as np
 
 from ...recording import Recording
 from ...simulate import Tape, Timing, uniform
+from ..polish import Fit
 from ..prepare import Prepared
+from ..problem import Problem
 from .speed_averaging import without_ends
 
 
@@ -31,6 +33,12 @@ def with_timing(given: Prepared, timing: Timing) -> Prepared:
     return without_ends(acting) if timing.ahead < 0 or timing.current_mean else acting
 
 
+def electrical_rate(problem: Problem, fit: Fit) -> float:
+    """R / L of the motor fitted, 1/s."""
+    motor = problem.parameters(fit.coordinates)
+    return float(motor.R / motor.L)
+
+
 def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
     """The record of a run with its voltages, and its loads if the timing says so, moved to the samples where they act.
 
@@ -38,9 +46,8 @@ def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
     """
     if run.drive != "voltage":
         return run.recorded
-    at_samples = tape.value if tape.rise is None else tape.value - tape.rise / 2
     even = run.resampled_from is None
-    voltage = tape.samples_of(k, at_samples, len(run)) if even else run.recorded.voltage
+    voltage = tape.samples_of(k, tape.drive_at(0.0), len(run)) if even else run.recorded.voltage
     run, last = run.recorded, len(run.recorded) - 1
     rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)
     run = attrs.evolve(run, voltage=np.asarray(voltage)[rows])

@@ -23,7 +23,7 @@ from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Nuisance, Problem
-from .retiming import with_timing
+from .retiming import electrical_rate, with_timing
 
 # A step is this many times the change of the voltage in the samples beside it, and this share of the voltage's range
 MIN_STEP_RATIO, MIN_STEP_SHARE = 10.0, 0.05
@@ -101,8 +101,8 @@ def _placed(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> _Placed:
 def _refitted_smooth(given: Prepared, straight: _Placed) -> _Placed:
     """The steps at the times that fit best if the voltages are on smooth curves between them, from the fit for straight
     voltages."""
-    motor = given.problem.parameters(straight.fit.coordinates)
-    smooth = with_timing(given, SMOOTH._replace(smooth=float(motor.R / motor.L)))
+    rate = electrical_rate(given.problem, straight.fit)
+    smooth = with_timing(given, SMOOTH._replace(smooth=rate))
     steps = [
         _as_laid_out(smooth, run)._replace(share=s.share) for run, s in enumerate(straight.steps)
     ]
@@ -132,9 +132,9 @@ def _as_laid_out(given: Prepared, k: int) -> Steps:
     """The steps of a run as they are on its tape."""
     steps, timing, tape = steps_of(given.runs[k]), given.timing, given.problem.tape
     if timing.smooth is not None:  # the curve before a step goes on until it
-        assert tape.rise is not None
-        rise = tape.samples_of(k, tape.rise, len(given.runs[k]))
-        return steps._replace(height=steps.height - rise[steps.at - 1])
+        run = given.runs[k]
+        before = tape.samples_of(k, tape.drive_at(1.0), len(run))[steps.at - 1]
+        return steps._replace(height=np.asarray(run.voltage)[steps.at] - before)
     if timing.straight:  # a straight rise between two samples is a step in their middle
         return steps._replace(share=steps.share + 0.5)
     return steps
@@ -176,8 +176,7 @@ def _with_steps(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
     problem, tape = given.problem, given.problem.tape
     value = np.array(tape.value)
     rise = np.zeros_like(value) if tape.rise is None else np.array(tape.rise)
-    motor = problem.parameters(fit.coordinates)
-    most, rate = max(len(s.at) for s in steps), float(motor.R / motor.L)
+    most, rate = max(len(s.at) for s in steps), electrical_rate(problem, fit)
     responses = np.zeros((*np.shape(tape.measured), most))
     for run, s in enumerate(steps):
         mine = np.flatnonzero(tape.blocks_of(run))
