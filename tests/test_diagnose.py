@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 from benchmarks import virtual_bench as vb
 from experiments.bench import recording
 from pmdc_jax import Recording
-from pmdc_jax.diagnose import naming
+from pmdc_jax.diagnose import proposals
 from pmdc_jax.diagnose.assessment import Assessment
 from pmdc_jax.diagnose.candidates import Scales
 from pmdc_jax.diagnose.compare import Fitted
@@ -30,7 +30,9 @@ from pmdc_jax.diagnose.library import Change, Library
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
 from pmdc_jax.diagnose.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.periodic import common_line, spectrum
+from pmdc_jax.diagnose.proposals import Proposals
 from pmdc_jax.diagnose.quantisation import ROUNDING_DRAWS, rounding_errors
+from pmdc_jax.diagnose.refits import Refits
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensor_changes
 from pmdc_jax.diagnose.rows import _batches
 from pmdc_jax.diagnose.shortlist import effect_of, most_promising, shortlist
@@ -108,6 +110,20 @@ def test_candidates_are_within_the_ranges(name):
             assert r.scale == "linear" or built[field] > 0
 
 
+NOTHING_PROPOSED = dict.fromkeys(
+    (
+        "by_evidence",
+        "by_largest_gain",
+        "by_unfiltered_misfit",
+        "by_earlier_evidence",
+        "by_exchange",
+        "by_swap",
+        "in_other_forms",
+    ),
+    lambda *models: [],
+)
+
+
 class UndecidedSelection(StepwiseSelection):
     """A selection from two models, each of which fits better than the other by the filter of that."""
 
@@ -115,21 +131,20 @@ class UndecidedSelection(StepwiseSelection):
         self.base, self.one, self.other = (
             Mock(spec=Model, is_possible=True, effects=()) for _ in range(3)
         )
-        self.superseded, self.trials = set(), 0
+        self.superseded, self.equivalents, self.trials = set(), {}, 0
         self.comparison = Mock(ranked=lambda models, white: [Mock(spec=Fitted, model=models[-1])])
+        self.assess = Mock(return_value=assessment_of({"quadratic_drag": 1.0}, np.inf))
+        self.assess.return_value.p_value = 1.0
+        self.proposals = Mock(spec=Proposals, **NOTHING_PROPOSED | {"by_evidence": self._other})
 
-    def _trials(self, current, found):
+    def _other(self, current):
         self.trials += 1
         assert self.trials < 5
         return [self.other if current is self.one else self.one]
 
-    assess = staticmethod(lambda model: Mock(spec=Assessment, unexplained=np.inf, p_value=1.0))
-    _by_unfiltered_misfit = staticmethod(lambda *models: None)
-    _by_likeliest_effect = staticmethod(lambda *models: None)
     _best = staticmethod(lambda tried, white: tried[0])
     elimination = Mock(reduced=lambda model: model)
     _is_genuine_improvement = staticmethod(lambda *models: True)
-    _equivalent_swaps = staticmethod(lambda *models: [])
     _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))
 
 
@@ -142,10 +157,9 @@ def test_the_selection_does_not_return_to_a_superseded_model():
 def test_a_correction_of_a_formula_does_not_hide_an_effect_found_without_a_filter():
     """A filter may remove most of an effect; the rest then resembles a formula error of another one."""
     selection = UndecidedSelection()
-    selection._by_unfiltered_misfit = lambda current, found: selection.other
-    selection._is_genuine_improvement = lambda current, found, better: better is selection.other
-    selection._in_other_forms = lambda *models: []
-    assert selection._step(selection.base, selection.assess(selection.base)) is selection.other
+    selection.proposals.by_unfiltered_misfit = lambda current: [selection.other]
+    selection._is_genuine_improvement = lambda current, better: better is selection.other
+    assert selection._step(selection.base) is selection.other
 
 
 @pytest.mark.parametrize(
@@ -177,11 +191,13 @@ def test_a_decisive_effect_on_other_axes_is_no_model_form_error(added, misfit, i
     better = Mock(spec=Model, effects=("brush_voltage_drop", added), fit=Mock(fitness=misfit))
     selection = StepwiseSelection.__new__(StepwiseSelection)
     selection._leaves_little = lambda current, better: False
-    found = Mock(spec=Assessment, exceeds_model_form_error=lambda model: False)
-    assert selection._is_genuine_improvement(current, found, better) == is_genuine
+    selection.assess = lambda model: Mock(
+        spec=Assessment, exceeds_model_form_error=lambda model: False
+    )
+    assert selection._is_genuine_improvement(current, better) == is_genuine
     # the first effect has no other beside it, whose formula may be wrong
     current.effects = ()
-    assert not selection._is_genuine_improvement(current, found, better)
+    assert not selection._is_genuine_improvement(current, better)
 
 
 @pytest.mark.parametrize("leaves_little", [True, False])
@@ -199,16 +215,18 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
         lambda model: False,
         lambda: False,
     )
-    selection = StepwiseSelection.__new__(StepwiseSelection)
+    selection = UndecidedSelection()
     tried = Mock(spec=Model, effects=("stribeck_friction",))
-    selection.refits = Mock(with_signal=Mock(return_value=tried))
-    selection.assess = lambda model: found
-    selection._better = lambda current, found, models: models[-1] if models else None
-    selection._in_other_forms = lambda *models: []
+    refits = Mock(spec=Refits, with_signal=Mock(return_value=tried))
+    selection.proposals.by_evidence = lambda current: []
+    selection.proposals.by_largest_gain = Proposals(
+        refits, lambda model: found, set()
+    ).by_largest_gain
+    selection._better = lambda current, models: models[-1] if models else None
     selection._leaves_little = lambda current, better: leaves_little
-    better = selection._by_likeliest_effect(Mock(spec=Model, effects=()), found)
+    better = selection._step(Mock(spec=Model, effects=()))
     assert better is (tried if leaves_little else None)
-    calls = selection.refits.with_signal.call_args_list
+    calls = refits.with_signal.call_args_list
     assert [effect_of(call.args[1]) for call in calls] == list(gains)[:2]
 
 
@@ -219,26 +237,24 @@ def test_a_full_set_exchanges_the_effect_in_the_same_equation(
     """Of dry friction, a delay and an offset the first, if Stribeck friction has the largest expected gain."""
     effects = ("asymmetric_friction", "speed_sensor_delay", "current_sensor_offset")[:count]
     peak = Mock(spec=Signal, candidate=Mock(effect="stribeck_friction"), gain=1.0)
-    monkeypatch.setattr(naming, "clear_signals", lambda found: [peak])
-    selection = UndecidedSelection()
-    selection.refits = Mock(without=Mock(return_value=Mock(spec=Model)))
-    selection.refits.with_signal.return_value = Mock(spec=Model)
-    selection.assess = lambda model: Mock(
-        spec=Assessment, candidate_signals=[peak], screen=Mock(spec=Screen)
-    )
-    selection._better = lambda current, found, tried: tried[0] if tried else None
+    monkeypatch.setattr(proposals, "clear_signals", lambda found: [peak])
+    exchanged = Mock(spec=Model)
+    refits = Mock(spec=Refits, with_signal=lambda *_: exchanged)
+    refits.without.return_value = Mock(spec=Model)
     found = Mock(
         spec=Assessment,
+        candidate_signals=[peak],
         p_value=p_value,
         is_negligible=lambda model: False,
-        screen=Mock(white="white"),
+        screen=Mock(spec=Screen, white="white"),
     )
     current = Mock(spec=Model, effects=effects)
-    better = selection._by_exchange(current, found)
-    assert selection.refits.without.call_count == exchanges
+    assert Proposals(refits, lambda model: found, set()).by_exchange(current) == (
+        [exchanged] * exchanges
+    )
+    assert refits.without.call_count == exchanges
     if exchanges:
-        selection.refits.without.assert_called_with(current, "asymmetric_friction", "white")
-        assert better is selection.refits.with_signal.return_value
+        refits.without.assert_called_with(current, "asymmetric_friction", "white")
 
 
 def test_an_unstable_motor_suggests_no_experiment(x64):

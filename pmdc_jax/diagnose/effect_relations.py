@@ -6,7 +6,7 @@ from .trials import TRIALS
 
 # By richer effect, the effects that it contains and replaces
 CONTAINS = {effect: trial.contains for effect, trial in TRIALS.items() if trial.contains}
-# By simple effect, its fuller form
+# By simple effect, its fuller form, richer or refit-only (see `proposals`), which the runs must rule out
 FULLER = {effect: trial.fuller for effect, trial in TRIALS.items() if trial.fuller}
 
 
