@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .identify.identification import Identification
     from .identify.pipeline import identify
     from .motor import Motor
-    from .motor_file import load_motor, load_uncertainty, save_motor
+    from .motor_file import load_motor, load_speed_noise, load_uncertainty, save_motor
     from .paper import paper
     from .recording import Recording
     from .recording_file import read_recording, write_recording
@@ -40,6 +40,7 @@ _HOME = {
     "identify": "identify.pipeline",
     "load_controller": "control.controller_file",
     "load_motor": "motor_file",
+    "load_speed_noise": "motor_file",
     "load_uncertainty": "motor_file",
     "paper": "paper",
     "read_recording": "recording_file",
@@ -64,6 +65,7 @@ __all__ = [
     "identify",
     "load_controller",
     "load_motor",
+    "load_speed_noise",
     "load_uncertainty",
     "paper",
     "read_recording",

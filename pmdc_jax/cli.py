@@ -205,7 +205,7 @@ def tune(
     load_torque: LoadTorque = None,
     delay: Delay = 1,
     speed_step: SpeedStep = None,
-    speed_noise: SpeedNoise = 0.0,
+    speed_noise: SpeedNoise = None,
     current_sensor: CurrentSensor = True,
     spread: Spread = None,
     save: SaveController = None,
@@ -222,7 +222,7 @@ def tune(
 
     check_outputs({"--save": save, "--json": json, "--report": report}, [motor])
     from .control.tuning import tune
-    from .motor_file import load_motor, load_uncertainty
+    from .motor_file import load_motor, load_speed_noise, load_uncertainty
     from .report.terminal import print_messages, progress
 
     subject, uncertainty = load_motor(motor), load_uncertainty(motor)
@@ -240,6 +240,7 @@ def tune(
             delay=delay,
             speed_step=speed_step,
             speed_noise=speed_noise,
+            recorded_noise=load_speed_noise(motor),
             measures_current=current_sensor,
             spread=None if spread is None else spread / 100,
             uncertainty=uncertainty,

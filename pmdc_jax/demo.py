@@ -38,7 +38,7 @@ def demo(
     from .control.controller_file import save_controller
     from .control.tuning import tune
     from .diagnose import diagnose
-    from .motor_file import load_motor, load_uncertainty, save_motor
+    from .motor_file import load_motor, load_speed_noise, load_uncertainty, save_motor
     from .report.diagnosis import write_diagnosis_report
     from .report.json import diagnosis_json, write_json
     from .report.tuning import write_tuning_report
@@ -57,6 +57,7 @@ def demo(
         setpoint=200.0,
         voltage_limit=18.0,
         current_limit=20.0,
+        recorded_noise=load_speed_noise(motor),
         uncertainty=load_uncertainty(motor),
         seed=seed,
         progress=progress,

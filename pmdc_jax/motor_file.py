@@ -28,8 +28,8 @@ def save_motor(
 ) -> None:
     """Write a motor as JSON, atomically.
 
-    **Arguments**: `motor`, with scalar parameters; `identification`, whose standard errors, statuses and covariance (of
-    the coordinates: natural logarithms of positive parameters) are saved with the values.
+    **Arguments**: `motor`, with scalar parameters; `identification`, whose standard errors, statuses, covariance (of
+    the coordinates: natural logarithms of positive parameters) and noise of the sensors are saved with the values.
     """
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -49,6 +49,7 @@ def save_motor(
             "names": list(identification.covariance_names),
             "matrix": np.asarray(identification.covariance).tolist(),
         }
+        content["noise"] = dict(identification.noise)
     write_text(Path(path), json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
@@ -83,6 +84,21 @@ def load_uncertainty(path: str | Path) -> Uncertainty | None:
     return Uncertainty(names, matrix, tuple(undetermined))
 
 
+def load_speed_noise(path: str | Path) -> float | None:
+    """The white noise of the recorded speeds, rad/s, that an identification saved in a motor file; None if the file has
+    none.
+
+    **Raises**: `InputError` if it is not a number of at least 0, or the file cannot be read.
+    """
+    speed = _content(path).get("noise", {}).get("speed_rad_s")
+    if speed is None:
+        return None
+    noise = finite_number(str(path), "the noise of the speed", speed, MEND)
+    if noise < 0:
+        raise InputError(str(path), f"the noise of the speed is {noise}, negative", MEND)
+    return noise
+
+
 def _is_covariance(names: Sequence[str], matrix: np.ndarray) -> bool:
     """Whether names are unique and known, and the matrix is finite and symmetric with no negative variance."""
     known = {*PARAMETERS, *(f"{e}.{f}" for e, kind in EFFECTS.items() for f in kind.ranges)}
@@ -105,8 +121,9 @@ def _content(path: str | Path) -> dict[str, Any]:
     where, content = str(path), read_object(path, FORMAT, MEND)
     if not isinstance(content.get("parameters"), dict):
         raise InputError(where, 'has no "parameters"', MEND)
-    if not isinstance(content.get("status", {}), dict):
-        raise InputError(where, '"status" is not an object', MEND)
+    for name in ("status", "noise"):
+        if not isinstance(content.get(name, {}), dict):
+            raise InputError(where, f'"{name}" is not an object', MEND)
     return content
 
 

@@ -104,7 +104,13 @@ Delay = Annotated[
 SpeedStep = Annotated[
     float | None, typer.Option(metavar="RAD_S", help="Resolution of the speed sensor.")
 ]
-SpeedNoise = Annotated[float, typer.Option(metavar="RAD_S", help="RMS noise of the speed sensor.")]
+SpeedNoise = Annotated[
+    float | None,
+    typer.Option(
+        metavar="RAD_S",
+        help="RMS noise of the speed sensor; by default tuned against that in the motor file.",
+    ),
+]
 CurrentSensor = Annotated[bool, typer.Option(help="Whether the controller measures the current.")]
 Spread = Annotated[
     float | None,

@@ -301,6 +301,7 @@ def faked_tuning(monkeypatch):
     replace_function(monkeypatch, "pmdc_jax.control.tuning", "tune", tune)
     replace_function(monkeypatch, "pmdc_jax.motor_file", "load_motor", lambda path: "motor")
     replace_function(monkeypatch, "pmdc_jax.motor_file", "load_uncertainty", lambda path: "spread")
+    replace_function(monkeypatch, "pmdc_jax.motor_file", "load_speed_noise", lambda path: "noise")
     replace_function(monkeypatch, "pmdc_jax.control.controller_file", "save_controller", write)
     report = "pmdc_jax.report.tuning"
     replace_function(monkeypatch, report, "write_tuning_report", lambda tuning, path: write(path))
@@ -315,6 +316,7 @@ def test_demo_writes_into_its_folder(faked, faked_tuning, capsys, tmp_path):
     assert names == reports
     motor, controller, options = faked_tuning.tune
     assert (motor, controller, options["uncertainty"]) == ("motor", "pid", "spread")
+    assert options["recorded_noise"] == "noise"
     recordings, options = faked.identify
     assert [path.stem for path in recordings] == ["staircase", "prbs", "triangle", "loaded"]
     assert [path.stem for path in options["holdout"]] == ["drive"]

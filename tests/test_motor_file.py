@@ -11,7 +11,7 @@ from linear_motor import PAPER
 from pmdc_jax import InputError, load_motor, save_motor
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.motor_file import load_uncertainty
+from pmdc_jax.motor_file import load_speed_noise, load_uncertainty
 
 VALID = {
     "parameters": PAPER,
@@ -188,4 +188,24 @@ def test_an_invalid_covariance_is_refused(tmp_path, covariance):
     path.write_text(json.dumps(VALID | {"covariance": covariance}))
     with pytest.raises(InputError, match="covariance") as refusal:
         load_uncertainty(path)
+    assert str(path) in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("noise", "read"), [({}, None), ({"speed_rad_s": None}, None), ({"speed_rad_s": 0.3}, 0.3)]
+)
+def test_the_noise_of_the_speed_is_read(tmp_path, noise, read):
+    path = tmp_path / "motor.json"
+    path.write_text(json.dumps(VALID))
+    assert load_speed_noise(path) is None
+    path.write_text(json.dumps(VALID | {"noise": noise}))
+    assert load_speed_noise(path) == read
+
+
+@pytest.mark.parametrize("noise", [0.3, "low", {"speed_rad_s": -1.0}, {"speed_rad_s": "low"}])
+def test_an_invalid_noise_is_refused(tmp_path, noise):
+    path = tmp_path / "motor.json"
+    path.write_text(json.dumps(VALID | {"noise": noise}))
+    with pytest.raises(InputError, match="noise") as refusal:
+        load_speed_noise(path)
     assert str(path) in str(refusal.value)

@@ -49,6 +49,19 @@ def test_the_tuned_loop_settles_nearly_as_fast_as_possible():
 
 
 @pytest.mark.slow
+def test_gains_are_tuned_against_the_noise_of_the_recordings():
+    """At half a per cent of noise the voltage becomes several times quieter, and the step hardly slower."""
+    limits = {"setpoint": 481.0, "voltage_limit": 30.0, "current_limit": 150.0, "starts": 16}
+    silent, noisy = (tune(MOTOR, "pid", **limits, recorded_noise=noise) for noise in (None, 2.4))
+    assert noisy.margins.voltage_per_noise < silent.margins.voltage_per_noise / 2
+    assert noisy.metrics["SettlingTime"] < 1.1 * silent.metrics["SettlingTime"]
+    assert silent.voltage_noise == 0
+    # what the metrics are of is the motor, not the sensor
+    assert not np.any(np.asarray(noisy.task.noise))
+    assert any("2.40 rad/s of the speed sensor, as in the recordings" in s for s in summary(noisy))
+
+
+@pytest.mark.slow
 def test_the_tuned_loop_is_robust_over_drawn_motors():
     ours, textbook = example().candidates
     assert ours.robust.samples == 256

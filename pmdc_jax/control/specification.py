@@ -54,7 +54,8 @@ class LoopRequirements:
     load_torque: float | None = None
     delay: int = 1
     speed_step: float | None = None
-    speed_noise: float = 0.0
+    speed_noise: float | None = None
+    recorded_noise: float | None = None
     measures_current: bool = True
     spread: float | None = None
     max_sensitivity: float | None = MAX_SENSITIVITY
@@ -69,11 +70,17 @@ class LoopRequirements:
             raise InputError("--delay", message, "Choose 0 or 1")
         _check_number("setpoint", self.setpoint, "a nonzero speed", lambda x: x != 0)
         _check_number("load_torque", self.load_torque, "a number", lambda x: True)
-        for name in ("max_overshoot", "speed_noise", "spread"):
+        for name in ("max_overshoot", "speed_noise", "recorded_noise", "spread"):
             _check_number(name, getattr(self, name), "a number of at least 0", lambda x: x >= 0)
         for name in ("voltage_limit", "current_limit", "sample_time", "max_settling", "speed_step"):
             _check_number(name, getattr(self, name), "a positive number", lambda x: x > 0)
         _check_number("max_sensitivity", self.max_sensitivity, "a positive number", lambda x: x > 0)
+
+    @property
+    def sensor_noise(self) -> float:
+        """Noise of the speed sensor, rad/s: as stated, else as recorded, else none."""
+        stated = self.recorded_noise if self.speed_noise is None else self.speed_noise
+        return stated or 0.0
 
     @property
     def allowed_overshoot(self) -> float:

@@ -108,6 +108,12 @@ class Tuning:
         return float(np.abs(self.response.current).max())
 
     @property
+    def voltage_noise(self) -> float | None:
+        """RMS of the voltage due to the noise of the speed sensor, V; None where the loop is unstable."""
+        gain = self.margins.voltage_per_noise
+        return None if gain is None else gain * self.requirements.sensor_noise
+
+    @property
     def controller(self) -> AbstractController:
         """The controller with its gains."""
         return self.law.controller
@@ -140,7 +146,8 @@ def tune(
     load_torque: float | None = None,
     delay: int = 1,
     speed_step: float | None = None,
-    speed_noise: float = 0.0,
+    speed_noise: float | None = None,
+    recorded_noise: float | None = None,
     measures_current: bool = True,
     uncertainty: Uncertainty | None = None,
     spread: float | None = None,
@@ -161,10 +168,11 @@ def tune(
     fortieth of the motor's transients; `max_overshoot`, %; `max_settling`, s; `load_torque`, N m, a load step to
     withstand, by default half of the torque that can still be held at the set point; `delay`, 0 or 1 samples from
     measurement to voltage; `speed_step`, rad/s, quantum of the speed sensor; `speed_noise`, rad/s, its standard
-    deviation; `measures_current`, if False the law estimates the current; `uncertainty` of the motor, from its file, or
-    `spread`, standard deviation of the logarithm of each parameter: with either, the worst tenth of the nominal and 32
-    drawn motors makes half of the cost, and 256 others validate the result; `max_sensitivity`, limit of the peak
-    sensitivity, None for no limit; `starts`, number of descents; `seed`; `progress`.
+    deviation, which the metrics include, or `recorded_noise`, from the motor's file, which they do not: gains are tuned
+    against either; `measures_current`, if False the law estimates the current; `uncertainty` of the motor, from its
+    file, or `spread`, standard deviation of the logarithm of each parameter: with either, the worst tenth of the
+    nominal and 32 drawn motors makes half of the cost, and 256 others validate the result; `max_sensitivity`, limit of
+    the peak sensitivity, None for no limit; `starts`, number of descents; `seed`; `progress`.
 
     **Raises**: `InputError`, stating the limit, for a specification that no controller can meet.
     """
@@ -181,6 +189,7 @@ def tune(
         delay=delay,
         speed_step=speed_step,
         speed_noise=speed_noise,
+        recorded_noise=recorded_noise,
         measures_current=measures_current,
         spread=spread,
         max_sensitivity=max_sensitivity,
@@ -228,7 +237,7 @@ def _task(specification: Specification, motor: Motor, unit_noise: np.ndarray) ->
         max_sensitivity=None
         if requirements.max_sensitivity is None
         else jnp.asarray(requirements.max_sensitivity),
-        noise=jnp.asarray(requirements.speed_noise * unit_noise),
+        noise=jnp.asarray((requirements.speed_noise or 0.0) * unit_noise),
         part_samples=specification.part_samples,
         substeps=int(steps_within(motor, specification.sample_time, jnp.asarray(max_current))),
     )
@@ -269,7 +278,7 @@ def _best_controller(
         motor=nominal,
         setpoint=task.setpoint,
     )
-    speed_noise = max(requirements.speed_noise, TUNING_NOISE * abs(specification.setpoint))
+    speed_noise = max(requirements.sensor_noise, TUNING_NOISE * abs(specification.setpoint))
     tuning_task = eqx.tree_at(lambda t: t.noise, task, jnp.asarray(speed_noise * unit_noise))
     coordinates = best_coordinates(tuning_task, space, motors, seed, starts)
     return space.controller(jnp.asarray(coordinates))

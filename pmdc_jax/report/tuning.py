@@ -46,6 +46,10 @@ def tuning_json(tuning: Tuning) -> dict[str, Any]:
         },
         "small_step": {"to_rad_s": SMALL_STEP * tuning.setpoint, **tuning.candidates[0].small_step},
         "margins": asdict(tuning.margins),
+        "noise": {
+            "speed_rad_s": tuning.requirements.sensor_noise,
+            "voltage_V": tuning.voltage_noise,
+        },
         "peak_current_A": tuning.peak_current,
         "meets_specification": tuning.meets_specification,
         "candidates": [_candidate_json(one) for one in tuning.candidates],
@@ -82,6 +86,7 @@ def summary(tuning: Tuning) -> list[str]:
         _load_sentence(tuning),
         _robust_sentence(tuning.robust),
         _margin_sentence(tuning),
+        _noise_sentence(tuning),
     )
     return [one for one in sentences if one]
 
@@ -147,6 +152,17 @@ def _margin_sentence(tuning: Tuning) -> str:
     if found.delay_margin_s is not None:
         parts.append(f"delay margin {_time_text(found.delay_margin_s)}")
     return f"Margins: {', '.join(parts)}." if parts else ""
+
+
+def _noise_sentence(tuning: Tuning) -> str:
+    noise, voltage = tuning.requirements.sensor_noise, tuning.voltage_noise
+    if not noise or voltage is None:
+        return ""
+    source = "" if tuning.requirements.speed_noise else ", as in the recordings,"
+    return (
+        f"Noise of {significant(noise)} rad/s of the speed sensor{source} moves the voltage by"
+        f" {significant(voltage, 2)} V RMS."
+    )
 
 
 def _time_text(seconds: float | None) -> str:
