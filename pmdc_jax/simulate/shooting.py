@@ -12,23 +12,19 @@ doi:10.1007/BF02238534 (its use for parallel time integration).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..compiled import compiled
-from ..effects.base import State
 from ..motor import Motor
-from .propagator import Propagator, grid_propagators, pick_grid, steps_in_sample
-from .sensing import outputs, reported, reports_of
-from .solver import Carry, Input, StepSolver, held_step_and_mean, take_steps
-from .tape import BLOCK, Tape
-
-T = TypeVar("T")
+from .blocks import MotorOnGrids, Pass, Start, Starts, pack, simulate_blocks, value_and_derivatives
+from .propagator import grid_propagators
+from .sensing import reported
+from .tape import Tape
 
 # Relative gap between blocks below which no further pass follows. The last pass still corrects the gap to first order,
 # so the remaining error is about the square of this.
@@ -37,20 +33,6 @@ MAX_RELATIVE_GAP = 1e-4
 # Passes after which a fit gives up on a motor. Where teeth rattle in their play, the end of a block depends chaotically
 # on its start: joining takes as many passes as a run has blocks, and the derivatives are of no use.
 MAX_PASSES = 32
-
-Starts = Float[Array, "blocks states"]
-Start = Float[Array, " states"]  # of one block
-# A motor, and its propagators on the grids of a tape; or their derivatives, with the columns as first axis
-MotorOnGrids = tuple[Motor, Propagator]
-
-
-class Pass(NamedTuple):
-    """All blocks simulated once from given starts. Columns of the derivatives: parameters, load offset, start."""
-
-    seen: Float[Array, "samples outputs blocks"]
-    d_seen: Float[Array, "samples columns outputs blocks"]
-    end: Starts
-    d_end: Float[Array, "columns blocks states"]
 
 
 class RunUnknowns(NamedTuple):
@@ -111,12 +93,12 @@ def sensitivities(
         motor = assemble(parameters)
         return motor, grid_propagators(motor, tape)
 
-    prepared, d_prepared = _value_and_derivatives(prepare, (parameters,), (jnp.eye(count),))
+    prepared, d_prepared = value_and_derivatives(prepare, (parameters,), (jnp.eye(count),))
     motor = prepared[0]
     d_motor = jax.tree.map(lambda leaf: _pad_columns(leaf, all_columns), d_prepared[0])
     ones = jnp.eye(UNKNOWNS_PER_RUN, all_columns, count)[:, :, None]
     d_own = RunUnknowns(*(jnp.broadcast_to(one, (all_columns, tape.runs)) for one in ones))
-    initial, d_initial = _value_and_derivatives(
+    initial, d_initial = value_and_derivatives(
         lambda motor, own: _initial_states(motor, own, tape), (motor, own), (d_motor, d_own)
     )
     states = initial.shape[1]
@@ -125,7 +107,7 @@ def sensitivities(
 
     # joining takes several passes, with the columns of the start only; one more pass at the joined starts has all
     starts = _join_blocks(prepared, tape, own, initial, MAX_PASSES).joined
-    passed = _simulate_blocks(prepared, d_prepared, columns, tape, starts, own.load_offset)
+    passed = simulate_blocks(prepared, d_prepared, columns, tape, starts, own.load_offset)
     joined, d_starts = _newton_correction_with_derivatives(
         passed, tape, starts, initial, d_initial, count
     )
@@ -137,21 +119,12 @@ def sensitivities(
     d_seen = (direct + through).transpose(2, 1, 0, 3)
     if motor.speed_delay() is None and tape.averaging is None:
         return seen.transpose(2, 1, 0), d_seen
-    seen, d_seen = _value_and_derivatives(
+    seen, d_seen = value_and_derivatives(
         lambda motor, seen: reported(motor, tape, seen),
         (motor, seen.transpose(2, 1, 0)),
         (d_motor, jnp.moveaxis(d_seen, -1, 0)),
     )
     return seen, jnp.moveaxis(d_seen, 0, -1)
-
-
-def _value_and_derivatives(
-    function: Callable[..., T], primals: tuple[Any, ...], tangents: tuple[Any, ...]
-) -> tuple[T, T]:
-    """A function's value, and its derivative along every column of the tangents."""
-    return jax.vmap(lambda *tangent: jax.jvp(function, primals, tangent), out_axes=(None, 0))(
-        *tangents
-    )
 
 
 def _in_all_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "... columns"]:
@@ -170,7 +143,7 @@ def _initial_states(motor: Motor, own: RunUnknowns, tape: Tape) -> Starts:
         for e in motor.effects
         if e.spring_state
     }
-    return _pack(state._replace(extra=state.extra | twisted)).T[tape.run]
+    return pack(state._replace(extra=state.extra | twisted)).T[tape.run]
 
 
 def _guessed_starts(motor: Motor, own: RunUnknowns, tape: Tape, initial: Starts) -> Starts:
@@ -185,7 +158,7 @@ def _guessed_starts(motor: Motor, own: RunUnknowns, tape: Tape, initial: Starts)
     first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
     angle = own.angle[tape.run] + before[:-1] - before[first]
     load = jnp.asarray(tape.load)[:, 0] + own.load_offset[tape.run]
-    guess = _pack(motor.initial_state(current, speed, load, angle)).T
+    guess = pack(motor.initial_state(current, speed, load, angle)).T
     return jnp.where(jnp.asarray(tape.begins)[:, None], initial, guess)
 
 
@@ -220,7 +193,7 @@ def _join_blocks(
     allowed = 1 if exact else min(max_passes or len(guess) + 1, len(guess) + 1)
 
     def simulate(starts: Starts) -> Pass:
-        return _simulate_blocks(prepared, no_derivatives, states, tape, starts, own.load_offset)
+        return simulate_blocks(prepared, no_derivatives, states, tape, starts, own.load_offset)
 
     def unjoined(joining: Joining) -> Bool[Array, ""]:
         return (joining.gap > MAX_RELATIVE_GAP) & (joining.passes < allowed)
@@ -241,83 +214,6 @@ def _join_blocks(
     if max_passes is None or exact:
         return end
     return end._replace(joined=jnp.where(end.gap > MAX_RELATIVE_GAP, jnp.nan, end.joined))
-
-
-@eqx.filter_jit  # one trace serves `_join_blocks` and other callers with as many columns
-def _simulate_blocks(
-    prepared: MotorOnGrids,
-    d_prepared: MotorOnGrids,
-    columns: int,
-    tape: Tape,
-    starts: Starts,
-    load_offset: Float[Array, " runs"],
-) -> Pass:
-    """Simulate every block from its start, with derivatives, whose last columns are with respect to the start."""
-    motor, grids = prepared
-    d_motor, d_grids = d_prepared
-    # if there is one grid only, all blocks share its matrices: a copy for each would be read at every step
-    grid = tape.grid if tape.sample_time.shape[0] > 1 else jnp.zeros(1, int)
-    propagator, drive = pick_grid(grids, tape, grid)
-    propagator = _blocks_last(propagator, 0)
-    d_propagator = _blocks_last(jax.tree.map(lambda leaf: leaf[:, grid], d_grids), 1)
-    states, steps = starts.shape[1], steps_in_sample(motor, tape)
-    offset = load_offset[tape.run]
-    d_load = jnp.zeros(columns)
-    if columns > states:
-        d_load = d_load.at[-1 - states].set(1.0)
-    d_load = jnp.broadcast_to(d_load[:, None], (columns, len(starts)))
-    value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T + offset
-    turn = jnp.asarray(tape.turn).T
-    rise = None if tape.rise is None else jnp.asarray(tape.rise).T
-
-    def advance(carry: Carry, k: Int[Array, ""]) -> Carry:
-        state, d_state = carry.state
-        rises = None if rise is None else rise[k]
-
-        def observe_and_step(
-            motor: Motor, propagator: Propagator, state: State, load: Float[Array, " blocks"]
-        ) -> tuple[State, Float[Array, "outputs blocks"]]:
-            acting = Input(drive, value[k], load, rises)
-            after, mean = held_step_and_mean(motor, propagator, acting, state, steps)
-            seen = outputs(motor, propagator, acting, state, steps, mean)
-            return _turned(state, after, turn[k]), seen
-
-        (state, seen), (d_state, d_seen) = _value_and_derivatives(
-            observe_and_step,
-            (motor, propagator, state, load[k]),
-            (d_motor, d_propagator, d_state, d_load),
-        )
-        return Carry((state, d_state), (seen, d_seen))
-
-    state = _unpack(motor, starts.T)
-    identity = (
-        jnp.zeros((columns, states, len(starts)))
-        .at[columns - states :]
-        .set(jnp.eye(states)[:, :, None])
-    )
-    d_state = jax.vmap(lambda column: _unpack(motor, column))(identity)
-    reports = reports_of(propagator)
-    seen = (jnp.zeros((reports, len(starts))), jnp.zeros((columns, reports, len(starts))))
-    saveat = diffrax.SaveAt(
-        subs=[
-            diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: y.output),
-            diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: y.state),
-        ]
-    )
-    (seen, d_seen), (end, d_end) = take_steps(
-        StepSolver(advance), Carry((state, d_state), seen), BLOCK, saveat
-    )
-    end, d_end = jax.tree.map(lambda leaf: leaf[0], (end, d_end))
-    return Pass(seen, d_seen, _pack(end).T, jax.vmap(_pack)(d_end).swapaxes(1, 2))
-
-
-def _turned(before: State, after: State, turn: Float[Array, " blocks"]) -> State:
-    """The state after a sample, with the rotor turned by the measured angle `turn` where it is not NaN."""
-    if "angle" not in after.extra:
-        return after
-    followed = before.extra["angle"] + jnp.nan_to_num(turn)
-    angle = jnp.where(jnp.isnan(turn), after.extra["angle"], followed)
-    return after._replace(extra={**after.extra, "angle": angle})
 
 
 def _newton_correction(
@@ -401,19 +297,5 @@ def _newton_correction_with_derivatives(
     return jax.lax.scan(follow, nothing, blocks)[1]
 
 
-def _blocks_last(propagator: Propagator, axis: int) -> Propagator:
-    # as the batch axis, which comes after the two axes of the matrices
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), propagator)
-
-
 def _pad_columns(leaf: Float[Array, "parameters ..."], columns: int) -> Float[Array, "columns ..."]:
     return jnp.pad(leaf, [(0, columns - leaf.shape[0])] + [(0, 0)] * (leaf.ndim - 1))
-
-
-def _pack(state: State) -> Float[Array, "states ..."]:
-    extra = [state.extra[name] for name in sorted(state.extra)]
-    return jnp.stack([state.current, state.speed, *extra])
-
-
-def _unpack(motor: Motor, packed: Float[Array, "states ..."]) -> State:
-    return State(packed[0], packed[1], dict(zip(motor.states, packed[2:], strict=True)))
