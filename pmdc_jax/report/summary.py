@@ -69,7 +69,7 @@ def cautions(identification: Identification) -> list[str]:
         sentences.append(f"{who} at the bound of the search range: a limit, not an estimate.")
     sentences.append(_unequal_constants_sentence(identification.parameters))
     if not identification.converged:
-        sentences.append(_unconverged_sentence(identification.distance))
+        sentences.append(_unconverged_sentence(identification))
     return [sentence for sentence in sentences if sentence]
 
 
@@ -91,12 +91,16 @@ def _unequal_constants_sentence(parameters: Mapping[str, Estimate]) -> str:
     )
 
 
-def _unconverged_sentence(distance: float) -> str:
+def _unconverged_sentence(identification: Identification) -> str:
+    distance = identification.distance
     if distance > MAX_STALLED_DISTANCE:
         return "The refinement did not converge: treat all results with care, or try another seed."
+    reason = ""
+    if identification.motor.switches:
+        reason = ", as it may where dry friction sticks and slips or teeth part"
     return (
-        f"The refinement stalled up to {distance:.2g} standard errors from the best fit, as it may where dry friction"
-        " sticks and slips: the intervals may be too narrow by as much."
+        f"The refinement stalled up to {distance:.2g} standard errors from the best fit{reason}: the intervals may be"
+        " too narrow by as much."
     )
 
 
