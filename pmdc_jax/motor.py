@@ -87,6 +87,11 @@ class Motor(eqx.Module):
         return numerators, jnp.stack([L * J, R * J + L * f, R * f + Kt * Kb])
 
     @property
+    def transient_time(self) -> Scalars:
+        """The electrical and the electromechanical time constant together, s: L / R + J R / (Kt Kb)."""
+        return self.L / self.R + self.J * self.R / (self.Kt * self.Kb)
+
+    @property
     def states(self) -> tuple[str, ...]:
         """Names of the states that the effects add."""
         return tuple(sorted({name for effect in self.effects for name in effect.states}))

@@ -136,9 +136,7 @@ class LoopRequirements:
     def _sampling(self, motor: Motor, fastest: float) -> tuple[float, list[str]]:
         """Sample time (s) for a fastest settling of `fastest` (s), and a note if it is a default or rather long."""
         # a tiny step may be over within a fraction of the motor's own time constants
-        transient = max(
-            fastest, float(motor.L / motor.R + motor.J * motor.R / (motor.Kt * motor.Kb))
-        )
+        transient = max(fastest, float(motor.transient_time))
         suitable = min(MAX_DEFAULT_SAMPLE_TIME, _rounded_down(transient / SAMPLES_PER_SETTLING))
         if self.sample_time is None:
             return suitable, [f"no sample time given: using {suitable:g} s"]

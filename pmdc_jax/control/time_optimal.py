@@ -63,7 +63,7 @@ def fastest_settling(
     **Source**: Pontryagin et al., "The Mathematical Theory of Optimal Processes" (1962), section 5.
     """
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
-    duration = 10 * float(motor.L / motor.R + motor.J * motor.R / (motor.Kt * motor.Kb))
+    duration = 10 * float(motor.transient_time)
     bounds = jax.tree.map(
         jnp.asarray, (setpoint, voltage_limit, current_limit, float(initial), float(load))
     )

@@ -19,7 +19,7 @@ MODEL_ASSUMPTION = (
     "The standard errors assume that the model lacks no effect: `pmdc diagnose` tests that."
 )
 # an RMS residual up to this multiple of the noise counts as noise: the RMS of few samples scatters as much
-MAX_NOISE_RATIO = 1.25
+MAX_RMSE_TO_NOISE = 1.25
 # Kt / Kb, and its inverse, of a motor at most: iron loss and brushes make them differ by some percent
 MAX_CONSTANT_RATIO = 1.5
 # A refinement that stalls within so many standard errors of the best fit has found it all the same
@@ -165,7 +165,7 @@ def _holdout_sentence(identification: Identification) -> str:
     excess = [
         f"the {one.quantity} error is {one.rmse / one.noise:.1f} times the measurement noise"
         for one in channels
-        if one.noise and one.rmse > MAX_NOISE_RATIO * one.noise
+        if one.noise and one.rmse > MAX_RMSE_TO_NOISE * one.noise
     ]
     sentence = f"{who} is reproduced in free-run simulation with {enumerate_words(reproduced)}"
     if not any(one.noise for one in channels):
