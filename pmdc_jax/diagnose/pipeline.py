@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import attrs
 
 from ..compiled import free_memory_maps
-from ..identify.corrections.input_timing import (
-    negative_log_likelihood_within,
-    only_current_is_late,
-    other_timings,
-)
 from ..identify.identification import Identification
-from ..identify.prepare import Prepared, prepare
+from ..identify.prepare import prepare
 from ..identify.results import results_of
-from ..identify.solve import Solved, solve
+from ..identify.solve import Solved
 from ..precision import double_precision
 from ..progress import ReportProgress, silent
 from ..recording_file import Runs
-from ..simulate import HELD, Timing
 from .assessment import FALSE_ALARM
+from .attempts import Attempt, likeliest_attempt
 from .balance import electrical_misfit
 from .description import (
     detectable_effects,
@@ -35,8 +29,7 @@ from .diagnosis import Diagnosis
 from .experiment import next_experiment
 from .gap import closed_fraction, gaps_by_role, gaps_of_runs
 from .judgement import implausible_effect, judge, unneeded_effect
-from .model import model_of
-from .naming import Naming, StepwiseSelection
+from .naming import Naming
 
 
 @double_precision
@@ -65,7 +58,7 @@ def diagnose(
     free_memory_maps()
     report("checking the recordings")
     prepared = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
-    found = _likeliest_attempt(prepared, search, seed, report)
+    found = likeliest_attempt(prepared, search, seed, report)
     given, naming_ended = found.given, time.perf_counter()
     report("estimating the uncertainty", found.naming.chosen.fit.fitness)
     base = results_of(given, found.solved)
@@ -108,46 +101,8 @@ def diagnose(
     )
 
 
-class _Attempt(NamedTuple):
-    """Effects named for one timing of the voltages."""
-
-    given: Prepared
-    solved: Solved
-    selection: StepwiseSelection
-    naming: Naming
-    identifying: float  # s that the identification of the motor without effects took
-
-
-def _likeliest_attempt(
-    prepared: Prepared, search: str, seed: int, report: ReportProgress
-) -> _Attempt:
-    """The effects named. If these reveal another timing of the voltages, which a fit without them could not tell: those
-    named with that timing, if they make the runs likelier; or, if the current alone was late, with held voltages."""
-
-    def attempt(timing: Timing | None = None) -> _Attempt:
-        began = time.perf_counter()
-        given, solved = solve(prepared, search, seed, report, timing)
-        identifying = time.perf_counter() - began
-        report("gathering evidence", solved.fit.fitness)
-        selection = StepwiseSelection(model_of((), given, solved.fit), solved, report)
-        return _Attempt(given, solved, selection, selection.name(), identifying)
-
-    def negative_log_likelihood(attempt: _Attempt) -> float:
-        chosen = attempt.naming.chosen
-        return negative_log_likelihood_within(chosen.given, chosen.fit)
-
-    first = attempt()
-    chosen = first.naming.chosen
-    if not chosen.effects:
-        return first
-    if first.given.timing != HELD:
-        return attempt(HELD) if only_current_is_late(chosen.given, chosen.fit) else first
-    others = other_timings(chosen.given, chosen.fit)
-    return min(first, *map(attempt, others[:1]), key=negative_log_likelihood) if others else first
-
-
 def _without_unneeded_effects(
-    found: _Attempt, base: Identification
+    found: Attempt, base: Identification
 ) -> tuple[Naming, Identification]:
     """The naming without effects that are implausible or that the runs do not need, and the motor it identifies; `base`
     is the motor without effects."""

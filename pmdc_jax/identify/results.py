@@ -98,7 +98,8 @@ def _intervals(
             return coordinates[k] - reach * spread, coordinates[k] + reach * spread
         return profile_interval(problem, best.unknowns, k, spread, info.inflation[k], reach)
 
-    identified = [k for k in range(len(coordinates)) if _status(k, best, info) == "identified"]
+    places = range(len(coordinates))
+    identified = [k for k in places if _status(k, problem.parameters, best, info) == "identified"]
     return dict(zip(identified, map_in_threads(interval, identified), strict=True))
 
 
@@ -200,7 +201,7 @@ def _estimates(
             estimates[name] = Estimate(value, 0.0, (value, value), unit, "known")
             continue
         k = parameters.names.index(source)
-        status = _status(k, best, info)
+        status = _status(k, parameters, best, info)
         if status != "identified":
             estimates[name] = Estimate(value, None, None, unit, status)
             continue
@@ -215,10 +216,15 @@ def _estimates(
     return estimates
 
 
-def _status(k: int, best: Optimum, info: Information) -> Status:
+def _status(k: int, parameters: Parameters, best: Optimum, info: Information) -> Status:
     if k in best.at_bound:
         return "at_bound"
-    if info.unseen_share[k] > MIN_SHARE or np.sqrt(info.covariance[k, k]) > MIN_UNSEEN_STDERR:
+    variance, unseen_variance = info.covariance[k, k], info.unseen_variance[k]
+    if info.unseen_share[k] > MIN_SHARE or np.sqrt(variance) > MIN_UNSEEN_STDERR:
+        return "not_identifiable"
+    # a torque of either sign whose scale is unseen: in its unit it is too small to make up much of a direction
+    size = 0.0 if parameters.logarithmic[k] else abs(float(best.unknowns.coordinates[k]))
+    if size and np.sqrt(unseen_variance) > max(MIN_UNSEEN_STDERR * size, np.sqrt(variance / 2)):
         return "not_identifiable"
     return "identified"
 

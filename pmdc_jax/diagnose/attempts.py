@@ -1,0 +1,86 @@
+"""Effects named for the likeliest timing of the voltages: which that is, a fit without the effects may not tell."""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+from ..effects import EFFECTS
+from ..identify.corrections.input_timing import (
+    negative_log_likelihood_within,
+    only_current_is_late,
+    other_timings,
+)
+from ..identify.likelihood import MIN_LOG_LIKELIHOOD_GAIN
+from ..identify.prepare import Prepared
+from ..identify.solve import Solved, polish_with_angle, solve
+from ..progress import ReportProgress
+from ..simulate import HELD, Timing
+from .model import Model, model_of
+from .naming import Naming, StepwiseSelection
+
+# Difference of two leads, in samples, below which they are the same
+SAME_LEAD = 0.05
+
+
+class Attempt(NamedTuple):
+    """Effects named for one timing of the voltages."""
+
+    given: Prepared
+    solved: Solved
+    selection: StepwiseSelection
+    naming: Naming
+    identifying: float  # s that the identification of the motor without effects took
+
+
+def likeliest_attempt(
+    prepared: Prepared, search: str, seed: int, report: ReportProgress
+) -> Attempt:
+    """The effects named, and then once more if these reveal another timing of the voltages: the likelier ones of both,
+    or those with held voltages if nothing speaks against these any more."""
+
+    def identified(timing: Timing | None) -> tuple[Prepared, Solved]:
+        return solve(prepared, search, seed, report, timing)
+
+    def attempt(timing: Timing | None = None) -> Attempt:
+        began = time.perf_counter()
+        given, solved = identified(timing)
+        identifying = time.perf_counter() - began
+        report("gathering evidence", solved.fit.fitness)
+        selection = StepwiseSelection(model_of((), given, solved.fit), solved, report)
+        return Attempt(given, solved, selection, selection.name(), identifying)
+
+    first = attempt()
+    chosen, timing = first.naming.chosen, first.given.timing
+    if not chosen.effects:
+        return first
+    if timing != HELD and only_current_is_late(chosen.given, chosen.fit):
+        return attempt(HELD)
+    held = chosen if timing == HELD else _with_effects_of(chosen, *identified(HELD))
+    if timing != HELD and not _is_likelier(chosen, held):
+        return attempt(HELD)
+    others = [t for t in other_timings(held.given, held.fit)[:1] if not _are_alike(t, timing)]
+    return min(first, *map(attempt, others), key=_negative_log_likelihood) if others else first
+
+
+def _with_effects_of(model: Model, given: Prepared, solved: Solved) -> Model:
+    """The effects of a model fitted to runs with another timing."""
+    given = given.with_effects([EFFECTS[effect] for effect in model.effects])
+    return model_of(model.effects, *polish_with_angle(given, model.fit.optimum))
+
+
+def _is_likelier(model: Model, than: Model) -> bool:
+    gain = negative_log_likelihood_within(than.given, than.fit)
+    gain -= negative_log_likelihood_within(model.given, model.fit)
+    return gain > MIN_LOG_LIKELIHOOD_GAIN
+
+
+def _negative_log_likelihood(attempt: Attempt) -> float:
+    chosen = attempt.naming.chosen
+    return negative_log_likelihood_within(chosen.given, chosen.fit)
+
+
+def _are_alike(one: Timing, other: Timing) -> bool:
+    """Whether two timings are the same kind, and nearly the same."""
+    kinds = [(t.straight, t.smooth is None, t.current_mean) for t in (one, other)]
+    return kinds[0] == kinds[1] and abs(one.lead - other.lead) < SAME_LEAD
