@@ -8,6 +8,8 @@ from linear_motor import PAPER
 from scipy.signal import cont2discrete, dlsim, lfilter
 
 from benchmarks import virtual_bench as vb
+from benchmarks.naming.cases import Bench, record
+from benchmarks.naming.plant import Plant
 from experiments.bench import recording
 from pmdc_jax.diagnose.balance import electrical_misfit
 from pmdc_jax.diagnose.diagnosis import MAX_ELECTRICAL
@@ -82,3 +84,27 @@ def test_a_hidden_shaft_causes_no_electrical_misfit():
     model = model_of((), given, solved.fit)
     assert abs(model.motor.R / PAPER["R"] - 1) > 0.05
     assert electrical_misfit(model) < 1.1
+
+
+@pytest.mark.usefixtures("x64")
+def test_brushes_whose_drop_sets_in_gradually_cause_no_electrical_misfit():
+    """With only a drop of constant size it would be 1.6."""
+    small = {"R": 1.2, "L": 1.5e-3, "Kb": 0.022, "Kt": 0.022, "J": 8.4e-6, "f": 6e-6}
+    plant, rng, runs = (
+        Plant(**small, brush_V=0.85, brush_onset_A=0.12),
+        np.random.default_rng(3),
+        [],
+    )
+    for name in ("first", "second"):
+        steps = np.repeat(rng.uniform(-10, 10, 50), 40)
+        excitation = vb.Excitation(1e-3 * np.arange(2000), steps, np.zeros(2000))
+        columns = record(plant, excitation, rng, vb.Noise(0.009, 0.5), Bench({}))
+        runs.append(recording(name, columns))
+
+    def misfit(*effects: str) -> float:
+        given = prepare(runs, (), unloaded=True, effects=[EFFECTS[e] for e in effects])
+        given, solved = solve(given, "cma_es", 0)
+        return electrical_misfit(model_of(effects, given, solved.fit))
+
+    assert misfit() > MAX_ELECTRICAL
+    assert misfit("brush_voltage_drop") < 1.2

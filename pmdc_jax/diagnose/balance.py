@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from ..identify.corrections.electrical_equation import MIN_FLOW
 from ..identify.generalised_least_squares import residuals_of, series_of
-from ..identify.noise import noise_of_sensor, white_noise
+from ..identify.noise import noise_of_sensor, rms, white_noise
 from ..identify.noise_model import Series
 from ..motor import Motor
 from ..recording import OVER_LAST
@@ -31,6 +31,9 @@ MIN_SAMPLES = 50
 LAGS = range(2, 9)
 # Standard errors of a correlation that chance may bring
 CHANCE_ERRORS = 3.0
+# The drop of the brushes may set in gradually: currents, over their root mean square, at which it is within 1/e of its
+# final value
+ONSETS = (0.02, 0.06, 0.2)
 # Bounds of the natural logarithms of R, Kb and L over those of the model, and the first guess of L, if it is less, as a
 # share of R times the sample time: a smaller one is not felt, and no gradient leads back
 MAX_LOGARITHM, MIN_GUESS = 7.0, 0.1
@@ -42,12 +45,13 @@ class _Electrical(NamedTuple):
     R: float
     Kb: float
     L: float
-    drop: float = 0.0  # V, opposes the current, beside that of the model
+    # amplitudes, V, of voltages that oppose the current, beside those of the model (see `_Steps.opposing`)
+    drop: Float[np.ndarray, " shapes"] = np.zeros(1 + len(ONSETS))
 
-    def changed(self, by: Float[np.ndarray, "4"]) -> _Electrical:
-        """With R, Kb and L changed by these natural logarithms, and this drop in V."""
+    def changed(self, by: Float[np.ndarray, " changes"]) -> _Electrical:
+        """With R, Kb and L changed by these natural logarithms, and these amplitudes of the drop."""
         R, Kb, L = np.array(self[:3]) * np.exp(by[:3])
-        return _Electrical(R, Kb, L, by[3])
+        return _Electrical(R, Kb, L, by[3:])
 
 
 class _Steps(NamedTuple):
@@ -57,13 +61,14 @@ class _Steps(NamedTuple):
     current: Float[np.ndarray, " steps"]  # A, at the start
     speed: Float[np.ndarray, "steps 2"]  # rad/s
     voltage: Float[np.ndarray, "steps 2"]  # V
-    direction: Float[np.ndarray, " steps"]  # of the current, if brushes oppose it; else zero
+    # what brushes oppose the current with, per V of each of the `_shapes`; zero without brushes
+    opposing: Float[np.ndarray, "steps 2 shapes"]
 
     def predicted(self, motor: _Electrical) -> Float[np.ndarray, " steps"]:
         """Current at the end of the steps by the electrical equation, with voltage and speed on straight lines."""
         decay, weights = _weights(motor, self.seconds)
-        drop = motor.drop * self.direction[:, None]
-        return decay * self.current + (self.voltage - motor.Kb * self.speed - drop) @ weights
+        voltage = self.voltage - motor.Kb * self.speed - self.opposing @ motor.drop
+        return decay * self.current + voltage @ weights
 
 
 class _Balance(NamedTuple):
@@ -111,10 +116,10 @@ def electrical_misfit(model: Model) -> float:
         return 1.0
     start = _electrical_part(model.motor)
     guess = MIN_GUESS * start.R / start.L * min(b.measured.seconds for b in balances)
-    largest = np.array([*3 * [MAX_LOGARITHM], np.inf])
+    largest = np.array([*3 * [MAX_LOGARITHM], *np.full_like(start.drop, np.inf)])
     best = least_squares(
         lambda by: np.concatenate([b.residuals(start.changed(by)) for b in balances]),
-        [0.0, 0.0, np.clip(np.log(guess), 0.0, MAX_LOGARITHM / 2), 0.0],
+        [0.0, 0.0, np.clip(np.log(guess), 0.0, MAX_LOGARITHM / 2), *start.drop],
         bounds=(-largest, largest),
         x_scale="jac",
     )
@@ -162,12 +167,13 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     is_mean = recorded.averaging == OVER_LAST
     voltage = _voltage_between_readings(model, run, len(known))[pairs]
 
-    direction = brushes * np.sign(simulated[:-1, 0] + simulated[1:, 0])[pairs]
+    shapes = brushes * _shapes(measured[:, 0])
+    opposing = np.stack([shapes[:-1], shapes[1:]], 1)[pairs]
 
     def steps(signals: Float[np.ndarray, "samples 2"]) -> _Steps:
         i, w = signals[:-1, 0][pairs], signals[:, 1]
         speed = np.stack([w[1:] if is_mean else w[:-1], w[1:]], 1)[pairs]
-        return _Steps(seconds, i, speed, voltage, direction)
+        return _Steps(seconds, i, speed, voltage, opposing)
 
     reached = residuals[1:, 0][pairs] + steps(simulated).predicted(motor)
     decay, weights = _weights(motor, seconds)
@@ -179,6 +185,13 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     )
     noise, even_clock = float(np.linalg.norm(parts)), recorded.resampled_from is None
     return _Balance(steps(measured), reached, noise, even_clock)
+
+
+def _shapes(current: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "samples shapes"]:
+    """Shapes of which the drop of the brushes may be made up: constant, and less so below each of the `ONSETS`."""
+    onsets, size = np.array(ONSETS) * max(rms(current), 1e-300), np.abs(current)[:, None]
+    gradual = np.exp(-size / onsets)
+    return np.sign(current)[:, None] * np.hstack([np.ones_like(size), gradual])
 
 
 def _voltage_between_readings(model: Model, run: int, length: int) -> Float[np.ndarray, "steps 2"]:
