@@ -17,11 +17,13 @@ from jaxtyping import Float
 
 from ..identify.by_run import FitByRun, errors_by_run, fit_by_run
 from ..identify.gauss_newton import squares_of_runs
+from ..identify.identifiability import torque_scale
 from ..identify.identification import Estimate
 from ..identify.likelihood import negative_log_likelihood
 from ..identify.parameters import unit_of
 from ..identify.results import run_fits
 from ..identify.run_unknowns import fit_run_unknowns
+from ..identify.uncertainty import information_of
 from ..motor import PARAMETERS
 from ..simulate import RunUnknowns
 from .assessment import FALSE_ALARM, Assessment
@@ -103,7 +105,9 @@ def _variation(model: Model, found: Screen, name: str) -> _Variation:
     gain = max(found.evidence.regress().squares - fit.squares, 0.0)
     freedom = len(model.given.training) - 1
     log_p = log_p_value(gain / dispersion_by_noise(found, block), freedom)
-    common = np.asarray(model.fit.coordinates) + fit.parameter_changes
+    common = np.array(model.fit.coordinates)
+    free = [k for k in range(len(common)) if k not in model.fit.at_bound]
+    common[free] += fit.parameter_changes[free]
     changes, errors = fit.coefficients[0][:, 0], fit.errors[0][:, 0]
     known = errors > 0
     largest = np.ptp(changes[known]) if known.any() else 0.0
@@ -151,9 +155,16 @@ def _squares(
 
 def _estimates_by_run(model: Model, found: _Variation, fit: FitByRun) -> dict[str, Estimate]:
     """The parameter in each run that determines it."""
-    given, place = model.given, _place(model, found.name)
-    errors, reaches = errors_by_run(given.problem, fit, place, model.fit.at_bound)
-    own = fit.coordinates[model.training, place]
+    given, place, held = model.given, _place(model, found.name), [*model.fit.at_bound]
+    own, names = fit.coordinates[model.training, place], given.problem.parameters.names
+    along = torque_scale(information_of(given.problem, model.fit).unseen, names)
+    if (
+        along is not None
+    ):  # with Kt = Kb, as in the identified motor: the ratios between runs do not depend on it
+        k, b = names.index("Kt"), names.index("Kb")
+        own = own + along[place] * (fit.coordinates[0, b] - fit.coordinates[0, k]) / along[k]
+        held.append(k)
+    errors, reaches = errors_by_run(given.problem, fit, place, held)
     return {
         run.name: _estimate(found.name, *of_run)
         for run, *of_run in zip(given.training, own, errors, reaches, strict=True)

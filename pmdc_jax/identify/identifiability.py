@@ -19,6 +19,15 @@ def moved_by(direction: np.ndarray, parameters: Parameters) -> tuple[str, ...]:
     return tuple(n for n, x in zip(parameters.names, direction, strict=True) if abs(x) > MIN_SHARE)
 
 
+def torque_scale(unseen: Sequence[np.ndarray], names: Sequence[str]) -> np.ndarray | None:
+    """The unseen direction along which all torques, Kt, J and f change in proportion, while Kb stays; None if the runs
+    show the scale."""
+    if not {"Kt", "Kb"} <= set(names):
+        return None
+    k, b = names.index("Kt"), names.index("Kb")
+    return next((d for d in unseen if abs(d[k]) > 0.1 and abs(d[b]) < 1e-2), None)
+
+
 def explain_directions(
     unseen: Sequence[np.ndarray], parameters: Parameters, recordings: Sequence[Recording]
 ) -> tuple[Direction, ...]:

@@ -12,7 +12,7 @@ from ..motor import PARAMETERS, Motor
 from ..recording import OVER_BOTH, OVER_LAST, Recording
 from ..simulate import RunUnknowns, Tape
 from ..threads import map_in_threads
-from .identifiability import MIN_SHARE, explain_directions
+from .identifiability import MIN_SHARE, explain_directions, torque_scale
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import ratio_to_noise, rms, white_noise
 from .parameters import Parameters, unit_of
@@ -154,17 +154,15 @@ def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit
     rejected.
     """
     names = problem.parameters.names
-    if "Kt" not in names or "Kb" not in names:
+    along = torque_scale(info.unseen, names)
+    if along is None:
         return polished
     k, b = names.index("Kt"), names.index("Kb")
-    along = [d for d in info.unseen if abs(d[k]) > 0.1 and abs(d[b]) < 1e-2]
-    if not along:
-        return polished
     held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
     moved = polished
     for _ in range(TIE_ITERATIONS):  # Kb moves a little as well
         coordinates = np.array(moved.coordinates)
-        coordinates += along[0] * (coordinates[b] - coordinates[k]) / along[0][k]
+        coordinates += along * (coordinates[b] - coordinates[k]) / along[k]
         coordinates[k] = coordinates[b]
         unknowns = moved.unknowns._replace(coordinates=jnp.asarray(coordinates))
         moved = polish(held, moved.optimum._replace(unknowns=unknowns))
