@@ -413,3 +413,19 @@ def test_a_timing_that_made_up_for_a_slow_sensor_is_given_up_with_it():
     assert not any("voltage" in message for message in found.final.messages)
     L = found.final.parameters["L"]
     assert L.value == pytest.approx(2e-3, abs=3 * L.stderr)
+
+
+@pytest.mark.slow
+def test_friction_that_differs_in_one_run_is_told_where_only_ratios_of_torques_are_seen():
+    """Without a load Kt, J and f are seen in proportion only; their values are those for Kt = Kb."""
+    rng, runs = np.random.default_rng(17), []
+    for name, factor in (("first", 1.0), ("second", 1.0), ("cold", 1.6)):
+        motor = vb.BenchMotor(**PAPER | {"f": factor * PAPER["f"], "Kt": PAPER["Kb"]})
+        columns = vb.record(motor, vb.prbs(rng, 4.0), rng, NOISE, load_known=False)
+        runs.append(recording(name, columns))
+    found = diagnose(runs, unloaded=True)
+    assert (found.verdict, found.effects, found.varies.name) == ("not_in_library", (), "f")
+    for name, one in found.varies.by_run.items():
+        truth = PAPER["f"] * (1.6 if name == "cold" else 1.0)
+        assert one.value == pytest.approx(truth, abs=4 * one.stderr)
+        assert one.stderr < 0.05 * truth
