@@ -86,6 +86,7 @@ def test_a_hidden_shaft_causes_no_electrical_misfit():
     assert electrical_misfit(model) < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_brushes_whose_drop_sets_in_gradually_cause_no_electrical_misfit():
     """With only a drop of constant size it would be 1.6."""
