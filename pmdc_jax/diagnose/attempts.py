@@ -59,7 +59,7 @@ def likeliest_attempt(
     held = chosen if timing == HELD else _with_effects_of(chosen, *identified(HELD))
     if timing != HELD and not _is_likelier(chosen, held):
         return attempt(HELD)
-    others = [t for t in other_timings(held.given, held.fit)[:1] if not _are_alike(t, timing)]
+    others = [t for t in other_timings(held.given, held.fit)[:1] if not _is_tried(t, timing)]
     return min(first, *map(attempt, others), key=_negative_log_likelihood) if others else first
 
 
@@ -80,7 +80,9 @@ def _negative_log_likelihood(attempt: Attempt) -> float:
     return negative_log_likelihood_within(chosen.given, chosen.fit)
 
 
-def _are_alike(one: Timing, other: Timing) -> bool:
-    """Whether two timings are the same kind, and nearly the same."""
-    kinds = [(t.straight, t.smooth is None, t.current_mean) for t in (one, other)]
-    return kinds[0] == kinds[1] and abs(one.lead - other.lead) < SAME_LEAD
+def _is_tried(other: Timing, timing: Timing) -> bool:
+    """Whether another timing is of the same kind as the one assumed, and nearly the same; smooth voltages are found
+    from straight ones."""
+    alike = (other.straight, other.current_mean) == (timing.straight, timing.current_mean)
+    smoother = other.smooth is not None and timing.smooth is None
+    return alike and not smoother and abs(other.lead - timing.lead) < SAME_LEAD
