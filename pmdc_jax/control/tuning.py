@@ -41,9 +41,9 @@ from .spread import drawn_motors, even_spread
 
 TUNING_MOTORS = 32  # motors drawn from the uncertainty to tune on, beside the nominal one
 VALIDATION_MOTORS = 256  # motors drawn independently of these to judge the result
-# Minimum standard deviation of the speed noise while tuning, over the set point: gains tuned without noise would make
-# the voltage jitter.
-TUNING_NOISE = 2e-4
+# Standard deviation of the speed noise while tuning, over the set point. Gains tuned without any would make the voltage
+# jitter; noise of the recordings that comes near the 2 % band would leave nothing to tune for.
+MIN_TUNING_NOISE, MAX_RECORDED_NOISE = 2e-4, 5e-3
 # Thresholds for a message: overshoot of the small step, over the larger of the allowed overshoot and the overshoot of
 # the full step; peak sensitivity, over its default limit; and current, over its limit.
 OVERSHOOT_TO_REPORT = 1.2
@@ -169,10 +169,11 @@ def tune(
     withstand, by default half of the torque that can still be held at the set point; `delay`, 0 or 1 samples from
     measurement to voltage; `speed_step`, rad/s, quantum of the speed sensor; `speed_noise`, rad/s, its standard
     deviation, which the metrics include, or `recorded_noise`, from the motor's file, which they do not: gains are tuned
-    against either; `measures_current`, if False the law estimates the current; `uncertainty` of the motor, from its
-    file, or `spread`, standard deviation of the logarithm of each parameter: with either, the worst tenth of the
-    nominal and 32 drawn motors makes half of the cost, and 256 others validate the result; `max_sensitivity`, limit of
-    the peak sensitivity, None for no limit; `starts`, number of descents; `seed`; `progress`.
+    against either, the latter up to 0.5 % of the set point; `measures_current`, if False the law estimates the current;
+    `uncertainty` of the motor, from its file, or `spread`, standard deviation of the logarithm of each parameter: with
+    either, the worst tenth of the nominal and 32 drawn motors makes half of the cost, and 256 others validate the
+    result; `max_sensitivity`, limit of the peak sensitivity, None for no limit; `starts`, number of descents; `seed`;
+    `progress`.
 
     **Raises**: `InputError`, stating the limit, for a specification that no controller can meet.
     """
@@ -265,7 +266,7 @@ def _best_controller(
     seed: int,
     starts: int,
 ) -> AbstractController:
-    """Best controller of all starts, tuned with at least `TUNING_NOISE` even if the sensor has none."""
+    """Best controller of all starts, tuned with noise even if the sensor has none (`MIN_TUNING_NOISE`)."""
     requirements = specification.requirements
     nominal = jax.tree.map(lambda leaf: leaf[0], motors)
     # of the voltage limit, which a loop needs that settles in its scale: at first the speed rises with voltage and time
@@ -278,10 +279,18 @@ def _best_controller(
         motor=nominal,
         setpoint=task.setpoint,
     )
-    speed_noise = max(requirements.sensor_noise, TUNING_NOISE * abs(specification.setpoint))
-    tuning_task = eqx.tree_at(lambda t: t.noise, task, jnp.asarray(speed_noise * unit_noise))
+    tuning_noise = unit_noise * _tuning_noise(requirements, abs(specification.setpoint))
+    tuning_task = eqx.tree_at(lambda t: t.noise, task, jnp.asarray(tuning_noise))
     coordinates = best_coordinates(tuning_task, space, motors, seed, starts)
     return space.controller(jnp.asarray(coordinates))
+
+
+def _tuning_noise(requirements: LoopRequirements, speed: float) -> float:
+    """Standard deviation of the speed noise, rad/s, while tuning for a set point of this size."""
+    noise = requirements.speed_noise
+    if noise is None:
+        noise = min(requirements.recorded_noise or 0.0, MAX_RECORDED_NOISE * speed)
+    return max(noise, MIN_TUNING_NOISE * speed)
 
 
 def _evaluated(
