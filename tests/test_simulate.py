@@ -30,6 +30,7 @@ from pmdc_jax.simulate import (
     Tape,
     free_run,
     reference_solution,
+    sensitivities,
     squared_errors,
     uniform,
 )
@@ -251,6 +252,22 @@ def test_joined_blocks_match_a_sequential_run(x64, effects):
         only = dataclasses.replace(tape, weight=weight)
         squares = np.array([float(e[0]) for e in squared_errors(one, only)])
         np.testing.assert_allclose(np.abs(outputs[block, :, sample]), np.sqrt(squares), rtol=1e-7)
+
+
+def test_a_current_that_decays_for_long_has_finite_sensitivities(x64):
+    """At rest, where it falls by e^-20 from sample to sample, until its square, and then itself, underflows."""
+    time = 5e-3 * np.arange(600)
+    run = Recording("rest", time, np.where(time < 0.3, 6.0, 0.0), 0 * time, 0 * time)
+    tape = Tape.from_recordings([evolve(run, averaging=OVER_LAST)])
+    values = jnp.array([*(PAPER | {"L": PAPER["R"] / 4000}).values(), 0.1])
+
+    def assemble(values):
+        return Motor(*values[:6], effects=(CoulombFriction(values[6]),))
+
+    seen, derivatives = sensitivities(assemble, values, tape)
+    assert float(jnp.abs(seen[:, 1]).max()) > 50
+    assert np.isfinite(seen).all()
+    assert np.isfinite(derivatives).all()
 
 
 def test_runs_on_one_tape_match_runs_simulated_alone(x64):

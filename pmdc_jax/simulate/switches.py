@@ -131,9 +131,7 @@ def stick_or_reverse(
     """
     direction = jnp.sign(before[row])
     crosses = direction * after[row] <= 0
-    # the guarded denominator keeps the derivative finite where the branch is not taken
-    fall = jnp.where(crosses & (direction != 0), before[row] - after[row], 1.0)
-    share = jnp.where(direction == 0, 0.0, before[row] / fall)
+    share = _share_until_zero(before[row], after[row], crosses)
     # response to a push over the rest of the step, relative to one over the whole step: the motion is exponential
     rest_response = jnp.maximum((1.0 - share) / (1.0 + jnp.expm1(-decay) * share), 1e-12)
     # the force that has opposed the motion so far, and the one that would bring the state to zero at the end; beyond
@@ -162,10 +160,21 @@ def mean_correction(before: Scalars, uncorrected: Scalars, corrected: Scalars) -
 
     **Arguments**: the value at the start of the step, and at its end without and with the correction.
     """
-    crosses = before * uncorrected <= 0
-    fall = jnp.where(crosses & (before != 0), before - uncorrected, 1.0)
-    remaining = jnp.where(crosses, 1.0 - before / fall, 0.5)
+    # by the sign, because the product of two currents that have nearly decayed underflows to zero
+    crosses = jnp.sign(before) * uncorrected <= 0
+    remaining = jnp.where(crosses, 1.0 - _share_until_zero(before, uncorrected, crosses), 0.5)
     return remaining / 2 * (corrected - uncorrected)
+
+
+def _share_until_zero(before: Scalars, after: Scalars, crosses: Bool[Array, "..."]) -> Scalars:
+    """The share of a step after which a state reaches zero, on a straight line, where it `crosses` that; elsewhere 0.
+
+    So for a state that falls by next to nothing, as a current does that decays for long: the derivative divides by the
+    square of the fall, which must not underflow.
+    """
+    fall = before - after
+    divides = crosses & (jnp.abs(fall) > jnp.sqrt(jnp.finfo(fall.dtype).tiny))
+    return jnp.where(divides, before / jnp.where(divides, fall, 1.0), 0.0)
 
 
 def _breakaway_excess(at_rest: Grip, start: Scalars, mean: Scalars) -> Scalars:
