@@ -172,6 +172,15 @@ INVALID_COVARIANCES = {
 }
 
 
+def assert_refused(tmp_path, entry: str, value: object, load) -> None:
+    """The valid file with this entry is refused, in a message that names both."""
+    path = tmp_path / "motor.json"
+    path.write_text(json.dumps(VALID | {entry: value}))
+    with pytest.raises(InputError, match=entry) as refusal:
+        load(path)
+    assert str(path) in str(refusal.value)
+
+
 def test_a_covariance_is_read(tmp_path):
     path = tmp_path / "motor.json"
     path.write_text(
@@ -184,11 +193,7 @@ def test_a_covariance_is_read(tmp_path):
 
 @pytest.mark.parametrize("covariance", INVALID_COVARIANCES.values(), ids=INVALID_COVARIANCES.keys())
 def test_an_invalid_covariance_is_refused(tmp_path, covariance):
-    path = tmp_path / "motor.json"
-    path.write_text(json.dumps(VALID | {"covariance": covariance}))
-    with pytest.raises(InputError, match="covariance") as refusal:
-        load_uncertainty(path)
-    assert str(path) in str(refusal.value)
+    assert_refused(tmp_path, "covariance", covariance, load_uncertainty)
 
 
 @pytest.mark.parametrize(
@@ -204,8 +209,4 @@ def test_the_noise_of_the_speed_is_read(tmp_path, noise, read):
 
 @pytest.mark.parametrize("noise", [0.3, "low", {"speed_rad_s": -1.0}, {"speed_rad_s": "low"}])
 def test_an_invalid_noise_is_refused(tmp_path, noise):
-    path = tmp_path / "motor.json"
-    path.write_text(json.dumps(VALID | {"noise": noise}))
-    with pytest.raises(InputError, match="noise") as refusal:
-        load_speed_noise(path)
-    assert str(path) in str(refusal.value)
+    assert_refused(tmp_path, "noise", noise, load_speed_noise)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import cache
 from typing import NamedTuple
 
 from ..effects import EFFECTS
@@ -39,45 +40,45 @@ def likeliest_attempt(
     """The effects named, and then once more if these reveal another timing of the voltages: the likelier ones of both,
     or those with held voltages if nothing speaks against these any more."""
 
-    def identified(timing: Timing | None) -> tuple[Prepared, Solved]:
-        return solve(prepared, search, seed, report, timing)
+    @cache
+    def identified(timing: Timing | None) -> tuple[Prepared, Solved, float]:
+        began = time.perf_counter()
+        given, solved = solve(prepared, search, seed, report, timing)
+        return given, solved, time.perf_counter() - began
 
     def attempt(timing: Timing | None = None) -> Attempt:
-        began = time.perf_counter()
-        given, solved = identified(timing)
-        identifying = time.perf_counter() - began
+        given, solved, identifying = identified(timing)
         report("gathering evidence", solved.fit.fitness)
         selection = StepwiseSelection(model_of((), given, solved.fit), solved, report)
         return Attempt(given, solved, selection, selection.name(), identifying)
 
     first = attempt()
-    chosen, timing = first.naming.chosen, first.given.timing
-    if not chosen.effects:
+    held, timing = first.naming.chosen, first.given.timing
+    if not held.effects:
         return first
-    if timing != HELD and only_current_is_late(chosen.given, chosen.fit):
-        return attempt(HELD)
-    held = chosen if timing == HELD else _with_effects_of(chosen, *identified(HELD))
-    if timing != HELD and not _is_likelier(chosen, held):
-        return attempt(HELD)
+    if timing != HELD:
+        chosen = held
+        if only_current_is_late(chosen.given, chosen.fit):
+            return attempt(HELD)
+        held = _with_effects_of(chosen, identified(HELD)[0])
+        gain = _negative_log_likelihood(held) - _negative_log_likelihood(chosen)
+        if not gain > MIN_LOG_LIKELIHOOD_GAIN:
+            return attempt(HELD)
     others = [t for t in other_timings(held.given, held.fit)[:1] if not _is_tried(t, timing)]
-    return min(first, *map(attempt, others), key=_negative_log_likelihood) if others else first
+    if not others:
+        return first
+    attempts = (first, attempt(others[0]))
+    return min(attempts, key=lambda a: _negative_log_likelihood(a.naming.chosen))
 
 
-def _with_effects_of(model: Model, given: Prepared, solved: Solved) -> Model:
+def _with_effects_of(model: Model, given: Prepared) -> Model:
     """The effects of a model fitted to runs with another timing."""
     given = given.with_effects([EFFECTS[effect] for effect in model.effects])
     return model_of(model.effects, *polish_with_angle(given, model.fit.optimum))
 
 
-def _is_likelier(model: Model, than: Model) -> bool:
-    gain = negative_log_likelihood_within(than.given, than.fit)
-    gain -= negative_log_likelihood_within(model.given, model.fit)
-    return gain > MIN_LOG_LIKELIHOOD_GAIN
-
-
-def _negative_log_likelihood(attempt: Attempt) -> float:
-    chosen = attempt.naming.chosen
-    return negative_log_likelihood_within(chosen.given, chosen.fit)
+def _negative_log_likelihood(model: Model) -> float:
+    return negative_log_likelihood_within(model.given, model.fit)
 
 
 def _is_tried(other: Timing, timing: Timing) -> bool:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from ..identify.by_run import FitByRun, errors_by_run, fit_by_run
 from ..identify.gauss_newton import squares_of_runs
-from ..identify.identifiability import torque_scale
+from ..identify.identifiability import step_to_equal_constants, torque_scale
 from ..identify.identification import Estimate
 from ..identify.likelihood import negative_log_likelihood
 from ..identify.parameters import unit_of
@@ -161,9 +161,8 @@ def _estimates_by_run(model: Model, found: _Variation, fit: FitByRun) -> dict[st
     if (
         along is not None
     ):  # with Kt = Kb, as in the identified motor: the ratios between runs do not depend on it
-        k, b = names.index("Kt"), names.index("Kb")
-        own = own + along[place] * (fit.coordinates[0, b] - fit.coordinates[0, k]) / along[k]
-        held.append(k)
+        own = own + step_to_equal_constants(along, fit.coordinates[0], names)[place]
+        held.append(names.index("Kt"))
     errors, reaches = errors_by_run(given.problem, fit, place, held)
     return {
         run.name: _estimate(found.name, *of_run)

@@ -28,6 +28,14 @@ def torque_scale(unseen: Sequence[np.ndarray], names: Sequence[str]) -> np.ndarr
     return next((d for d in unseen if abs(d[k]) > 0.1 and abs(d[b]) < 1e-2), None)
 
 
+def step_to_equal_constants(
+    along: np.ndarray, coordinates: np.ndarray, names: Sequence[str]
+) -> np.ndarray:
+    """The step along the `torque_scale` that makes Kt equal Kb, as they are in SI."""
+    k, b = names.index("Kt"), names.index("Kb")
+    return along * (coordinates[b] - coordinates[k]) / along[k]
+
+
 def explain_directions(
     unseen: Sequence[np.ndarray], parameters: Parameters, recordings: Sequence[Recording]
 ) -> tuple[Direction, ...]:

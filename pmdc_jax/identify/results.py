@@ -12,7 +12,7 @@ from ..motor import PARAMETERS, Motor
 from ..recording import OVER_BOTH, OVER_LAST, Recording
 from ..simulate import RunUnknowns, Tape
 from ..threads import map_in_threads
-from .identifiability import MIN_SHARE, explain_directions, torque_scale
+from .identifiability import MIN_SHARE, explain_directions, step_to_equal_constants, torque_scale
 from .identification import Estimate, Identification, Role, RunFit, Status
 from .noise import ratio_to_noise, rms, white_noise
 from .parameters import Parameters, unit_of
@@ -162,7 +162,7 @@ def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit
     moved = polished
     for _ in range(TIE_ITERATIONS):  # Kb moves a little as well
         coordinates = np.array(moved.coordinates)
-        coordinates += along * (coordinates[b] - coordinates[k]) / along[k]
+        coordinates += step_to_equal_constants(along, coordinates, names)
         coordinates[k] = coordinates[b]
         unknowns = moved.unknowns._replace(coordinates=jnp.asarray(coordinates))
         moved = polish(held, moved.optimum._replace(unknowns=unknowns))
