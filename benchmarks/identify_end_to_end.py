@@ -39,7 +39,7 @@ def read(folder: Path) -> Runs:
 def ours(runs: Runs) -> dict[str, float]:
     """`pmdc_jax.identify`."""
     import pmdc_jax
-    from pmdc_jax.recording import Recording
+    from pmdc_jax.recordings.recording import Recording
 
     def recording(name, c):
         signals = (c[n] for n in ("time_s", "voltage_V", "current_A", "speed_rad_s"))

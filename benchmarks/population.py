@@ -22,7 +22,7 @@ from benchmarks.peers.held import Run
 from benchmarks.timing import Row, Timed, interleaved, machine
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.motor import Motor
-from pmdc_jax.recording import Recording
+from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate import Tape, squared_errors
 
 SIZES = (20, 256, 1024, 8192)

@@ -35,7 +35,7 @@ def main() -> None:
 
 def _rows() -> list[Row]:
     from pmdc_jax.motor import Motor
-    from pmdc_jax.recording import Recording
+    from pmdc_jax.recordings.recording import Recording
     from pmdc_jax.simulate import Tape, free_run, sensitivities
 
     truth = vb.paper_motor()

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from .motor import Motor
     from .motor_file import load_motor, load_speed_noise, load_uncertainty, save_motor
     from .paper import paper
-    from .recording import Recording
-    from .recording_file import read_recording, write_recording
+    from .recordings.recording import Recording
+    from .recordings.recording_file import read_recording, write_recording
     from .simulate import simulate
 
 # Names are imported on first use, so that importing this package is fast and changes no setting.
@@ -31,7 +31,7 @@ _HOME = {
     "Identification": "identify.identification",
     "InputError": "errors",
     "Motor": "motor",
-    "Recording": "recording",
+    "Recording": "recordings.recording",
     "Tuning": "control.tuning",
     "demo": "demo",
     "diagnose": "diagnose.pipeline",
@@ -43,12 +43,12 @@ _HOME = {
     "load_speed_noise": "motor_file",
     "load_uncertainty": "motor_file",
     "paper": "paper",
-    "read_recording": "recording_file",
+    "read_recording": "recordings.recording_file",
     "save_controller": "control.controller_file",
     "save_motor": "motor_file",
     "simulate": "simulate",
     "tune": "control.tuning",
-    "write_recording": "recording_file",
+    "write_recording": "recordings.recording_file",
 }
 
 __all__ = [

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
 
-from .compilation_cache import keep_compiled
 from .errors import InputError
 from .options import (
     Column,
@@ -56,6 +55,7 @@ from .options import (
     fit_options,
     pairs,
 )
+from .runtime.compilation_cache import keep_compiled
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -183,7 +183,7 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
     check_outputs({"--out": out}, [motor, input])
     columns = dict(pairs("--column", column))
     from .motor_file import load_motor
-    from .recording_file import read_recording, write_recording
+    from .recordings.recording_file import read_recording, write_recording
     from .simulate import simulate
 
     driven = read_recording(input, columns, to_simulate=True)
@@ -320,7 +320,7 @@ def _read_and_fit(
     options: dict[str, Any],
 ) -> Result:
     """Read the runs and call `fit`, which is `identify` or `diagnose`, on them, showing progress."""
-    from .recording_file import read_recording
+    from .recordings.recording_file import read_recording
     from .report.terminal import progress
 
     with progress() as on_progress:

@@ -43,13 +43,13 @@ def demo(
     from .report.json import diagnosis_json, write_json
     from .report.tuning import write_tuning_report
 
-    report, found, motor, page, controller = (folder / name for name in FILES)
+    report, content, motor, page, controller = (folder / name for name in FILES)
     training, held_out = (
         [SAMPLE / f"{name}.csv" for name in names] for names in (TRAINING, HOLDOUT)
     )
     diagnosis = diagnose(training, holdout=held_out, seed=seed, progress=progress)
     save_motor(motor, diagnosis.final.motor, diagnosis.final)
-    write_json(diagnosis_json(diagnosis), found)
+    write_json(diagnosis_json(diagnosis), content)
     write_diagnosis_report(diagnosis, report)
     tuning = tune(
         load_motor(motor),

@@ -86,6 +86,14 @@ class Motor(eqx.Module):
         }
         return numerators, jnp.stack([L * J, R * J + L * f, R * f + Kt * Kb])
 
+    def steady_speed(self, voltage: Scalars | float, load: Scalars | float = 0.0) -> Scalars:
+        """Speed, rad/s, at a constant voltage (V) and load (N m): w = (Kt v - R T) / (R f + Kt Kb), without effects."""
+        return (self.Kt * voltage - self.R * load) / (self.R * self.f + self.Kt * self.Kb)
+
+    def steady_current(self, speed: Scalars, load: Scalars | float = 0.0) -> Scalars:
+        """Current, A, at a constant speed (rad/s) against a load (N m): i = (f w + T) / Kt, without effects."""
+        return (self.f * speed + load) / self.Kt
+
     @property
     def transient_time(self) -> Scalars:
         """The electrical and the electromechanical time constant together, s: L / R + J R / (Kt Kb)."""

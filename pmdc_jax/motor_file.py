@@ -41,9 +41,9 @@ def save_motor(
         ],
     }
     if identification is not None:
-        found = identification.parameters
-        content["stderr"] = {name: estimate.stderr for name, estimate in found.items()}
-        content["status"] = {name: estimate.status for name, estimate in found.items()}
+        estimates = identification.parameters
+        content["stderr"] = {name: estimate.stderr for name, estimate in estimates.items()}
+        content["status"] = {name: estimate.status for name, estimate in estimates.items()}
         content["covariance"] = {
             "of": "coordinates: natural logarithms of positive parameters",
             "names": list(identification.covariance_names),
@@ -68,12 +68,12 @@ def load_uncertainty(path: str | Path) -> Uncertainty | None:
     **Raises**: `InputError` if the covariance is not valid, or the file cannot be read.
     """
     where, content = str(path), _content(path)
-    given = content.get("covariance")
-    if given is None:
+    covariance = content.get("covariance")
+    if covariance is None:
         return None
     try:
-        names = tuple(given["names"])
-        matrix = np.array(given["matrix"], float).reshape(len(names), len(names))
+        names = tuple(covariance["names"])
+        matrix = np.array(covariance["matrix"], float).reshape(len(names), len(names))
         if not _is_covariance(names, matrix):
             raise ValueError
     except (KeyError, TypeError, ValueError, OverflowError):

@@ -153,15 +153,15 @@ def pairs(option: str, texts: list[str]) -> list[tuple[str, str]]:
 
 def _pair(option: str, text: str) -> tuple[str, str]:
     """Split "Kt=Kb" into ("Kt", "Kb")."""
-    left, equals, right = (part.strip() for part in text.partition("="))
-    if not (left and equals and right):
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not (name and equals and value):
         examples = {"--column": "speed=rpm_meas:rpm", "--tie": "Kt=Kb", "--known": "R=0.157"}
         raise InputError(
             f"{option} {text}",
             "this is not of the form A=B",
             f"Write for example {option} {examples[option]}",
         )
-    return left, right
+    return name, value
 
 
 def _number(option: str, name: str, text: str) -> float:

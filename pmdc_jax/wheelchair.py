@@ -17,7 +17,7 @@ from .progress import ReportProgress, silent
 if TYPE_CHECKING:
     from .control.loop import Response
     from .control.tuning import Tuning
-    from .recording import Recording
+    from .recordings.recording import Recording
 
 TABLE_1 = {"R": 0.157378, "L": 0.0003137, "Kb": 0.0492, "Kt": 0.0501, "J": 0.000466, "f": 0.0002546}
 PRINTED = Motor(**{name: np.asarray(TABLE_1[name]) for name in PARAMETERS}, effects=())
@@ -92,7 +92,6 @@ class Paper:
 
 def reproduce(progress: ReportProgress | None = None) -> Paper:
     """Reproduce all tables and figures of the paper."""
-    from .control.feasibility import steady_speed
     from .control.time_optimal import fastest_settling
     from .control.tuning import tune
 
@@ -117,13 +116,14 @@ def reproduce(progress: ReportProgress | None = None) -> Paper:
     report("simulating Figs 7 and 8", fraction=0.9)
     steps = {kind: step_up_and_down(tuning) for kind, tuning in tunings.items()}
     gains = {kind: row.gains for kind, row in TABLE_2.items() if row.gains}
-    as_printed = {kind: simulated_as_printed(*found) for kind, found in gains.items()}
-    return Paper(recovered, steady_speed(PRINTED, VOLTAGE), tunings, fastest, steps, as_printed)
+    as_printed = {kind: simulated_as_printed(*of_kind) for kind, of_kind in gains.items()}
+    top_speed = float(PRINTED.steady_speed(VOLTAGE))
+    return Paper(recovered, top_speed, tunings, fastest, steps, as_printed)
 
 
 def load_test(seed: int = 0) -> Recording:
     """The virtual load test: 24 V from rest, then the load rises in steps to 1 N m; 1 ms samples, noisy sensors."""
-    from .recording import Recording
+    from .recordings.recording import Recording
     from .simulate import simulate
 
     rng = np.random.default_rng(seed)
@@ -143,9 +143,9 @@ def load_test(seed: int = 0) -> Recording:
 
 def recovered_by_paper_ga(seed: int = 0) -> Recovered:
     """Identify by the paper's binary genetic algorithm alone: 20 chromosomes of 60 bits."""
-    from .identify.bounds import search_bounds
     from .identify.parameters import Parameters
-    from .identify.search import search
+    from .identify.search.bounds import search_bounds
+    from .identify.search.evolution import search
     from .simulate import Tape, uniform
 
     run = load_test()
@@ -154,10 +154,10 @@ def recovered_by_paper_ga(seed: int = 0) -> Recovered:
         parameters = Parameters.of(search_bounds([run]))
         tape = Tape.from_recordings([uniform(run)])
         noise = np.array([NOISE["current"], NOISE["speed"]])
-        found = search(parameters, tape, noise, method="paper_ga", seed=seed)
-        motor = jax.tree.map(float, parameters(jax.numpy.asarray(found.candidates[0])))
+        result = search(parameters, tape, noise, method="paper_ga", seed=seed)
+        motor = jax.tree.map(float, parameters(jax.numpy.asarray(result.candidates[0])))
     seconds = time.perf_counter() - begin
-    return Recovered("the paper's GA", motor, found.evaluations, seconds, found.best)
+    return Recovered("the paper's GA", motor, result.evaluations, seconds, result.best)
 
 
 def recovered_by_identify(seed: int = 0) -> Recovered:
@@ -166,27 +166,23 @@ def recovered_by_identify(seed: int = 0) -> Recovered:
 
     run = load_test()
     begin = time.perf_counter()
-    found = identify([run], seed=seed)
+    identification = identify([run], seed=seed)
     seconds = time.perf_counter() - begin
-    motor = jax.tree.map(float, found.motor)
-    search = found.search
+    motor = jax.tree.map(float, identification.motor)
+    search = identification.search
     best = np.append(search.best, search.refined[:1])
     return Recovered("ours", motor, search.evaluations, seconds, best)
 
 
 def load_errors(motor: Motor) -> dict[str, np.ndarray]:
     """Figs 5 and 6: error (%) of steady speed and current on 24 V at each load torque in `LOADS`."""
-    (speed, current), (found_speed, found_current) = _steady_state(PRINTED), _steady_state(motor)
+    speed, printed_speed = (np.asarray(m.steady_speed(VOLTAGE, LOADS)) for m in (motor, PRINTED))
+    current = np.asarray(motor.steady_current(speed, LOADS))
+    printed_current = np.asarray(PRINTED.steady_current(printed_speed, LOADS))
     return {
-        "speed": 100 * (found_speed / speed - 1),
-        "current": 100 * (found_current / current - 1),
+        "speed": 100 * (speed / printed_speed - 1),
+        "current": 100 * (current / printed_current - 1),
     }
-
-
-def _steady_state(motor: Motor) -> tuple[np.ndarray, np.ndarray]:
-    R, Kb, Kt, f = (float(getattr(motor, name)) for name in ("R", "Kb", "Kt", "f"))
-    speed = (Kt * VOLTAGE - R * LOADS) / (R * f + Kt * Kb)
-    return speed, (f * speed + LOADS) / Kt
 
 
 def step_up_and_down(tuning: Tuning) -> Response:
@@ -225,6 +221,6 @@ def simulated_as_printed(proportional: float, integral: float, derivative: float
     first = slice(0, samples // 2)
     with jax.enable_x64(True):
         t, w = (jax.numpy.asarray(x[first]) for x in (time, speed))
-        found = step_metrics(t, w, SETPOINT)
-        overshoot, settling = float(found.Overshoot), float(found.SettlingTime)
+        metrics = step_metrics(t, w, SETPOINT)
+        overshoot, settling = float(metrics.Overshoot), float(metrics.SettlingTime)
     return AsPrinted(overshoot, settling, float(np.abs(voltage).max()), time, speed)

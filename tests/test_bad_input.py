@@ -19,8 +19,8 @@ from scipy.io import savemat
 
 from pmdc_jax.errors import InputError
 from pmdc_jax.identify.prepare import prepare
-from pmdc_jax.recording import Recording
-from pmdc_jax.recording_file import read_recording, write_recording
+from pmdc_jax.recordings.recording import Recording
+from pmdc_jax.recordings.recording_file import read_recording, write_recording
 
 HEADER = "time_s,voltage_V,current_A,speed_rad_s"
 

@@ -10,9 +10,9 @@ import pytest
 from attrs import evolve
 from linear_motor import exact_step
 
-from pmdc_jax.check import check
-from pmdc_jax.plausibility import speed_of
-from pmdc_jax.recording import Recording
+from pmdc_jax.checks.check import check
+from pmdc_jax.checks.plausibility import speed_of
+from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate import uniform
 
 EXCITATIONS = ("steps", "prbs", "staircase", "triangle", "load_cycles", "spin_up")

@@ -17,10 +17,10 @@ from test_diagnose_report import ambiguous, named
 from test_report import fake_identification, partial_identification
 
 from pmdc_jax import cli
-from pmdc_jax.compilation_cache import keep_compiled
 from pmdc_jax.errors import InputError
 from pmdc_jax.identify.identification import Estimate
 from pmdc_jax.report import terminal
+from pmdc_jax.runtime.compilation_cache import keep_compiled
 
 HEAVY = ("jax", "numpy", "plotly", "polars", "scipy", "equinox", "diffrax")
 
@@ -56,7 +56,9 @@ def faked(monkeypatch, tmp_path, no_terminal):
 
     replace_function(monkeypatch, "pmdc_jax.identify", "identify", identify)
     replace_function(monkeypatch, "pmdc_jax.diagnose", "diagnose", diagnose)
-    replace_function(monkeypatch, "pmdc_jax.recording_file", "read_recording", read_recording)
+    replace_function(
+        monkeypatch, "pmdc_jax.recordings.recording_file", "read_recording", read_recording
+    )
     replace_function(monkeypatch, "pmdc_jax.motor_file", "save_motor", save_motor)
     monkeypatch.chdir(tmp_path)
     return calls
@@ -278,7 +280,7 @@ def test_simulate_reads_simulates_and_writes(faked, monkeypatch, capsys):
     replace_function(monkeypatch, "pmdc_jax.simulate", "simulate", lambda motor, run: (motor, run))
     replace_function(
         monkeypatch,
-        "pmdc_jax.recording_file",
+        "pmdc_jax.recordings.recording_file",
         "write_recording",
         lambda run, path: written.append((run, path)),
     )

@@ -8,12 +8,12 @@ import pytest
 from scipy.linalg import expm
 
 import pmdc_jax
-from pmdc_jax.clock import evenly_stamped, is_even
 from pmdc_jax.errors import InputError
 from pmdc_jax.motor import Drive, Motor
-from pmdc_jax.recording import Recording
+from pmdc_jax.recordings.clock import evenly_stamped, is_even
+from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate import uniform
-from pmdc_jax.simulate.uneven import mean_and_rise, pieces_of, seen_at_record
+from pmdc_jax.simulate.uneven import mean_and_rise, pieces_of, simulated_at_stamps
 
 # the current settles within a sample, so L is identified only if the sampling times are right
 MOTOR = {"R": 1.0, "L": 3.4e-4, "Kb": 0.07, "Kt": 0.07, "J": 1.16e-4, "f": 1.1e-4}
@@ -105,7 +105,7 @@ def test_an_interpolated_voltage_keeps_its_mean_and_first_moment_in_every_even_s
         for states in (straight, true):
             states[k + 1, :2] = (transition @ states[k])[:2]
     seen = straight[:-1:fine, :2]
-    then = seen_at_record(Motor(**MOTOR), Drive(), unloaded, seen, straight=True)
+    then = simulated_at_stamps(Motor(**MOTOR), Drive(), unloaded, seen, straight=True)
     times = even.time[0] + even.sample_time / fine * np.arange(len(true))
     for c in range(2):
         want = np.interp(run.time, times, true[:, c])

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pmdc_jax import compiled
-from pmdc_jax.compilation_cache import PROGRAMS
+from pmdc_jax.runtime import compiled
+from pmdc_jax.runtime.compilation_cache import PROGRAMS
 
 
 class Eigenvalues(NamedTuple):

@@ -12,40 +12,45 @@ import numpy as np
 import pytest
 from attrs import evolve
 from linear_motor import PAPER
+from pmdc_jax.diagnose.evidence.regression.assessment import Assessment
+from pmdc_jax.diagnose.evidence.regression.periodic import common_line, spectrum
+from pmdc_jax.diagnose.evidence.regression.quantisation import ROUNDING_DRAWS, rounding_errors
+from pmdc_jax.diagnose.evidence.regression.regression import Block, gather_evidence
+from pmdc_jax.diagnose.evidence.regression.rows import _batches
+from pmdc_jax.diagnose.evidence.regression.signals import (
+    Screen,
+    Signal,
+    gain_common_to_waves,
+    log_p_value,
+)
+from pmdc_jax.identify.noise.sensor_noise.noise_model import Series, whitener
 from scipy import stats
 from scipy.linalg import block_diag
 
 from benchmarks import virtual_bench as vb
 from experiments.bench import recording
 from pmdc_jax import Recording
-from pmdc_jax.diagnose import proposals
-from pmdc_jax.diagnose.assessment import Assessment
-from pmdc_jax.diagnose.candidates import Scales
-from pmdc_jax.diagnose.compare import Fitted
-from pmdc_jax.diagnose.effect_relations import FULLER, are_rivals, is_simpler_form
-from pmdc_jax.diagnose.evidence import Block, gather_evidence
 from pmdc_jax.diagnose.experiment import difference_between
+from pmdc_jax.diagnose.hypotheses.candidates import Scales
+from pmdc_jax.diagnose.hypotheses.effect_relations import FULLER, are_rivals, is_simpler_form
+from pmdc_jax.diagnose.hypotheses.library import Change, Library
+from pmdc_jax.diagnose.hypotheses.trials import TRIALS
 from pmdc_jax.diagnose.judgement import implausible_effect, may_be_absent
-from pmdc_jax.diagnose.library import Change, Library
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
-from pmdc_jax.diagnose.naming import Naming, StepwiseSelection
-from pmdc_jax.diagnose.periodic import common_line, spectrum
-from pmdc_jax.diagnose.proposals import Proposals
-from pmdc_jax.diagnose.quantisation import ROUNDING_DRAWS, rounding_errors
-from pmdc_jax.diagnose.refits import Refits
 from pmdc_jax.diagnose.response import kicks, path_of, respond, sensor_changes
-from pmdc_jax.diagnose.rows import _batches
-from pmdc_jax.diagnose.shortlist import effect_of, most_promising, shortlist
-from pmdc_jax.diagnose.signals import Screen, Signal, gain_common_to_waves, log_p_value
-from pmdc_jax.diagnose.starts import Starts, common_phase
-from pmdc_jax.diagnose.trials import TRIALS
+from pmdc_jax.diagnose.selection import proposals
+from pmdc_jax.diagnose.selection.compare import Fitted
+from pmdc_jax.diagnose.selection.naming import Naming, StepwiseSelection
+from pmdc_jax.diagnose.selection.proposals import Proposals
+from pmdc_jax.diagnose.selection.refits import Refits
+from pmdc_jax.diagnose.selection.shortlist import effect_of, most_promising, shortlist
+from pmdc_jax.diagnose.selection.starts import Starts, common_phase
 from pmdc_jax.effects import EFFECTS, ShaftCompliance
+from pmdc_jax.identify.fit.polish import fit_at
+from pmdc_jax.identify.fit.refine import Optimum
 from pmdc_jax.identify.identification import Estimate, Identification
-from pmdc_jax.identify.noise_model import Series, whitener
-from pmdc_jax.identify.polish import fit_at
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Unknowns
-from pmdc_jax.identify.refine import Optimum
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, free_run
 

@@ -12,7 +12,7 @@ from attrs import evolve
 from rich.console import Console
 from test_report import Page, fake_identification, partial_identification
 
-from pmdc_jax.alignment import LATE_SPEED
+from pmdc_jax.checks.alignment import LATE_SPEED
 from pmdc_jax.diagnose.diagnosis import (
     Detectable,
     Diagnosis,
@@ -25,14 +25,14 @@ from pmdc_jax.diagnose.diagnosis import (
 )
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate
-from pmdc_jax.recording import Finding
+from pmdc_jax.recordings.recording import Finding
 from pmdc_jax.report import notation
 from pmdc_jax.report.diagnosis import write_diagnosis_report
 from pmdc_jax.report.diagnosis_figures import averages
+from pmdc_jax.report.diagnosis_sentences import drifts, intervals_in_words, verdict_sentences
 from pmdc_jax.report.diagnosis_tables import diagnosis_tables
 from pmdc_jax.report.experiment import write_experiment
 from pmdc_jax.report.json import diagnosis_json
-from pmdc_jax.report.verdict import drifts, intervals_in_words, verdict_sentences
 
 STRIBECK = {
     "coulomb_Nm": Estimate(0.0612, 4e-4, (0.0604, 0.0620), "N m", "identified"),

@@ -21,7 +21,7 @@ from benchmarks import virtual_bench as vb
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import Motor
-from pmdc_jax.recording import OVER_BOTH, OVER_LAST, Averaging, Recording
+from pmdc_jax.recordings.recording import OVER_BOTH, OVER_LAST, Averaging, Recording
 from pmdc_jax.simulate import (
     UNKNOWNS_PER_RUN,
     RunUnknowns,

@@ -19,7 +19,7 @@ from pmdc_jax.identify.friction_test import (
     friction_messages,
 )
 from pmdc_jax.identify.identification import Identification
-from pmdc_jax.recording import Recording
+from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate import Tape
 
 PAPER = vb.paper_motor()

@@ -14,6 +14,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pmdc_jax.identify.noise.sensor_noise.noise_model import whitener
+from pmdc_jax.identify.noise.sensor_noise.sensor_noise import (
+    common_divisor,
+    is_coarse,
+    quantum,
+    white_noise,
+)
+from pmdc_jax.identify.noise.sensor_noise.whitening import Whitening
+from pmdc_jax.identify.search.evolution.binary_ga import BinaryGA
+from pmdc_jax.identify.search.evolution.bounds import effect_bounds
+from pmdc_jax.identify.search.evolution.evolution import METHODS, SearchResult, search
+from pmdc_jax.identify.search.evolution.nearby import best_nearby
+from pmdc_jax.identify.uncertainty.covariance.covariance import information, long_run_variance
 from scipy.integrate import cumulative_simpson
 from scipy.signal import lfilter, lsim
 
@@ -24,28 +37,20 @@ from pmdc_jax import InputError, identify
 from pmdc_jax.control.spread import drawn_motors
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify import problem as problems
-from pmdc_jax.identify.binary_ga import BinaryGA
-from pmdc_jax.identify.bounds import effect_bounds
-from pmdc_jax.identify.generalised_least_squares import last_fit, residuals_of
+from pmdc_jax.identify.fit.generalised_least_squares import last_fit, residuals_of
+from pmdc_jax.identify.fit.polish import fit_at, polish
+from pmdc_jax.identify.fit.refine import Optimum, refine
+from pmdc_jax.identify.fit.run_unknowns import fit_run_unknowns
 from pmdc_jax.identify.identification import CONVERGED_DISTANCE, Identification
-from pmdc_jax.identify.nearby import best_nearby
-from pmdc_jax.identify.noise import common_divisor, is_coarse, quantum, white_noise
-from pmdc_jax.identify.noise_model import whitener
 from pmdc_jax.identify.parameters import Parameters
-from pmdc_jax.identify.polish import fit_at, polish
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Problem, Unknowns, _evaluated, evaluate, normal_matrix
-from pmdc_jax.identify.refine import Optimum, refine
 from pmdc_jax.identify.results import results_of
 from pmdc_jax.identify.rotor_angle import with_rotor_angle
-from pmdc_jax.identify.run_unknowns import fit_run_unknowns
-from pmdc_jax.identify.search import METHODS, SearchResult, search
 from pmdc_jax.identify.solve import _distinct, solve
-from pmdc_jax.identify.uncertainty import information, long_run_variance
-from pmdc_jax.identify.whitening import Whitening
 from pmdc_jax.motor import PARAMETERS
 from pmdc_jax.motor_file import Uncertainty
-from pmdc_jax.recording import Recording
+from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, sensitivities
 
 PAPER = vb.paper_motor()

@@ -12,7 +12,7 @@ from benchmarks import virtual_bench as vb
 from experiments.bench import recording
 from pmdc_jax import identify
 from pmdc_jax.identify.corrections.input_noise import denoised
-from pmdc_jax.recording import Recording
+from pmdc_jax.recordings.recording import Recording
 
 NOISE = 0.1  # V
 

@@ -18,7 +18,7 @@ from pmdc_jax import identify
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.recording import OVER_LAST, Recording
+from pmdc_jax.recordings.recording import OVER_LAST, Recording
 from pmdc_jax.simulate import (
     STRAIGHT,
     UNKNOWNS_PER_RUN,

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
-from pmdc_jax.columns import understand
 from pmdc_jax.errors import InputError
-from pmdc_jax.recording import Recording
-from pmdc_jax.recording_file import read_recording, recordings_of, write_recording
+from pmdc_jax.recordings.columns import understand
+from pmdc_jax.recordings.recording import Recording
+from pmdc_jax.recordings.recording_file import read_recording, recordings_of, write_recording
 
 T = np.arange(12) * 0.01
 NUMBER = {"allow_nan": False, "allow_infinity": False, "width": 64}
@@ -426,7 +426,7 @@ def test_a_million_rows_are_read_in_seconds(tmp_path):
 
 def test_importing_recordings_and_checks_imports_nothing_heavy():
     code = (
-        "import sys, pmdc_jax.recording, pmdc_jax.check;"
+        "import sys, pmdc_jax.recordings.recording, pmdc_jax.checks.check;"
         "print(*{'jax', 'pint', 'polars', 'scipy'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

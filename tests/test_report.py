@@ -15,12 +15,12 @@ from pmdc_jax import files
 from pmdc_jax.errors import InputError
 from pmdc_jax.identify.identification import Direction, Estimate, Identification, RunFit, Search
 from pmdc_jax.motor import Motor
-from pmdc_jax.recording import Finding
+from pmdc_jax.recordings.recording import Finding
 from pmdc_jax.report import figures, notation
 from pmdc_jax.report.identification import write_identification_report
+from pmdc_jax.report.identification_sentences import MODEL_ASSUMPTION, summary
 from pmdc_jax.report.json import identification_json, write_json
 from pmdc_jax.report.page import _commands
-from pmdc_jax.report.summary import MODEL_ASSUMPTION, summary
 from pmdc_jax.report.terminal import identification_tables
 
 TRUTH = {"R": 0.157, "L": 84e-6, "Kb": 0.0501, "Kt": 0.0501, "J": 1.21e-3, "f": 2.3e-4}

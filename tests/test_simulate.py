@@ -20,11 +20,12 @@ from scipy.integrate import solve_ivp
 
 import pmdc_jax
 from pmdc_jax import InputError
-from pmdc_jax.clock import is_even
 from pmdc_jax.effects import CoulombFriction, ResistanceHeating
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.recording import OVER_LAST, Recording
-from pmdc_jax.recording_file import write_recording
+from pmdc_jax.recordings.clock import is_even
+from pmdc_jax.recordings.recording import OVER_LAST, Recording
+from pmdc_jax.recordings.recording_file import write_recording
+from pmdc_jax.runtime.threads import map_in_threads
 from pmdc_jax.simulate import (
     RunUnknowns,
     Tape,
@@ -35,7 +36,6 @@ from pmdc_jax.simulate import (
     uniform,
 )
 from pmdc_jax.simulate.exponential import phi_functions
-from pmdc_jax.threads import map_in_threads
 
 BLOCKS = 4  # every tape below has this shape, so that few are compiled
 SAMPLES = 128 * BLOCKS
@@ -541,7 +541,7 @@ def test_importing_changes_no_setting_and_prints_nothing():
     code = (
         "import jax\n"
         "before = dict(jax.config.values)\n"
-        "import pmdc_jax, pmdc_jax.simulate, pmdc_jax.identify, pmdc_jax.cli, pmdc_jax.identify.binary_ga\n"
+        "import pmdc_jax, pmdc_jax.simulate, pmdc_jax.identify, pmdc_jax.cli, pmdc_jax.identify.search.binary_ga\n"
         "changed = {k: v for k, v in jax.config.values.items() if k in before and before[k] != v}\n"
         "assert not changed, changed\n"
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import attrs
 import numpy as np
 import pytest
+from pmdc_jax.identify.noise.sensor_noise.sensor_noise import quantum
 from scipy import ndimage, signal
 from scipy.interpolate import CubicSpline
 
@@ -16,8 +17,7 @@ from pmdc_jax.identify.corrections.speed_averaging import (
     averaging_of_counts,
     averaging_of_differences,
 )
-from pmdc_jax.identify.noise import quantum
-from pmdc_jax.recording import OVER_BOTH, OVER_LAST, Recording
+from pmdc_jax.recordings.recording import OVER_BOTH, OVER_LAST, Recording
 
 # a motor that speeds up within a few samples
 FAST_MOTOR = {"R": 0.5, "L": 0.001, "Kb": 0.05, "Kt": 0.05, "J": 5e-5, "f": 1e-4}

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from scipy.signal import chirp, dlsim
 
 from pmdc_jax import Identification, diagnose, identify
-from pmdc_jax.recording import Recording
+from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate.tape import rise_like_step
 
 TRUE = {"R": 1.2, "L": 1.8e-3, "Kb": 0.05, "Kt": 0.05, "J": 6e-5, "f": 4e-5}

@@ -16,9 +16,9 @@ from typing import Any
 
 from rich.console import Console
 
-from .cases import SETS, SUITES, Case, case, dump
-from .methods import METHODS
-from .tables import all_tables, outcome_of
+from benchmarks.naming.cases import SETS, SUITES, Case, case, dump
+from benchmarks.naming.methods import METHODS
+from benchmarks.naming.tables import all_tables, outcome_of
 
 OUT = Path(__file__).parents[1] / "out"
 SIZES = {

@@ -31,13 +31,20 @@ import numpy as np
 from numpy.random import Generator
 
 from benchmarks import virtual_bench as vb
+from benchmarks.naming import foreign
+from benchmarks.naming.excitations import BLIND, HOLDOUT, Excitations, jittered, standard
+from benchmarks.naming.hidden import (
+    FORMULAS,
+    LIBRARY,
+    NAMES,
+    STRANGERS,
+    Hidden,
+    Parameters,
+    log_uniform,
+)
+from benchmarks.naming.plant import Plant, ornstein_uhlenbeck, simulate, substeps
+from benchmarks.naming.strength import Gauge, Outputs, Response, amplitude_for, linear
 from benchmarks.virtual_bench import Columns, Excitation, Noise
-
-from . import foreign
-from .excitations import BLIND, HOLDOUT, Excitations, jittered, standard
-from .hidden import FORMULAS, LIBRARY, NAMES, STRANGERS, Hidden, Parameters, log_uniform
-from .plant import Plant, ornstein_uhlenbeck, simulate, substeps
-from .strength import Gauge, Outputs, Response, amplitude_for, linear
 
 SETS = {"tuning": 20_251, "report": 70_912}
 NOISES = ("white", "coloured_fast", "coloured_slow", "quantised")

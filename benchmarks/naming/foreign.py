@@ -14,11 +14,10 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from benchmarks.naming.excitations import HOLDOUT, Excitations
+from benchmarks.naming.hidden import LIBRARY, Hidden, Parameters, log_uniform
+from benchmarks.naming.plant import Plant
 from benchmarks.virtual_bench import Excitation, Noise
-
-from .excitations import HOLDOUT, Excitations
-from .hidden import LIBRARY, Hidden, Parameters, log_uniform
-from .plant import Plant
 
 SENSORS = ("ordinary", "encoder", "noisy_voltage", "converter", "angle")
 # an encoder has neither

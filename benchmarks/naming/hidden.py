@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from numpy.random import Generator
 
-from .plant import Plant
+from benchmarks.naming.plant import Plant
 
 Parameters = dict[str, float]
 

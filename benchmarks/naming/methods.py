@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.naming.sparse import sparse
+from benchmarks.naming.stepwise import stepwise
 from benchmarks.virtual_bench import Columns
-
-from .sparse import sparse
-from .stepwise import stepwise
 
 Answer = dict[str, Any]
 Runs = Mapping[str, Columns]

@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.naming.hidden import LIBRARY, Parameters
+from benchmarks.naming.plant import Plant, simulate
 from benchmarks.virtual_bench import SIX, Columns, paper_motor
-
-from .hidden import LIBRARY, Parameters
-from .plant import Plant, simulate
 
 Runs = Mapping[str, Columns]
 REFITTED = 4  # candidates of each round

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from benchmarks.naming.plant import Plant, compiled
 from benchmarks.virtual_bench import SIX, Excitation
-
-from .plant import Plant, compiled
 
 Outputs = NDArray[np.float64]  # current (A) and speed (rad/s), shape (samples, 2)
 DETECTABLE = 30.0  # chi-square that a single effect needs: p < 1e-7, to allow for many tests

@@ -9,8 +9,16 @@ from typing import Any
 
 from rich.table import Table
 
-from .hidden import NAMES
-from .score import PUBLISHED_RECOVERY, Outcome, gap_closed, intervals, named, outcome, right
+from benchmarks.naming.hidden import NAMES
+from benchmarks.naming.score import (
+    PUBLISHED_RECOVERY,
+    Outcome,
+    gap_closed,
+    intervals,
+    named,
+    outcome,
+    right,
+)
 
 Result = dict[str, Any]  # one line of the results file
 ABSTAINED = {"ambiguous": "amb", "not_in_library": "lib", "none_detected": "none", "error": "err"}

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..motor import Motor
-from ..precision import double_precision
+from ..runtime.precision import double_precision
 from .controllers import PI, PID, StateFeedback, StateFeedbackIntegral
 from .gains import reference_gain
 from .hardware import Hardware

@@ -6,9 +6,9 @@ import diffrax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..compiled import compiled
 from ..effects.base import State
 from ..motor import Motor
+from ..runtime.compiled import compiled
 from .controllers import AbstractController, Memory, Number
 from .loop import Response
 from .steady import steady_state

@@ -78,9 +78,9 @@ def load_controller(path: str | Path) -> Law:
     )
 
 
-def _numbers(where: str, given: Any, names: Iterable[str]) -> dict[str, float]:
-    given = given if isinstance(given, dict) else {}
-    return {name: finite_number(where, name, given.get(name), MEND) for name in names}
+def _numbers(where: str, values: Any, names: Iterable[str]) -> dict[str, float]:
+    values = values if isinstance(values, dict) else {}
+    return {name: finite_number(where, name, values.get(name), MEND) for name in names}
 
 
 def _positive(where: str, name: str, value: Any) -> float:

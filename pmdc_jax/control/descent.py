@@ -10,8 +10,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
-from ..compiled import compiled
 from ..motor import Motor
+from ..runtime.compiled import compiled
 from .controllers import Number
 from .gains import GainSpace
 from .law import SampledMotor

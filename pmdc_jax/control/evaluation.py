@@ -12,8 +12,8 @@ import numpy as np
 from attrs import field, frozen
 from jaxtyping import Array, Float
 
-from ..compiled import compiled
 from ..motor import Motor
+from ..runtime.compiled import compiled
 from .controllers import AbstractController
 from .law import Law, SampledMotor
 from .loop import Response, closed_loop

@@ -9,12 +9,6 @@ from ..motor import Motor
 from .steady import steady_state
 
 
-def steady_speed(motor: Motor, voltage: float, load: float = 0.0) -> float:
-    """Steady speed (rad/s) at a voltage against a load (N m), of the linear part of the motor."""
-    R, Kb, Kt, f = (float(getattr(motor, name)) for name in ("R", "Kb", "Kt", "f"))
-    return (Kt * voltage - R * load) / (R * f + Kt * Kb)
-
-
 def check_reachable(
     motor: Motor,
     setpoint: float,
@@ -46,12 +40,12 @@ def check_reachable(
 def _highest_speed(motor: Motor, setpoint: float, voltage_limit: float, load: float) -> float:
     """The highest speed (rad/s) that the voltage holds; with the motor's effects, by bisection."""
     if not motor.effects:
-        return max(0.0, steady_speed(motor, voltage_limit, load))
+        return max(0.0, float(motor.steady_speed(voltage_limit, load)))
     low, high = 0.0, abs(setpoint)
     for _ in range(20):
         middle = (low + high) / 2
-        held = abs(float(steady_state(motor, math.copysign(middle, setpoint), load)[1]))
-        low, high = (middle, high) if held <= voltage_limit else (low, middle)
+        voltage = abs(float(steady_state(motor, math.copysign(middle, setpoint), load)[1]))
+        low, high = (middle, high) if voltage <= voltage_limit else (low, middle)
     return low
 
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
+from ..runtime.compiled import compiled
 from ..simulate.propagator import make_propagator
 from ..simulate.solver import Input, held_step
 from .controllers import Number

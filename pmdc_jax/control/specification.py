@@ -12,7 +12,7 @@ from attrs import frozen
 from ..errors import InputError
 from ..motor import Motor
 from .controllers import CONTROLLERS
-from .feasibility import check_reachable, check_settling, default_load_torque, steady_speed
+from .feasibility import check_reachable, check_settling, default_load_torque
 from .hardware import Hardware
 from .loop import REMEMBERED_SAMPLES
 from .steady import steady_state
@@ -126,7 +126,7 @@ class LoopRequirements:
                 voltage_limit = _three_digits(VOLTAGE_RESERVE * holding_voltage)
             notes.append(f"no voltage limit given: using {voltage_limit:g} V")
         if setpoint is None:
-            setpoint = _three_digits(SETPOINT_SHARE * steady_speed(motor, voltage_limit))
+            setpoint = _three_digits(SETPOINT_SHARE * float(motor.steady_speed(voltage_limit)))
             notes.append(
                 f"no set point given: using {setpoint:g} rad/s,"
                 f" {100 * SETPOINT_SHARE:g} % of the largest speed"

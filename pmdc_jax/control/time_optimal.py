@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
-from ..precision import double_precision
+from ..runtime.compiled import compiled
+from ..runtime.precision import double_precision
 from ..simulate.propagator import Propagator, make_propagator
 from ..simulate.solver import Input, held_step
 from .controllers import Number

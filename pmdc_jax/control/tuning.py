@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from attrs import field, frozen
 
-from ..compiled import free_memory_maps
 from ..motor import Motor
 from ..motor_file import Uncertainty
-from ..precision import double_precision
 from ..progress import ReportProgress, silent
+from ..runtime.compiled import free_memory_maps
+from ..runtime.precision import double_precision
 from ..simulate.propagator import steps_within
 from .classical import ZIEGLER_NICHOLS_CONTROLLERS, ziegler_nichols
 from .controllers import AbstractController

@@ -8,12 +8,12 @@ from scipy import stats
 
 from ..effects import EFFECTS
 from ..identify.identification import Identification
-from .assessment import FALSE_ALARM
 from .diagnosis import Detectable, EffectFound, LearnedCurve, Region
-from .evidence import MIN_EIGENVALUE, Block
-from .library import Curve
-from .naming import Naming
-from .signals import Screen, log_p_value
+from .evidence.assessment import FALSE_ALARM
+from .evidence.regression import MIN_EIGENVALUE, Block
+from .evidence.signals import Screen, log_p_value
+from .hypotheses.library import Curve
+from .selection.naming import Naming
 
 # A knot of a curve is part of a region if its misfit is so many standard errors
 REGION_Z = 4.0
@@ -40,16 +40,16 @@ def rival_sets(naming: Naming) -> tuple[tuple[str, ...], ...]:
 
 def regions_of_misfit(naming: Naming) -> tuple[Region, ...]:
     """Where the curves of the motor without effects are far from zero, the clearest first; also a line in frequency."""
-    found, line = naming.base_screen, naming.line
-    base = found.evidence.regress().squares
+    screen, line = naming.base_screen, naming.line
+    base = screen.evidence.regress().squares
     regions = []
-    for curve, block in zip(found.curves, found.curve_blocks, strict=True):
+    for curve, block in zip(screen.curves, screen.curve_blocks, strict=True):
         if curve.per_run or curve.is_sensor_error:
             continue
-        gain = base - found.evidence.regress([block]).squares
-        if log_p_value(gain, found.evidence.degrees_of_freedom(block)) > np.log(1e-4):
+        gain = base - screen.evidence.regress([block]).squares
+        if log_p_value(gain, screen.evidence.degrees_of_freedom(block)) > np.log(1e-4):
             continue
-        z = np.array([_z_of_column(found, column) for column in block.columns])
+        z = np.array([_z_of_column(screen, column) for column in block.columns])
         regions += _regions_of_curve(curve, z)
     if line is not None:
         region = (line.low, line.high)
@@ -57,9 +57,9 @@ def regions_of_misfit(naming: Naming) -> tuple[Region, ...]:
     return tuple(sorted(regions, key=lambda r: -abs(r.z))[:12])
 
 
-def _z_of_column(found: Screen, column: int) -> float:
+def _z_of_column(screen: Screen, column: int) -> float:
     """The misfit at one knot over its standard error; regressed alone, as neighbours would share what they explain."""
-    fit = found.evidence.regress([Block((column,))])
+    fit = screen.evidence.regress([Block((column,))])
     error = float(fit.errors[0][0])
     return float(fit.coefficients[0][0]) / error if error > 0 else 0.0
 
@@ -83,16 +83,16 @@ def _regions_of_curve(curve: Curve, z: np.ndarray) -> list[Region]:
 
 def learned_curves(naming: Naming) -> tuple[LearnedCurve, ...]:
     """The curves that the data still show, at most three, the most significant first; none for a line in frequency."""
-    found = naming.chosen_screen
+    screen = naming.chosen_screen
     if naming.p_nothing_more >= FALSE_ALARM:
         return ()
-    base = found.evidence.regress().squares
+    base = screen.evidence.regress().squares
     learned = []
-    for curve, block in zip(found.curves, found.curve_blocks, strict=True):
+    for curve, block in zip(screen.curves, screen.curve_blocks, strict=True):
         # directions that the motor's own parameters can imitate are no part of the curve
         least = 1e-3 if curve.order > 1 else MIN_EIGENVALUE
-        fit = found.evidence.regress([block], min_eigenvalue=least)
-        log_p = log_p_value(base - fit.squares, found.evidence.degrees_of_freedom(block))
+        fit = screen.evidence.regress([block], min_eigenvalue=least)
+        log_p = log_p_value(base - fit.squares, screen.evidence.degrees_of_freedom(block))
         value, error = fit.coefficients[0], fit.errors[0]
         if curve.per_run:  # of the run that shows it most clearly
             clearest = np.argmax(np.sum(np.square(value / np.maximum(error, 1e-300)), axis=1))
@@ -111,18 +111,18 @@ def learned_curves(naming: Naming) -> tuple[LearnedCurve, ...]:
     return tuple(curve for _, curve in sorted(learned, key=lambda pair: pair[0])[:3])
 
 
-def detectable_effects(found: Screen) -> tuple[Detectable, ...]:
+def detectable_effects(screen: Screen) -> tuple[Detectable, ...]:
     """The smallest amplitude of each effect that would be detected with a probability of 90 %, if it is physical."""
-    count = len(found.candidates) + len(found.curves)
+    count = len(screen.candidates) + len(screen.curves)
     needed = stats.norm.isf(FALSE_ALARM / count / 2) + stats.norm.isf(0.1)
     smallest: dict[str, Detectable] = {}
-    for candidate, block in zip(found.candidates, found.candidate_blocks, strict=True):
+    for candidate, block in zip(screen.candidates, screen.candidate_blocks, strict=True):
         field = candidate.amplitude
         if field is None:
             continue
-        error = float(np.min(found.evidence.regress([block]).errors[0][..., -1]))
-        error *= np.sqrt(found.evidence.rounding_dispersion(block))
-        least = max(found.sensor_floor(candidate), candidate.min_amplitude)
+        error = float(np.min(screen.evidence.regress([block]).errors[0][..., -1]))
+        error *= np.sqrt(screen.evidence.rounding_dispersion(block))
+        least = max(screen.sensor_floor(candidate), candidate.min_amplitude)
         amplitude = max(float(needed * error * candidate.unit), least)
         known = smallest.get(candidate.effect)
         if error > 0 and amplitude < (known.amplitude if known else candidate.max_amplitude):

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from scipy import stats
 
 from ..motor import Motor
-from ..recording import Recording
+from ..recordings.recording import Recording
 from ..simulate import Tape, free_run
 from .diagnosis import NextExperiment
-from .naming import Naming
+from .selection.naming import Naming
 
 # Length of the run in s, and its sample time
 DURATION, SAMPLE_TIME = 6.0, 1e-3

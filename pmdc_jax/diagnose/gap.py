@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..identify.identification import Role, RunFit
-from ..identify.noise import MIN_RELATIVE_NOISE, noise_of_sensor, rms
+from ..identify.noise.sensor_noise import MIN_RELATIVE_NOISE, noise_of_sensor, rms
 from .diagnosis import Gap
 
 CHANNELS = ("current", "speed")
@@ -68,7 +68,7 @@ def noise_of_runs(fits: Fits, share: float) -> Noise:
 def _noise_of_runs(fits: Fits, channel: str, share: float) -> dict[str, float]:
     training = {name: f for name, f in fits.items() if f.role == "train"}
     white = {name: _white_noise(f, channel) for name, f in fits.items()}
-    left = {name: getattr(f, f"{channel}_rmse") for name, f in training.items()}
+    residual = {name: getattr(f, f"{channel}_rmse") for name, f in training.items()}
     signals = {name: getattr(f, channel) for name, f in training.items()}
     measured = {name: None if x is None else rms(x) for name, x in signals.items()}
 
@@ -78,7 +78,7 @@ def _noise_of_runs(fits: Fits, channel: str, share: float) -> dict[str, float]:
         return float(np.sqrt(sum(x * x * n for x, n in known) / samples)) if samples else 0.0
 
     of_all = pooled(white)
-    coloured = max((share * pooled(left)) ** 2 - of_all**2, 0.0)
+    coloured = max((share * pooled(residual)) ** 2 - of_all**2, 0.0)
     least = MIN_RELATIVE_NOISE * pooled(measured)
     return {
         name: max(float(np.hypot(np.sqrt(coloured), of_all if own is None else own)), least)
@@ -88,5 +88,5 @@ def _noise_of_runs(fits: Fits, channel: str, share: float) -> dict[str, float]:
 
 def _white_noise(fit: RunFit, channel: str) -> float | None:
     """White noise in the residuals of a run's channel; None if it was not measured."""
-    left = fit.residual(channel)
-    return None if left is None else noise_of_sensor(getattr(fit, channel), left)
+    residual = fit.residual(channel)
+    return None if residual is None else noise_of_sensor(getattr(fit, channel), residual)

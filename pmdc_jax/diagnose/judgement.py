@@ -5,11 +5,11 @@ from __future__ import annotations
 from ..effects import EFFECTS, ShaftCompliance
 from ..identify.identification import Identification
 from ..motor import Motor
-from .assessment import FALSE_ALARM
 from .diagnosis import Verdict, breaks_electrical_equation, is_disturbed, unlike_held_out
+from .evidence.assessment import FALSE_ALARM
 from .gap import Noise, closed_fraction, gaps_by_role, gaps_of_runs, noise_of_runs
-from .library import Library
-from .naming import Naming
+from .hypotheses.library import Library
+from .selection.naming import Naming
 
 # An effect with a smaller p-value without it is kept even if the runs give no interval of any of its parameters
 CERTAIN_P_VALUE = 1e-30
@@ -63,12 +63,12 @@ def unneeded_effect(
 def may_be_absent(final: Identification, effect: str, amplitude: str) -> bool:
     """Whether the 95 % interval of an effect's amplitude includes zero, or, if it is strictly positive, the larger of
     its lower bound and the share `ABSENT_SHARE` of the estimate."""
-    found, about = final.parameters[f"{effect}.{amplitude}"], EFFECTS[effect].ranges[amplitude]
-    if found.value is None or found.ci95 is None:
+    estimate, about = final.parameters[f"{effect}.{amplitude}"], EFFECTS[effect].ranges[amplitude]
+    if estimate.value is None or estimate.ci95 is None:
         return False
     least = about.lower * (1 + 1e-6)  # the bound after its logarithm and back
-    absent = max(least, ABSENT_SHARE * found.value) if about.scale == "log" else 0.0
-    return found.ci95[0] <= absent <= found.ci95[1]
+    absent = max(least, ABSENT_SHARE * estimate.value) if about.scale == "log" else 0.0
+    return estimate.ci95[0] <= absent <= estimate.ci95[1]
 
 
 def judge(

@@ -9,20 +9,20 @@ import attrs
 import numpy as np
 
 from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction, InputDeadZone
-from ..identify.generalised_least_squares import (
+from ..identify.fit.generalised_least_squares import (
     last_fit,
     residuals_of,
     series_of,
     training_indices,
     with_whitening,
 )
-from ..identify.noise_model import Series, Whitener
-from ..identify.polish import Fit, fit_at, reweighted
+from ..identify.fit.polish import Fit, fit_at, reweighted
+from ..identify.fit.refine import Optimum
+from ..identify.noise.noise_model import Series, Whitener
 from ..identify.prepare import Prepared
-from ..identify.refine import Optimum
 from ..identify.rotor_angle import rotor_outputs, with_rotor_angle
 from ..identify.solve import polish_with_angle
-from ..identify.uncertainty import MIN_UNSEEN_STDERR
+from ..identify.uncertainty.covariance import MIN_UNSEEN_STDERR
 from ..motor import Motor
 from .response import Path, path_of
 
@@ -39,13 +39,13 @@ class Model:
     """A motor with some effects, fitted to the recordings; compared and hashed by identity."""
 
     effects: tuple[str, ...]
-    given: Prepared
+    prepared: Prepared
     fit: Fit
 
     @property
     def motor(self) -> Motor:
         """The fitted motor."""
-        return self.given.problem.parameters(self.fit.coordinates)
+        return self.prepared.problem.parameters(self.fit.coordinates)
 
     @property
     def is_possible(self) -> bool:
@@ -71,7 +71,7 @@ class Model:
         recorded voltage where that is zero.
         """
         width = sum(float(e.width_V) for e in self.motor.effects if isinstance(e, InputDeadZone))
-        tape = self.given.problem.tape
+        tape = self.prepared.problem.tape
         driven = [k for k in self.training if tape.drive_of(k).voltage]
         if not width or not driven:
             return True
@@ -82,13 +82,13 @@ class Model:
     @property
     def travel(self) -> float:
         """The largest range of rotor angles, in rad, of any training run."""
-        angle, tape = np.asarray(self.path.angle), self.given.problem.tape
+        angle, tape = np.asarray(self.path.angle), self.prepared.problem.tape
         return float(max(np.ptp(angle[:, tape.blocks_of(run)]) for run in self.training))
 
     @property
     def effects_at_end(self) -> set[str]:
         """The effects with a parameter that is held at its bound or `undetermined`."""
-        names = self.given.problem.parameters.names
+        names = self.prepared.problem.parameters.names
         at_end = {names[k] for k in self.fit.at_bound} | self.undetermined
         return {name.partition(".")[0] for name in at_end} & set(self.effects)
 
@@ -96,7 +96,7 @@ class Model:
     def undetermined(self) -> set[str]:
         """The parameters to which no run is sensitive (standard error above `MIN_UNSEEN_STDERR`), so that a refit would
         not move them."""
-        problem = self.given.problem
+        problem = self.prepared.problem
         names = problem.parameters.names
         # columns of each run's own unknowns follow those of the parameters
         jacobian = np.asarray(self.fit.evaluation.jacobian)
@@ -133,7 +133,7 @@ class Model:
     def path(self) -> Path:
         """The free run of the fitted motor: the states of the rotor itself, before any sensor."""
         held = {EFFECTS[name].holds for name in self.effects}
-        problem = self.given.problem
+        problem = self.prepared.problem
         start_angle = self.fit.unknowns.runs.angle
         return path_of(
             rotor_outputs(problem, self.fit),
@@ -146,7 +146,7 @@ class Model:
     @property
     def relative_misfit(self) -> float:
         """Its residuals over what was measured, as root mean squares, for the output where that is larger."""
-        sizes = self.given.problem.measured_rms
+        sizes = self.prepared.problem.measured_rms
         measured = sizes > 0
         return float(np.max(self.fit.noise[measured] / sizes[measured], initial=0.0))
 
@@ -158,31 +158,33 @@ class Model:
     @property
     def training(self) -> list[int]:
         """The runs that it was fitted to."""
-        return training_indices(self.given)
+        return training_indices(self.prepared)
 
 
-def refit_from(effects: tuple[str, ...], given: Prepared, start: Optimum, white: Whitener) -> Model:
+def refit_from(
+    effects: tuple[str, ...], prepared: Prepared, start: Optimum, white: Whitener
+) -> Model:
     """A model fitted from a start to whitened residuals; its `fit` is evaluated without the filter."""
-    given, whitened = polish_with_angle(with_whitening(given, white), start)
-    given = given._replace(problem=replace(given.problem, whitening=None))
+    prepared, whitened = polish_with_angle(with_whitening(prepared, white), start)
+    prepared = prepared._replace(problem=replace(prepared.problem, whitening=None))
     # no step: the unfiltered residuals at the same point
-    unfiltered = fit_at(given.problem, whitened.optimum)
+    unfiltered = fit_at(prepared.problem, whitened.optimum)
     optimum = whitened.optimum._replace(fitness=unfiltered.fitness)
-    return model_of(effects, given, unfiltered._replace(optimum=optimum))
+    return model_of(effects, prepared, unfiltered._replace(optimum=optimum))
 
 
-def model_of(effects: tuple[str, ...], given: Prepared, fit: Fit) -> Model:
+def model_of(effects: tuple[str, ...], prepared: Prepared, fit: Fit) -> Model:
     """A fitted model, with the rotor angle of each sample estimated from recordings and fit together."""
-    if not given.problem.depends_on_angle:  # with an effect of the angle, the fit has done this
-        given = given._replace(problem=with_rotor_angle(given.problem, fit))
-    return Model(effects, given, fit)
+    if not prepared.problem.depends_on_angle:  # with an effect of the angle, the fit has done this
+        prepared = prepared._replace(problem=with_rotor_angle(prepared.problem, fit))
+    return Model(effects, prepared, fit)
 
 
 def final_fit(model: Model, white: Whitener) -> tuple[Prepared, Fit]:
     """The last fit of a model: to whitened residuals where `last_fit` allows it, else by plain least squares."""
-    known = reweighted(model.given.problem, model.fit)
-    given, unfiltered = polish_with_angle(model.given, model.fit.optimum, known)
-    return last_fit(given, unfiltered, model.fit, white)
+    known = reweighted(model.prepared.problem, model.fit)
+    prepared, unfiltered = polish_with_angle(model.prepared, model.fit.optimum, known)
+    return last_fit(prepared, unfiltered, model.fit, white)
 
 
 class RunSeries(NamedTuple):
@@ -196,16 +198,16 @@ class RunSeries(NamedTuple):
 
 def series_of_runs(model: Model) -> list[RunSeries]:
     """The fit of every training run, in the order of time."""
-    evaluation, tape = model.fit.evaluation, model.given.problem.tape
+    evaluation, tape = model.fit.evaluation, model.prepared.problem.tape
     J = np.asarray(evaluation.jacobian) * model.fit.noise[:, None, None]
-    count = model.given.problem.free.shape[0]
-    residuals = residuals_of(model.given, model.fit)
+    count = model.prepared.problem.free.shape[0]
+    residuals = residuals_of(model.prepared, model.fit)
     return [
         RunSeries(
             series_of(tape, run, J[..., :count]),
             series_of(tape, run, J[..., count:]),
             residual,
-            series_of(tape, run, np.asarray(evaluation.seen)),
+            series_of(tape, run, np.asarray(evaluation.simulated)),
         )
         for run, residual in zip(model.training, residuals, strict=True)
     ]

@@ -7,17 +7,14 @@ from collections.abc import Mapping, Sequence
 
 import attrs
 
-from ..compiled import free_memory_maps
 from ..identify.identification import Identification
 from ..identify.prepare import prepare
 from ..identify.results import results_of
 from ..identify.solve import Solved
-from ..precision import double_precision
 from ..progress import ReportProgress, silent
-from ..recording_file import Runs
-from .assessment import FALSE_ALARM
-from .attempts import Attempt, likeliest_attempt
-from .balance import electrical_misfit
+from ..recordings.recording_file import Runs
+from ..runtime.compiled import free_memory_maps
+from ..runtime.precision import double_precision
 from .description import (
     detectable_effects,
     effects_found,
@@ -26,10 +23,13 @@ from .description import (
     rival_sets,
 )
 from .diagnosis import Diagnosis
+from .evidence.assessment import FALSE_ALARM
+from .evidence.electrical_balance import electrical_misfit
 from .experiment import next_experiment
 from .gap import closed_fraction, gaps_by_role, gaps_of_runs
 from .judgement import implausible_effect, judge, unneeded_effect
-from .naming import Naming
+from .selection.naming import Naming
+from .selection.timing import Attempt, likeliest_attempt
 
 
 @double_precision
@@ -58,12 +58,12 @@ def diagnose(
     free_memory_maps()
     report("checking the recordings")
     prepared = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
-    found = likeliest_attempt(prepared, search, seed, report)
-    given, naming_ended = found.given, time.perf_counter()
-    report("estimating the uncertainty", found.naming.chosen.fit.fitness)
-    base = results_of(given, found.solved)
-    naming, final = _without_unneeded_effects(found, base)
-    before, after = (electrical_misfit(m) for m in (found.selection.base, naming.chosen))
+    attempt = likeliest_attempt(prepared, search, seed, report)
+    prepared, naming_ended = attempt.prepared, time.perf_counter()
+    report("estimating the uncertainty", attempt.naming.chosen.fit.fitness)
+    base = results_of(prepared, attempt.solved)
+    naming, final = _without_unneeded_effects(attempt, base)
+    before, after = (electrical_misfit(m) for m in (attempt.selection.base, naming.chosen))
     verdict, noise = judge(naming, base, final, (before, after))
     gaps = gaps_of_runs(base.fit, final.fit, noise)
     by_role = gaps_by_role(gaps, base.fit)
@@ -71,8 +71,8 @@ def diagnose(
     tells_curves = verdict == "not_in_library" or naming.leaves_sensor_error
     tells_curves = tells_curves and naming.varies is None
     seconds = {
-        "identify": found.identifying,
-        "name": naming_ended - began - found.identifying,
+        "identify": attempt.identifying,
+        "name": naming_ended - began - attempt.identifying,
         "total": time.perf_counter() - began,
     }
     final = attrs.evolve(final, seconds=seconds)
@@ -84,7 +84,9 @@ def diagnose(
         gap_of_run=gaps,
         closed_fraction=closed_fraction(by_role) if naming.chosen.effects else None,
         rivals=rival_sets(naming),
-        next_experiment=next_experiment(naming, given.training) if verdict == "ambiguous" else None,
+        next_experiment=next_experiment(naming, prepared.training)
+        if verdict == "ambiguous"
+        else None,
         curves=learned_curves(naming) if tells_curves else (),
         detectable=detectable_effects(naming.chosen_screen),
         base=base,
@@ -102,22 +104,22 @@ def diagnose(
 
 
 def _without_unneeded_effects(
-    found: Attempt, base: Identification
+    attempt: Attempt, base: Identification
 ) -> tuple[Naming, Identification]:
     """The naming without effects that are implausible or that the runs do not need, and the motor it identifies; `base`
     is the motor without effects."""
-    naming = found.naming
-    final = _identification(naming, found.solved)
+    naming = attempt.naming
+    final = _identification(naming, attempt.solved)
     while effect := (
         implausible_effect(naming.chosen.motor)
-        or unneeded_effect(naming, base, final, found.selection.library)
+        or unneeded_effect(naming, base, final, attempt.selection.library)
     ):
-        naming = found.selection.without(naming, effect)
-        final = _identification(naming, found.solved)
+        naming = attempt.selection.without(naming, effect)
+        final = _identification(naming, attempt.solved)
     return naming, final
 
 
 def _identification(naming: Naming, solved: Solved) -> Identification:
     """The identification of the chosen motor."""
-    given, fit = naming.final_fit
-    return results_of(given, solved._replace(fit=fit))
+    prepared, fit = naming.final_fit
+    return results_of(prepared, solved._replace(fit=fit))

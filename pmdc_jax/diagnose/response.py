@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compiled import compiled
 from ..effects import State
 from ..effects.base import Scalars
 from ..motor import Motor
+from ..runtime.compiled import compiled
 from ..simulate import Tape
 from ..simulate.propagator import Propagator, grid_propagators, pick_grid, steps_in_sample
 from ..simulate.sensing import outputs, reported
@@ -42,7 +42,7 @@ class Path(NamedTuple):
 
 @compiled
 def path_of(
-    seen: Float[Array, "blocks 2 samples"],
+    simulated: Float[Array, "blocks 2 samples"],
     tape: Tape,
     start_angle: Float[Array, " runs"],
     can_stick: bool | Array,
@@ -50,17 +50,17 @@ def path_of(
 ) -> Path:
     """The path of free runs.
 
-    **Arguments**: `seen`, simulated current in A and speed in rad/s; `start_angle`, the angle in rad where each run
-    begins; `can_stick` and `can_coast`, whether the motor has friction that can hold the rotor, and brushes that can
-    block the current.
+    **Arguments**: `simulated`, current in A and speed in rad/s; `start_angle`, the angle in rad where each run begins;
+    `can_stick` and `can_coast`, whether the motor has friction that can hold the rotor, and brushes that can block the
+    current.
     """
-    current, speed = seen[:, 0].T, seen[:, 1].T
+    current, speed = simulated[:, 0].T, simulated[:, 1].T
     drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid], tape.drive)
     current = drive.voltage * current + drive.current * jnp.asarray(tape.value).T
     step = jnp.asarray(tape.sample_time)[tape.grid][:, None]
     # the turn in a sample is its mean speed times its length
-    next_speed = jnp.append(seen[:, 1].reshape(-1)[1:], 0.0).reshape(tape.turn.shape)
-    turn = jnp.where(jnp.isnan(tape.turn), (seen[:, 1] + next_speed) / 2 * step, tape.turn)
+    next_speed = jnp.append(simulated[:, 1].reshape(-1)[1:], 0.0).reshape(tape.turn.shape)
+    turn = jnp.where(jnp.isnan(tape.turn), (simulated[:, 1] + next_speed) / 2 * step, tape.turn)
     before = jnp.append(0.0, jnp.cumsum(turn.reshape(-1))[:-1]).reshape(turn.shape)
     first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
     angle = before - before[first, :1] + start_angle[tape.run][:, None]
@@ -90,15 +90,15 @@ def _sensor_outputs(motor: Motor, tape: Tape, path: Path) -> Outputs:
     mean = None
     if propagator.mean is not None:
         _, mean = held_step_and_mean(motor, propagator, inputs, state, steps)
-    seen = outputs(motor, propagator, inputs, state, steps, mean)
-    return _reported_samples_first(motor, tape, jnp.moveaxis(seen, 0, 1))
+    simulated = outputs(motor, propagator, inputs, state, steps, mean)
+    return _reported_samples_first(motor, tape, jnp.moveaxis(simulated, 0, 1))
 
 
 def _reported_samples_first(
-    motor: Motor, tape: Tape, seen: Float[Array, "samples outputs blocks"]
+    motor: Motor, tape: Tape, simulated: Float[Array, "samples outputs blocks"]
 ) -> Outputs:
     """What the motor reports (`reported`) of outputs whose first axis is the samples."""
-    return reported(motor, tape, seen.transpose(2, 1, 0)).transpose(2, 1, 0)
+    return reported(motor, tape, simulated.transpose(2, 1, 0)).transpose(2, 1, 0)
 
 
 @compiled
@@ -207,14 +207,14 @@ def _reported_response(
         by_start = jnp.einsum("ijsb,sjbc->sibc", within.mean.transition, at_start)
         return (by_start + share / 2 * kicks) * varies
 
-    seen = [response, mean(propagator, 1.0)]
+    simulated = [response, mean(propagator, 1.0)]
     if propagator.reading is not None:
         part, share = propagator.reading
         share = jnp.asarray(share)[:, None, :, None]
-        seen.append((share * mean(part, share))[:, 1:])
-    seen = jnp.concatenate(seen, 1)
+        simulated.append((share * mean(part, share))[:, 1:])
+    simulated = jnp.concatenate(simulated, 1)
     report = partial(_reported_samples_first, motor, tape)
-    return jax.vmap(report, in_axes=-1, out_axes=-1)(seen)
+    return jax.vmap(report, in_axes=-1, out_axes=-1)(simulated)
 
 
 def _propagator_and_inputs(motor: Motor, tape: Tape) -> tuple[Propagator, Input]:

@@ -17,10 +17,11 @@ attributes, each of which does nothing unless the effect overrides it:
 - `fastest_rate`: the fastest rate that it adds to the motor
 - `sensors`, `speed_delay` and `speed_before_sensor`: reported current and speed, and the speed behind a report
 
-A new effect is one class in this package, one row in its table `EFFECTS` and one in that of `diagnose/trials.py`. Its
-class attributes say what kind of effect it is: whether it is `affine` and its `longest_step` decide how fast it is
-simulated; `holds`, `contact_state` and `spring_state` belong to dry elements, teeth and springs; the `variable` of
-which it is a function, and whether it `needs_current`, decide which runs can show it.
+A new effect is one class in this package, one row in its table `EFFECTS` and one in that of
+`diagnose/hypotheses/trials.py`. Its class attributes say what kind of effect it is: whether it is `affine` and its
+`longest_step` decide how fast it is simulated; `holds`, `contact_state` and `spring_state` belong to dry elements,
+teeth and springs; the `variable` of which it is a function, and whether it `needs_current`, decide which runs
+can show it.
 """
 
 from __future__ import annotations

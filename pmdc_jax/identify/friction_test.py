@@ -17,12 +17,12 @@ from scipy.linalg import expm
 from scipy.signal import lfilter, ss2tf
 
 from ..motor import Motor
-from ..recording import OVER_LAST
+from ..recordings.recording import OVER_LAST
 from ..simulate import UNKNOWNS_PER_RUN, Tape
-from .generalised_least_squares import residuals_of, series_of, training_indices
+from .fit.generalised_least_squares import residuals_of, series_of, training_indices
+from .fit.polish import Fit
 from .identification import Identification
-from .noise_model import Series, Whitener, scaling_whitener, whitener
-from .polish import Fit
+from .noise.noise_model import Series, Whitener, scaling_whitener, whitener
 from .prepare import Prepared
 
 # Standard errors above zero from which friction is significant
@@ -48,36 +48,38 @@ class MissingFriction(NamedTuple):
     ]  # of the search coordinates without friction in the model
 
 
-def missing_friction(given: Prepared, fit: Fit) -> MissingFriction | None:
+def missing_friction(prepared: Prepared, fit: Fit) -> MissingFriction | None:
     """The dry friction that a fit to the training runs lacks; None if it has some already or lacks none clearly."""
-    problem, count = given.problem, len(given.problem.free)
+    problem, count = prepared.problem, len(prepared.problem.free)
     if any(effect.holds == "speed" for effect in problem.parameters.effects):
         return None
-    rows = _regression_columns(given, fit)
+    rows = _regression_columns(prepared, fit)
     residuals = [series._replace(values=series.values[..., -1]) for series in rows]
-    found = _regress(rows, scaling_whitener(residuals), count)
+    regression = _regress(rows, scaling_whitener(residuals), count)
     if (
-        found.z_score(count) <= MIN_Z_SCORE
+        regression.z_score(count) <= MIN_Z_SCORE
     ):  # too large rather than too small where the noise is coloured
         return None
-    found = _regress(rows, whitener(found.residuals), count)
-    z_score = found.z_score(count)
-    friction, bias = float(found.coefficients[count]), found.coefficients[:count]
+    regression = _regress(rows, whitener(regression.residuals), count)
+    z_score = regression.z_score(count)
+    friction, bias = float(regression.coefficients[count]), regression.coefficients[:count]
     return MissingFriction(friction, z_score, bias) if z_score > MIN_Z_SCORE else None
 
 
-def friction_messages(missing: MissingFriction | None, found: Identification) -> Iterator[str]:
+def friction_messages(
+    missing: MissingFriction | None, identification: Identification
+) -> Iterator[str]:
     """A message on the friction that a fit lacks, if a parameter compensates for it by more than `MIN_BIAS` of its
     standard errors, or if the residuals are far larger than the noise, so that no standard error is reliable."""
-    if missing is None or found.covariance is None:
+    if missing is None or identification.covariance is None:
         return
     # of the free parameters, which come before the tied ones
-    errors = np.sqrt(np.diag(found.covariance))[: len(missing.bias)]
+    errors = np.sqrt(np.diag(identification.covariance))[: len(missing.bias)]
     bias = np.abs(missing.bias) / np.where(errors > 0, errors, np.inf)
     worst = int(np.argmax(bias))
     if bias[worst] > MIN_BIAS:
-        wrong = f", and without it {found.covariance_names[worst]} is biased by more than its standard error"
-    elif found.missed:
+        wrong = f", and without it {identification.covariance_names[worst]} is biased by more than its standard error"
+    elif identification.missed:
         wrong = ""
     else:
         return
@@ -88,23 +90,23 @@ def friction_messages(missing: MissingFriction | None, found: Identification) ->
     )
 
 
-def _regression_columns(given: Prepared, fit: Fit) -> list[Series]:
+def _regression_columns(prepared: Prepared, fit: Fit) -> list[Series]:
     """Columns of the regression for each training run, in A and rad/s: the derivatives with respect to the motor's
     parameters, the response to 1 N m of dry friction, the derivatives with respect to the run's own unknowns, and last
     the residual."""
-    problem, tape = given.problem, given.problem.tape
+    problem, tape = prepared.problem, prepared.problem.tape
     motor, count = problem.parameters(fit.coordinates), len(problem.free)
-    of_grid = {tape.grid_of(run): run for run in training_indices(given)}
+    of_grid = {tape.grid_of(run): run for run in training_indices(prepared)}
     filters = {grid: _load_filter(motor, tape, run) for grid, run in of_grid.items()}
     J = np.asarray(fit.evaluation.jacobian) * fit.noise[:, None, None]
     rows = []
-    for run, residual in zip(training_indices(given), residuals_of(given, fit), strict=True):
-        speed = np.asarray(fit.evaluation.seen)[tape.blocks_of(run), 1].ravel()
+    for run, residual in zip(training_indices(prepared), residuals_of(prepared, fit), strict=True):
+        speed = np.asarray(fit.evaluation.simulated)[tape.blocks_of(run), 1].ravel()
         _, outputs = residual.kind
         friction = _load_response(filters[tape.grid_of(run)], np.sign(speed))
-        if (averaging := given.runs[run].averaging) is not None:
+        if (averaging := prepared.runs[run].averaging) is not None:
             friction[:, 1] = averaging.applied_to(friction[:, 1])
-        if given.runs[run].current_averaged:
+        if prepared.runs[run].current_averaged:
             friction[:, 0] = OVER_LAST.applied_to(friction[:, 0])
         friction = friction[:, list(outputs)]
         derivatives = series_of(tape, run, J).values

@@ -9,7 +9,7 @@ import numpy as np
 from attrs import field, frozen
 
 from ..motor import Motor
-from ..recording import Finding
+from ..recordings.recording import Finding
 
 # A refinement that ends within so many standard errors of the minimum has converged: at the kinks of dry elements,
 # the linearised model predicts a reduction that no step attains

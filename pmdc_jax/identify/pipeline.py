@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 
 import attrs
 
-from ..compiled import free_memory_maps
-from ..precision import double_precision
 from ..progress import ReportProgress, silent
-from ..recording_file import Runs
+from ..recordings.recording_file import Runs
+from ..runtime.compiled import free_memory_maps
+from ..runtime.precision import double_precision
+from .fit.generalised_least_squares import last_fit, residuals_of
 from .friction_test import friction_messages, missing_friction
-from .generalised_least_squares import last_fit, residuals_of
 from .identification import Identification
-from .noise_model import whitener
+from .noise.noise_model import whitener
 from .parameters import effects_named
 from .prepare import prepare
 from .results import results_of
@@ -50,22 +50,22 @@ def identify(
     report = progress or silent
     free_memory_maps()
     report("checking the recordings")
-    given = prepare(
+    prepared = prepare(
         recordings, holdout, tie=tie, known=known, unloaded=unloaded, effects=effects_named(effects)
     )
-    given, solved = solve(given, search, seed, progress)
+    prepared, solved = solve(prepared, search, seed, progress)
     report("estimating the uncertainty", solved.fit.fitness)
     plain_fit = solved.fit
-    friction = missing_friction(given, plain_fit)
-    white = whitener(residuals_of(given, plain_fit))
-    given, polished = last_fit(given, plain_fit, plain_fit, white)
-    found = results_of(given, solved._replace(fit=polished))
+    friction = missing_friction(prepared, plain_fit)
+    white = whitener(residuals_of(prepared, plain_fit))
+    prepared, polished = last_fit(prepared, plain_fit, plain_fit, white)
+    result = results_of(prepared, solved._replace(fit=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
     residual_messages = (
         f"the residual of the {name} is {times:.2g} times its white noise: run `pmdc diagnose` to find out whether the "
         "model lacks an effect, or the motor or a sensor was disturbed"
-        for name, times in found.missed.items()
+        for name, times in result.missed.items()
     )
-    doubts = (*friction_messages(friction, found), *residual_messages)
-    messages = (*found.messages, *doubts)
-    return attrs.evolve(found, seconds=seconds, messages=messages, doubts=doubts)
+    doubts = (*friction_messages(friction, result), *residual_messages)
+    messages = (*result.messages, *doubts)
+    return attrs.evolve(result, seconds=seconds, messages=messages, doubts=doubts)

@@ -12,20 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..check import check
-from ..clock import evenly_stamped
+from ..checks.check import check
+from ..checks.invalid_samples import without_unmeasured
 from ..effects import AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS
-from ..recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
-from ..recording_file import Runs, recordings_of
+from ..recordings.clock import evenly_stamped
+from ..recordings.recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
+from ..recordings.recording_file import Runs, recordings_of
 from ..simulate import HELD, Tape, Timing, uniform
-from ..unmeasured import without_unmeasured
-from .bounds import search_bounds
 from .identification import Role
-from .noise import white_noise
+from .noise.sensor_noise import white_noise
 from .parameters import Parameters, check_names
 from .problem import Problem
+from .search.bounds import search_bounds
 
 
 class Prepared(NamedTuple):

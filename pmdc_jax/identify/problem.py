@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..compiled import compiled, is_traced, quickly_compiled
+from ..runtime.compiled import compiled, is_traced, quickly_compiled
+from ..runtime.threads import CORES, map_in_threads
 from ..simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, sensitivities
-from ..threads import CORES, map_in_threads
+from .noise.whitening import Whitening
 from .parameters import Parameters
-from .whitening import Whitening
 
 # Derivative of an output by an unknown, in noise standard deviations, from which a simulation counts as failed: it is
 # so sensitive that rounding errors make its derivatives meaningless
@@ -116,7 +116,7 @@ class Evaluation(NamedTuple):
     Columns: the coordinates, then the run's own unknowns.
     """
 
-    seen: Float[Array, "blocks 2 samples"]
+    simulated: Float[Array, "blocks 2 samples"]
     residuals: Float[Array, "blocks 2 samples"]
     jacobian: Float[Array, "blocks 2 samples columns"]
 
@@ -173,12 +173,14 @@ def whitened(problem: Problem, plain: Evaluation) -> Evaluation:
 
 def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
     tape = problem.tape
-    seen, jacobian = sensitivities(problem.parameters, unknowns.coordinates, tape, unknowns.runs)
+    simulated, jacobian = sensitivities(
+        problem.parameters, unknowns.coordinates, tape, unknowns.runs
+    )
     scale = tape.weight / problem.noise[:, None]
     jacobian = jacobian * scale[..., None] * problem.determinable()[tape.run][:, None, None, :]
-    residuals = (seen - tape.measured) * scale
+    residuals = (simulated - tape.measured) * scale
     wild = ~jnp.all(jnp.abs(jacobian) < MAX_SENSITIVITY, (1, 2, 3)) & problem.fitted_runs[tape.run]
-    return Evaluation(seen, jnp.where(wild[:, None, None], jnp.inf, residuals), jacobian)
+    return Evaluation(simulated, jnp.where(wild[:, None, None], jnp.inf, residuals), jacobian)
 
 
 # `quickly_compiled` programs are as fast as others without effects, and up to a third slower with them
@@ -207,8 +209,8 @@ def _orthogonal(tape: Tape, allowed: Nuisance, plain: Evaluation) -> Evaluation:
         gram + jnp.eye(count) * jnp.where(jnp.diagonal(gram, axis1=1, axis2=2) > 0, 0, 1)[:, None]
     )
     share = jnp.linalg.solve(gram, along)
-    left = both[..., count:] - jnp.einsum("bcsi,bij->bcsj", nuisance, share[tape.run])
-    return Evaluation(plain.seen, left[..., -1], left[..., :-1])
+    projected = both[..., count:] - jnp.einsum("bcsi,bij->bcsj", nuisance, share[tape.run])
+    return Evaluation(plain.simulated, projected[..., -1], projected[..., :-1])
 
 
 @compiled
@@ -216,7 +218,7 @@ def _apply_whitening(problem: Problem, plain: Evaluation) -> Evaluation:
     both = jnp.concatenate([plain.jacobian, plain.residuals[..., None]], -1)
     assert problem.whitening is not None
     both = problem.whitening(both * problem.noise[:, None, None], problem.tape.run)
-    return Evaluation(plain.seen, both[..., -1], both[..., :-1])
+    return Evaluation(plain.simulated, both[..., -1], both[..., :-1])
 
 
 @compiled

@@ -9,21 +9,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..motor import PARAMETERS, Motor
-from ..recording import OVER_BOTH, OVER_LAST, Recording
+from ..recordings.recording import OVER_BOTH, OVER_LAST, Recording
+from ..runtime.threads import map_in_threads
 from ..simulate import RunUnknowns, Tape
-from ..threads import map_in_threads
-from .identifiability import MIN_SHARE, explain_directions, step_to_equal_constants, torque_scale
+from .fit.polish import Fit, fit_at, polish
+from .fit.refine import Optimum
+from .fit.run_unknowns import fit_run_unknowns
 from .identification import Estimate, Identification, Role, RunFit, Status
-from .noise import ratio_to_noise, rms, white_noise
+from .noise.sensor_noise import ratio_to_noise, rms, white_noise
 from .parameters import Parameters, unit_of
-from .polish import Fit, fit_at, polish
 from .prepare import Prepared
 from .problem import Problem
-from .profile import QUADRATIC_STDERR, profile_interval
-from .refine import Optimum
-from .run_unknowns import fit_run_unknowns
 from .solve import FITNESS_TOLERANCE, Solved
-from .uncertainty import MIN_UNSEEN_STDERR, Information, information_of
+from .uncertainty.covariance import MIN_UNSEEN_STDERR, Information, information_of
+from .uncertainty.identifiability import (
+    MIN_SHARE,
+    explain_directions,
+    step_to_equal_constants,
+    torque_scale,
+)
+from .uncertainty.profile import QUADRATIC_STDERR, profile_interval
 
 TIE_ITERATIONS = 3
 # Residuals this many times their white noise are reported
@@ -41,9 +46,9 @@ MIN_UNSEEN_SHARE = 0.99
 VISIBLE_SHARE = 0.3
 
 
-def results_of(given: Prepared, solved: Solved) -> Identification:
+def results_of(prepared: Prepared, solved: Solved) -> Identification:
     """The result of a fit: estimates with uncertainty and status, and the fit of every run."""
-    problem, training = given.problem, given.training
+    problem, training = prepared.problem, prepared.training
     released = _released_from_bounds(problem, solved.fit)
     parameters = problem.parameters
     info = information_of(problem, released)
@@ -57,15 +62,17 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
     unknowns, ended = fit_run_unknowns(problem, best.unknowns)
-    fit = run_fits(given.runs, given.roles, problem.tape, np.asarray(ended.seen), unknowns.runs)
+    fit = run_fits(
+        prepared.runs, prepared.roles, problem.tape, np.asarray(ended.simulated), unknowns.runs
+    )
     names, covariance = parameters.with_tied(info.covariance)
     noise = {
-        name: white_noise([left for _, left in _measured_and_residuals(fit, name)])
+        name: white_noise([residual for _, residual in _measured_and_residuals(fit, name)])
         for name in ("current", "speed")
     }
     return Identification(
         motor=motor,
-        parameters=_estimates(parameters, best, info, given, _intervals(problem, best, info)),
+        parameters=_estimates(parameters, best, info, prepared, _intervals(problem, best, info)),
         unidentified_directions=explain_directions(info.unseen, parameters, training),
         fit=fit,
         noise={"current_A": noise["current"], "speed_rad_s": noise["speed"]},
@@ -73,10 +80,10 @@ def results_of(given: Prepared, solved: Solved) -> Identification:
         seed=solved.seed,
         seconds=solved.seconds,
         search=solved.search,
-        findings=given.findings,
+        findings=prepared.findings,
         covariance=covariance,
         covariance_names=names,
-        messages=_messages(given, solved, Kt_set_to_Kb=chosen is not released),
+        messages=_messages(prepared, solved, Kt_set_to_Kb=chosen is not released),
         missed=_large_residuals(fit),
     )
 
@@ -107,8 +114,8 @@ def _released_from_bounds(problem: Problem, polished: Fit) -> Fit:
     """The fit with those coordinates released from their bound that an unseen direction of several parameters leaves
     arbitrary."""
 
-    def released(held: Sequence[int]) -> Fit:
-        return polished._replace(optimum=polished.optimum._replace(at_bound=tuple(held)))
+    def released(fixed: Sequence[int]) -> Fit:
+        return polished._replace(optimum=polished.optimum._replace(at_bound=tuple(fixed)))
 
     bound = polished.at_bound
     unseen = information_of(problem, released(())).unseen if bound else ()
@@ -140,8 +147,8 @@ def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
         coordinates[k], problem.parameters.lower[k], problem.parameters.upper[k]
     )
     unknowns = polished.unknowns._replace(coordinates=jnp.asarray(coordinates))
-    held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
-    refitted = polish(held, polished.optimum._replace(unknowns=unknowns))
+    with_k_fixed = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
+    refitted = polish(with_k_fixed, polished.optimum._replace(unknowns=unknowns))
     # false where the simulation failed: its fitness is infinite
     as_good = refitted.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE)
     return fit_at(problem, refitted.optimum._replace(at_bound=())) if as_good else None
@@ -158,14 +165,14 @@ def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit
     if along is None:
         return polished
     k, b = names.index("Kt"), names.index("Kb")
-    held = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
+    with_Kt_fixed = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
     moved = polished
     for _ in range(TIE_ITERATIONS):  # Kb moves a little as well
         coordinates = np.array(moved.coordinates)
         coordinates += step_to_equal_constants(along, coordinates, names)
         coordinates[k] = coordinates[b]
         unknowns = moved.unknowns._replace(coordinates=jnp.asarray(coordinates))
-        moved = polish(held, moved.optimum._replace(unknowns=unknowns))
+        moved = polish(with_Kt_fixed, moved.optimum._replace(unknowns=unknowns))
     return moved if moved.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE) else polished
 
 
@@ -181,7 +188,7 @@ def _estimates(
     parameters: Parameters,
     best: Optimum,
     info: Information,
-    given: Prepared,
+    prepared: Prepared,
     intervals: Mapping[int, tuple[float, float]],
 ) -> dict[str, Estimate]:
     """The estimate of each parameter, from the 95 % `intervals` of the identified coordinates."""
@@ -191,11 +198,11 @@ def _estimates(
     estimates = {}
     for name in names:
         unit, source = unit_of(name), ties.get(name, name)
-        if source in given.irrelevant and source not in given.known:
+        if source in prepared.irrelevant and source not in prepared.known:
             estimates[name] = Estimate(None, None, None, unit, "not_identifiable")
             continue
         value = parameters.value(name, coordinates)
-        if source in given.known:
+        if source in prepared.known:
             estimates[name] = Estimate(value, 0.0, (value, value), unit, "known")
             continue
         k = parameters.names.index(source)
@@ -280,7 +287,7 @@ def _measured_and_residuals(
     """An output as measured and its residuals, in every training run that has it."""
     runs = [f for f in fit.values() if f.role == "train"]
     pairs = [(getattr(f, name), f.residual(name)) for f in runs]
-    return [(measured, left) for measured, left in pairs if left is not None]
+    return [(measured, residual) for measured, residual in pairs if residual is not None]
 
 
 def _large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:
@@ -292,21 +299,21 @@ def _large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:
     return {name: ratio for name, ratio in ratios.items() if ratio > MAX_RESIDUAL_RATIO}
 
 
-def _messages(given: Prepared, solved: Solved, Kt_set_to_Kb: bool) -> tuple[str, ...]:
+def _messages(prepared: Prepared, solved: Solved, Kt_set_to_Kb: bool) -> tuple[str, ...]:
     messages = [
-        f"{run.name}: the recorded {run.drive} has {given.input_noise[run.name]:.3g} {UNITS[run.drive]} of sensor "
+        f"{run.name}: the recorded {run.drive} has {prepared.input_noise[run.name]:.3g} {UNITS[run.drive]} of sensor "
         "noise that did not reach the motor: it was removed"
-        for run in given.runs
-        if run.name in given.input_noise
+        for run in prepared.runs
+        if run.name in prepared.input_noise
     ]
-    acts = "steps between samples" if given.stepped else given.timing.what
+    acts = "steps between samples" if prepared.stepped else prepared.timing.what
     if acts:
         messages.append(f"the voltage {acts}: this is modelled")
-    if given.timing.current_mean:
+    if prepared.timing.current_mean:
         messages.append("the current is a mean over the last sample interval: this is modelled")
-    if given.averaging:
+    if prepared.averaging:
         messages.append(
-            f"the speed is a mean over {AVERAGING_SPANS[given.averaging]}, as differences of an angle are:"
+            f"the speed is a mean over {AVERAGING_SPANS[prepared.averaging]}, as differences of an angle are:"
             " this is modelled"
         )
     if solved.interrupted:

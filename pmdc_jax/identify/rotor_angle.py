@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from scipy import fft, ndimage
 
 from ..simulate import free_run
-from .polish import Fit
+from .fit.polish import Fit
 from .problem import Problem
 
 # Neighbouring frequencies over which the power of the residuals is averaged
@@ -26,7 +26,7 @@ def rotor_outputs(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"
     effects, tape = problem.parameters.effects, problem.tape
     as_seen = tape.averaging is None and tape.reading is None
     if as_seen and all(effect.equation != "sensor" for effect in effects):
-        return fit.evaluation.seen
+        return fit.evaluation.simulated
     unknowns = fit.unknowns
     motor = problem.parameters(unknowns.coordinates)
     bare = motor.with_effects(effect for effect in motor.effects if effect.equation != "sensor")
@@ -41,7 +41,7 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
     plus the part of the residual that is motion, with the delay of the sensor undone.
     """
     motor = problem.parameters(fit.coordinates)
-    tape, seen = problem.tape, np.asarray(fit.evaluation.seen)
+    tape, simulated = problem.tape, np.asarray(fit.evaluation.simulated)
     rotor = np.asarray(rotor_outputs(problem, fit))
     turn, run = np.array(tape.turn), np.asarray(tape.run)
     sample_time = np.asarray(tape.sample_time)[np.asarray(tape.grid)]
@@ -50,12 +50,12 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
         measured, weight = (
             np.asarray(x)[mine, 1].reshape(-1) for x in (tape.measured, tape.weight)
         )
-        simulated = seen[mine, 1].reshape(-1)
+        expected = simulated[mine, 1].reshape(-1)
         known = np.flatnonzero(weight)
-        if not len(known) or not np.all(np.isfinite(simulated)):
+        if not len(known) or not np.all(np.isfinite(expected)):
             continue
         end = known[-1] + 1
-        error = np.where(weight[:end] > 0, measured[:end] - simulated[:end], 0.0)
+        error = np.where(weight[:end] > 0, measured[:end] - expected[:end], 0.0)
         speed = rotor[mine, 1].reshape(-1).copy()
         time = np.cumsum(np.repeat(sample_time[mine], turn.shape[1]))[:end]
         unmodelled = motion_in(error)

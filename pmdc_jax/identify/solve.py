@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..progress import ReportProgress, silent
+from ..runtime.threads import map_in_threads_until, submit
 from ..simulate import RunUnknowns, Tape, Timing
-from ..threads import map_in_threads_until, submit
-from .bounds import effect_bounds
 from .corrections.input_noise import without_input_noise
 from .corrections.input_timing import negative_log_likelihood_within, other_timings
 from .corrections.reading_time import with_fitted_reading
@@ -21,16 +20,17 @@ from .corrections.retiming import with_timing
 from .corrections.speed_averaging import with_averaging, with_evident_averaging
 from .corrections.step_times import with_step_times
 from .corrections.uneven_sampling import with_even_clock
+from .fit.polish import Fit, polish
+from .fit.refine import Optimum, refine
+from .fit.run_unknowns import with_holdout_unknowns
 from .identification import Search
 from .parameters import Parameters
-from .polish import Fit, polish
 from .prepare import Prepared
 from .problem import Evaluation, Problem, Unknowns
-from .refine import Optimum, refine
 from .rotor_angle import with_rotor_angle
-from .run_unknowns import with_holdout_unknowns
-from .search import SearchResult
-from .search import search as global_search
+from .search.bounds import effect_bounds
+from .search.evolution import SearchResult
+from .search.evolution import search as global_search
 
 STARTS = 4
 # Two refinements found the same optimum if their fitness agrees to this share.
@@ -55,7 +55,7 @@ class Solved(NamedTuple):
 
 
 def solve(
-    given: Prepared,
+    prepared: Prepared,
     search: str,
     seed: int,
     progress: ReportProgress | None = None,
@@ -66,7 +66,7 @@ def solve(
     **Arguments**: `timing` of the inputs, if it is known already.
     **Returns**: the problem as `search_and_refine` returns it, corrected, and the fit to it.
     """
-    recorded = with_evident_averaging(given)
+    recorded = with_evident_averaging(prepared)
 
     def at(timing: Timing | None) -> tuple[Prepared, Solved]:
         runs = with_timing(recorded, timing) if timing else recorded
@@ -74,15 +74,15 @@ def solve(
 
     attempts = [at(timing)]
     if timing is None:
-        given, solved = attempts[0]
-        attempts += map(at, other_timings(given, solved.fit))
-    found = []
+        prepared, solved = attempts[0]
+        attempts += map(at, other_timings(prepared, solved.fit))
+    solutions = []
     for runs, result in attempts:
         runs, fit = with_fitted_reading(*with_step_times(runs, result.fit))
-        found.append((runs, result._replace(fit=fit)))
-    if len(found) == 1:
-        return found[0]
-    return min(found, key=lambda pair: negative_log_likelihood_within(pair[0], pair[1].fit))
+        solutions.append((runs, result._replace(fit=fit)))
+    if len(solutions) == 1:
+        return solutions[0]
+    return min(solutions, key=lambda pair: negative_log_likelihood_within(pair[0], pair[1].fit))
 
 
 # Applied in this order: uneven sampling hides everything else, and a mean is recognised by the sensor's own noise
@@ -93,16 +93,16 @@ CORRECTIONS: tuple[Callable[[Prepared, Fit], tuple[Prepared, Fit]], ...] = (
 )
 
 
-def _corrected(given: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
+def _corrected(prepared: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
     """The runs corrected for artefacts of their sensors, and the fit to them."""
-    fit = with_holdout_unknowns(given.problem, solved.fit)
+    fit = with_holdout_unknowns(prepared.problem, solved.fit)
     for correct in CORRECTIONS:
-        given, fit = correct(given, fit)
-    return given, solved._replace(fit=fit)
+        prepared, fit = correct(prepared, fit)
+    return prepared, solved._replace(fit=fit)
 
 
 def search_and_refine(
-    given: Prepared,
+    prepared: Prepared,
     search: str,
     seed: int,
     progress: ReportProgress | None = None,
@@ -115,9 +115,9 @@ def search_and_refine(
     """
     began = time.perf_counter()
     report = progress or silent
-    problem = given.problem
-    searching = Tape.from_recordings(given.training, timing=given.timing)
-    noise, parameters = np.asarray(problem.noise), _searched_parameters(given)
+    problem = prepared.problem
+    searching = Tape.from_recordings(prepared.training, timing=prepared.timing)
+    noise, parameters = np.asarray(problem.noise), _searched_parameters(prepared)
 
     def run_search(seed: int) -> SearchResult:
         return global_search(parameters, searching, noise, search, seed, progress=progress)
@@ -125,20 +125,20 @@ def search_and_refine(
     middle = (problem.parameters.lower + problem.parameters.upper) / 2
     # a refinement that stops at once, so that it is compiled on another core while the search runs
     compiled = submit(refine, problem, _start(problem.tape, middle), tolerance=1e3)
-    found = run_search(seed)
+    search_result = run_search(seed)
     search_ended = time.perf_counter()
-    report("refining the best candidates", float(found.best[-1]))
+    report("refining the best candidates", float(search_result.best[-1]))
     compiled.result()
-    ends = _refine_all(problem, found)
+    ends = _refine_all(problem, search_result)
     for attempt in range(1, searches):
-        if found.interrupted or _agreed(ends, problem.outputs):
+        if search_result.interrupted or _agreed(ends, problem.outputs):
             break
-        found = _continued(found, run_search(seed + attempt))
-        ends = sorted([*ends, *_refine_all(problem, found)], key=_fitness)
-    given, polished = polish_with_angle(given, ends[0])
+        search_result = _continued(search_result, run_search(seed + attempt))
+        ends = sorted([*ends, *_refine_all(problem, search_result)], key=_fitness)
+    prepared, polished = polish_with_angle(prepared, ends[0])
     seconds = {"search": search_ended - began, "refine": time.perf_counter() - search_ended}
-    record = _search_record(search, found, ends)
-    return given, Solved(polished, record, seed, found.interrupted, seconds)
+    record = _search_record(search, search_result, ends)
+    return prepared, Solved(polished, record, seed, search_result.interrupted, seconds)
 
 
 def _continued(before: SearchResult, search: SearchResult) -> SearchResult:
@@ -150,31 +150,31 @@ def _continued(before: SearchResult, search: SearchResult) -> SearchResult:
     )
 
 
-def _searched_parameters(given: Prepared) -> Parameters:
+def _searched_parameters(prepared: Prepared) -> Parameters:
     """The parameters within narrower bounds: the search can skip values at which an effect does not show."""
-    effects = given.problem.parameters.effects
-    return given.parameters(effects, effect_bounds(effects, given.training))
+    effects = prepared.problem.parameters.effects
+    return prepared.parameters(effects, effect_bounds(effects, prepared.training))
 
 
 def polish_with_angle(
-    given: Prepared, end: Optimum, known: Evaluation | None = None
+    prepared: Prepared, end: Optimum, known: Evaluation | None = None
 ) -> tuple[Prepared, Fit]:
     """Polish; where a torque depends on the rotor angle, update the angle from the fit and repeat while that helps."""
-    polished = polish(given.problem, end, known=known)
-    for _ in range(ANGLE_ITERATIONS if given.problem.depends_on_angle else 0):
-        again = given._replace(problem=with_rotor_angle(given.problem, polished))
+    polished = polish(prepared.problem, end, known=known)
+    for _ in range(ANGLE_ITERATIONS if prepared.problem.depends_on_angle else 0):
+        again = prepared._replace(problem=with_rotor_angle(prepared.problem, polished))
         better = polish(again.problem, polished.optimum)
         if not better.fitness < (1 - MIN_ANGLE_GAIN) * polished.fitness:
             break
-        given, polished = again, better
-    return given, polished
+        prepared, polished = again, better
+    return prepared, polished
 
 
 def _start(tape: Tape, coordinates: jax.Array | np.ndarray) -> Unknowns:
     return Unknowns(jnp.asarray(coordinates), RunUnknowns.as_recorded(tape))
 
 
-def _distinct(found: SearchResult, parameters: Parameters) -> list[np.ndarray]:
+def _distinct(search_result: SearchResult, parameters: Parameters) -> list[np.ndarray]:
     """The best few clearly different candidates, preceded by the best one with L in the middle of its range.
 
     Where L is too small to matter the sum of squares is flat in it, and no gradient leads back.
@@ -182,9 +182,9 @@ def _distinct(found: SearchResult, parameters: Parameters) -> list[np.ndarray]:
     kept: list[np.ndarray] = []
     if "L" in parameters.names:
         L = parameters.names.index("L")
-        kept.append(np.array(found.candidates[0]))
+        kept.append(np.array(search_result.candidates[0]))
         kept[0][L] = (parameters.lower[L] + parameters.upper[L]) / 2
-    for candidate in found.candidates:
+    for candidate in search_result.candidates:
         if all(np.max(np.abs(candidate - other)) > MIN_DISTANCE for other in kept):
             kept.append(candidate)
         if len(kept) == STARTS:
@@ -192,9 +192,12 @@ def _distinct(found: SearchResult, parameters: Parameters) -> list[np.ndarray]:
     return kept
 
 
-def _refine_all(problem: Problem, found: SearchResult) -> list[Optimum]:
+def _refine_all(problem: Problem, search_result: SearchResult) -> list[Optimum]:
     """Refine the best distinct candidates of a search, one on each core at a time, until they agree; the best first."""
-    starts = [_start(problem.tape, candidate) for candidate in _distinct(found, problem.parameters)]
+    starts = [
+        _start(problem.tape, candidate)
+        for candidate in _distinct(search_result, problem.parameters)
+    ]
 
     def agreed(ends: list[Optimum]) -> bool:
         return _agreed(sorted(ends, key=_fitness), problem.outputs)
@@ -220,12 +223,12 @@ def _times_found(ends: Sequence[Optimum]) -> int:
     return int(np.sum(fitness <= fitness[0] * (1 + FITNESS_TOLERANCE) + 1e-12))
 
 
-def _search_record(method: str, found: SearchResult, ends: Sequence[Optimum]) -> Search:
+def _search_record(method: str, search_result: SearchResult, ends: Sequence[Optimum]) -> Search:
     return Search(
         method=method,
-        evaluations=found.evaluations,
-        best=found.best,
-        median=found.median,
+        evaluations=search_result.evaluations,
+        best=search_result.best,
+        median=search_result.median,
         refined=np.array([end.fitness for end in ends]),
         times_found=_times_found(ends),
     )

@@ -27,8 +27,18 @@ from .diagnosis_figures import (
     residual_over_variable_figure,
     where_figure,
 )
+from .diagnosis_sentences import (
+    VERDICTS,
+    detectable_others,
+    drift_words,
+    drifts,
+    intervals_in_words,
+    judged_role,
+    verdict_sentences,
+)
 from .figures import points_per_trace
 from .identification import identification_content
+from .identification_sentences import role_word, runs_in_order
 from .notation import (
     effect_words,
     enumerate_words,
@@ -42,16 +52,6 @@ from .notation import (
     write_estimate,
 )
 from .page import figure_json, write_page
-from .summary import role_word, runs_in_order
-from .verdict import (
-    VERDICTS,
-    detectable_others,
-    drift_words,
-    drifts,
-    intervals_in_words,
-    judged_role,
-    verdict_sentences,
-)
 
 # traces of one run in the figure of its residuals, and in that of its simulation: they share the points drawn
 TRACES_OF_RESIDUALS = 4

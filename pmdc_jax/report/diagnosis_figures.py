@@ -113,10 +113,10 @@ def residual_figure(
     for row, channel in enumerate(channels, start=1):
         title, column = RESIDUALS[channel]
         for name, fit, colour in _coloured(fits):
-            left = fit.residual(channel)
-            if left is None:
+            residual = fit.residual(channel)
+            if residual is None:
                 continue
-            time, values = envelope(fit.time, left, points)
+            time, values = envelope(fit.time, residual, points)
             line = {"color": colour, "width": 0.8}
             trace = go.Scatter(
                 x=time, y=values, name=name, line=line, showlegend=row == 1, legendgroup=name
@@ -158,11 +158,11 @@ def averages(
     there = [(x, r) for x, r in pairs if x is not None and r is not None]
     if not there:
         return None
-    x, left = (np.concatenate(parts) for parts in zip(*there, strict=True))
-    known = np.isfinite(x) & np.isfinite(left)
+    x, residual = (np.concatenate(parts) for parts in zip(*there, strict=True))
+    known = np.isfinite(x) & np.isfinite(residual)
     order = np.argsort(x[known], kind="stable")
     groups = [g for g in np.array_split(order, BINS) if len(g)]
-    means = [(x[known][g].mean(), left[known][g].mean()) for g in groups]
+    means = [(x[known][g].mean(), residual[known][g].mean()) for g in groups]
     return np.array([m[0] for m in means]), np.array([m[1] for m in means])
 
 
@@ -210,10 +210,10 @@ def experiment_figure(experiment: NextExperiment, points: int) -> go.Figure:
 
 def _range(fits: Mapping[str, RunFit], variable: str) -> list[float] | None:
     """Lowest and highest value of a variable in all runs; None if no run has it."""
-    found = [values for fit in fits.values() if (values := _values(fit, variable)) is not None]
-    if not found:
+    parts = [values for fit in fits.values() if (values := _values(fit, variable)) is not None]
+    if not parts:
         return None
-    return [float(np.nanmin(np.concatenate(found))), float(np.nanmax(np.concatenate(found)))]
+    return [float(np.nanmin(np.concatenate(parts))), float(np.nanmax(np.concatenate(parts)))]
 
 
 def _values(fit: RunFit, variable: str) -> np.ndarray | None:

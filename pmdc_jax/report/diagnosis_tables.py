@@ -7,6 +7,8 @@ from rich.table import Table
 from rich.text import Text
 
 from ..diagnose.diagnosis import Diagnosis
+from .diagnosis_sentences import detectable_others, drift_words, drifts, verdict_sentences
+from .identification_sentences import role_word, runs_in_order
 from .notation import (
     effect_words,
     field_words,
@@ -15,9 +17,7 @@ from .notation import (
     value_with_unit,
     write_estimate,
 )
-from .summary import role_word, runs_in_order
 from .terminal import parameter_table, plain_table, status_text
-from .verdict import detectable_others, drift_words, drifts, verdict_sentences
 
 
 def diagnosis_tables(diagnosis: Diagnosis) -> RenderableType:

@@ -17,6 +17,7 @@ from .figures import (
     run_figure,
     search_figure,
 )
+from .identification_sentences import role_word, runs_in_order, status_word, summary
 from .notation import (
     PARAMETER_NAMES,
     EstimateText,
@@ -28,7 +29,6 @@ from .notation import (
     write_estimate,
 )
 from .page import figure_json, write_page
-from .summary import role_word, runs_in_order, status_word, summary
 
 
 def write_identification_report(identification: Identification, path: str | Path) -> None:

@@ -13,9 +13,9 @@ from attrs import asdict
 
 from ..files import write_text
 from ..identify.identification import Estimate, Identification, RunFit, Search
-from ..recording import Finding
-from .summary import summary
-from .verdict import verdict_sentences
+from ..recordings.recording import Finding
+from .diagnosis_sentences import verdict_sentences
+from .identification_sentences import summary
 
 if TYPE_CHECKING:
     from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, NextExperiment
@@ -53,7 +53,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     summary is that of the diagnosis."""
     before = diagnosis.base.parameters.items()
     gap = {role: _gap(diagnosis.gap.get(role)) for role in ("train", "holdout")}
-    found = {
+    content = {
         "verdict": diagnosis.verdict,
         "effects": [_effect(effect, diagnosis.rivals) for effect in diagnosis.effects],
         "where": [asdict(region) for region in diagnosis.where],
@@ -68,7 +68,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "summary": verdict_sentences(diagnosis),
         "before": {"parameters": {name: _estimate(estimate) for name, estimate in before}},
     }
-    return identification_json(diagnosis.final) | _plain(found)
+    return identification_json(diagnosis.final) | _plain(content)
 
 
 def write_json(obj: Any, path: str | Path) -> None:

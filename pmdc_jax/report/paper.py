@@ -113,9 +113,9 @@ def remarks(paper: Paper) -> list[str]:
 def _printed_remarks(paper: Paper) -> list[str]:
     return [
         f"The printed gains of the {CONTROLLERS[kind].label}, simulated on the printed motor without any limit, give"
-        f" {found.overshoot:.1f} % and {found.settling:.3f} s instead of {TABLE_2[kind].overshoot:g} % and"
-        f" {TABLE_2[kind].settling:g} s, with a peak of {found.peak_voltage:.0f} V."
-        for kind, found in paper.as_printed.items()
+        f" {printed.overshoot:.1f} % and {printed.settling:.3f} s instead of {TABLE_2[kind].overshoot:g} % and"
+        f" {TABLE_2[kind].settling:g} s, with a peak of {printed.peak_voltage:.0f} V."
+        for kind, printed in paper.as_printed.items()
     ]
 
 
@@ -157,11 +157,11 @@ def paper_json(paper: Paper) -> dict[str, Any]:
 def _as_printed_json(paper: Paper, kind: str) -> dict[str, float] | None:
     if kind not in paper.as_printed:
         return None
-    found = paper.as_printed[kind]
+    printed = paper.as_printed[kind]
     return {
-        "Overshoot": found.overshoot,
-        "SettlingTime": found.settling,
-        "PeakVoltage": found.peak_voltage,
+        "Overshoot": printed.overshoot,
+        "SettlingTime": printed.settling,
+        "PeakVoltage": printed.peak_voltage,
     }
 
 

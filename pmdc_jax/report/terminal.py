@@ -13,9 +13,9 @@ from rich.text import Text
 
 from ..identify.identification import Estimate, Identification
 from ..progress import ReportProgress, silent
-from ..recording import Finding
+from ..recordings.recording import Finding
+from .identification_sentences import role_word, runs_in_order, status_word, summary
 from .notation import enumerate_words, percent, significant, write_estimate
-from .summary import role_word, runs_in_order, status_word, summary
 
 STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
 SEVERITY_STYLES = {"error": "red", "warning": "yellow"}

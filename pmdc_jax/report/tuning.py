@@ -114,7 +114,7 @@ def _limits_text(tuning: Tuning) -> str:
 def _load_sentence(tuning: Tuning) -> str:
     if not tuning.load_torque:
         return ""
-    recovery, left = tuning.load["RecoveryTime"], tuning.load["SteadyStateError"]
+    recovery, steady_state_error = tuning.load["RecoveryTime"], tuning.load["SteadyStateError"]
     back = "does not return to the 2 % band"
     if recovery is not None:
         back = (
@@ -124,7 +124,7 @@ def _load_sentence(tuning: Tuning) -> str:
         )
     return (
         f"A load step of {tuning.load_torque:.3g} N m changes the speed by {significant(tuning.load['Deviation'])}"
-        f" rad/s; it {back}, with a steady-state error of {significant(left, 2)} rad/s."
+        f" rad/s; it {back}, with a steady-state error of {significant(steady_state_error, 2)} rad/s."
     )
 
 
@@ -141,16 +141,16 @@ def _robust_sentence(robust: Robustness | None) -> str:
 
 
 def _margin_sentence(tuning: Tuning) -> str:
-    found = tuning.margins
-    if not found.stable:
+    margins = tuning.margins
+    if not margins.stable:
         return "The loop linearised at the set point is unstable: only its limits keep it bounded."
     parts = []
-    if found.gain_margin is not None:
-        parts.append(f"gain margin {significant(found.gain_margin)}")
-    if found.phase_margin_deg is not None:
-        parts.append(f"phase margin {significant(found.phase_margin_deg)}°")
-    if found.delay_margin_s is not None:
-        parts.append(f"delay margin {_time_text(found.delay_margin_s)}")
+    if margins.gain_margin is not None:
+        parts.append(f"gain margin {significant(margins.gain_margin)}")
+    if margins.phase_margin_deg is not None:
+        parts.append(f"phase margin {significant(margins.phase_margin_deg)}°")
+    if margins.delay_margin_s is not None:
+        parts.append(f"delay margin {_time_text(margins.delay_margin_s)}")
     return f"Margins: {', '.join(parts)}." if parts else ""
 
 

@@ -9,15 +9,15 @@ import numpy as np
 
 from ..errors import InputError
 from ..motor import Motor
-from ..precision import double_precision
-from ..recording import Recording
-from ..recording_file import Run, recordings_of
+from ..recordings.recording import Recording
+from ..recordings.recording_file import Run, recordings_of
+from ..runtime.precision import double_precision
 from .population import squared_errors
 from .reference import reference_solution
 from .shooting import UNKNOWNS_PER_RUN, RunUnknowns, free_run, sensitivities
 from .tape import Tape
 from .timing import EARLY, HELD, LATE, SMOOTH, STRAIGHT, Timing
-from .uneven import seen_at_record
+from .uneven import simulated_at_stamps
 from .uniform import uniform
 
 __all__ = [
@@ -57,15 +57,15 @@ def simulate(motor: Motor, recording: Run) -> Recording:
     # the instantaneous speed is simulated, even if the recorded one is a mean
     even = attrs.evolve(uniform(recording), averaging=None)
     tape = Tape.from_recordings([even], unloaded=True)
-    seen = tape.samples_of(0, free_run(motor, tape), len(even))
+    simulated = tape.samples_of(0, free_run(motor, tape), len(even))
     if even.resampled_from is not None:
-        seen = seen_at_record(motor, tape.drive_of(0), even, seen)
-    finite = np.isfinite(seen).all(1)
+        simulated = simulated_at_stamps(motor, tape.drive_of(0), even, simulated)
+    finite = np.isfinite(simulated).all(1)
     if not finite.all():
         raise InputError(
             "motor",
             f"its simulation of {recording.name} diverges at {recording.time[finite.argmin()]:.6g} s",
             "Check the parameters of the motor and its effects",
         )
-    current = seen[:, 0] if recording.drive == "voltage" else recording.current
-    return attrs.evolve(recording, current=current, speed=seen[:, 1], angle=None)
+    current = simulated[:, 0] if recording.drive == "voltage" else recording.current
+    return attrs.evolve(recording, current=current, speed=simulated[:, 1], angle=None)

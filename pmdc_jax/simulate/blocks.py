@@ -29,24 +29,24 @@ MotorOnGrids = tuple[Motor, Propagator]
 class Pass(NamedTuple):
     """All blocks simulated once from given starts. Columns of the derivatives: parameters, load offset, start."""
 
-    seen: Float[Array, "samples outputs blocks"]
-    d_seen: Float[Array, "samples columns outputs blocks"]
+    simulated: Float[Array, "samples outputs blocks"]
+    d_simulated: Float[Array, "samples columns outputs blocks"]
     end: Starts
     d_end: Float[Array, "columns blocks states"]
 
 
 @eqx.filter_jit  # one trace serves `_join_blocks` and other callers with as many columns
 def simulate_blocks(
-    prepared: MotorOnGrids,
-    d_prepared: MotorOnGrids,
+    motor_on_grids: MotorOnGrids,
+    d_motor_on_grids: MotorOnGrids,
     columns: int,
     tape: Tape,
     starts: Starts,
     load_offset: Float[Array, " runs"],
 ) -> Pass:
     """Simulate every block from its start, with derivatives, whose last columns are with respect to the start."""
-    motor, d_motor = prepared[0], d_prepared[0]
-    propagator, d_propagator, drive = _of_blocks(prepared[1], d_prepared[1], tape)
+    motor, d_motor = motor_on_grids[0], d_motor_on_grids[0]
+    propagator, d_propagator, drive = _of_blocks(motor_on_grids[1], d_motor_on_grids[1], tape)
     steps = steps_in_sample(motor, tape)
     value, turn = jnp.asarray(tape.value).T, jnp.asarray(tape.turn).T
     load, d_load = jnp.asarray(tape.load).T + load_offset[tape.run], _d_load(columns, starts)
@@ -61,28 +61,31 @@ def simulate_blocks(
         ) -> tuple[State, Float[Array, "outputs blocks"]]:
             acting = Input(drive, value[k], load, rises)
             after, mean = held_step_and_mean(motor, propagator, acting, state, steps)
-            seen = outputs(motor, propagator, acting, state, steps, mean)
-            return _turned(state, after, turn[k]), seen
+            simulated = outputs(motor, propagator, acting, state, steps, mean)
+            return _turned(state, after, turn[k]), simulated
 
-        (state, seen), (d_state, d_seen) = value_and_derivatives(
+        (state, simulated), (d_state, d_simulated) = value_and_derivatives(
             observe_and_step,
             (motor, propagator, state, load[k]),
             (d_motor, d_propagator, d_state, d_load),
         )
-        return Carry((state, d_state), (seen, d_seen))
+        return Carry((state, d_state), (simulated, d_simulated))
 
     reports = reports_of(propagator)
-    nothing_seen = (jnp.zeros((reports, len(starts))), jnp.zeros((columns, reports, len(starts))))
-    start = Carry(_states_with_derivatives(motor, starts, columns), nothing_seen)
+    nothing_simulated = (
+        jnp.zeros((reports, len(starts))),
+        jnp.zeros((columns, reports, len(starts))),
+    )
+    start = Carry(_states_with_derivatives(motor, starts, columns), nothing_simulated)
     saveat = diffrax.SaveAt(
         subs=[
             diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: y.output),
             diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: y.state),
         ]
     )
-    (seen, d_seen), (end, d_end) = take_steps(StepSolver(advance), start, BLOCK, saveat)
+    (simulated, d_simulated), (end, d_end) = take_steps(StepSolver(advance), start, BLOCK, saveat)
     end, d_end = jax.tree.map(lambda leaf: leaf[0], (end, d_end))
-    return Pass(seen, d_seen, pack(end).T, jax.vmap(pack)(d_end).swapaxes(1, 2))
+    return Pass(simulated, d_simulated, pack(end).T, jax.vmap(pack)(d_end).swapaxes(1, 2))
 
 
 def _of_blocks(

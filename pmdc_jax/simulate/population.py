@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compiled import compiled
 from ..effects.base import Scalars, State
 from ..motor import Motor
-from ..threads import CORES, map_in_threads
+from ..runtime.compiled import compiled
+from ..runtime.threads import CORES, map_in_threads
 from .exponential import Matrix, product
 from .propagator import Propagator, grid_propagators, pick_grid, steps_in_sample
 from .sensing import at_instant
@@ -207,9 +207,9 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
             acting = Input(drive, value, load)
             after, mean = held_step_and_mean(motors, propagator, acting, state)
             read = _when_read(motors, propagator, acting, state)
-            seen = _seen(motors, read, mean, over_last, block)
+            simulated = _seen(motors, read, mean, over_last, block)
             errors = tuple(
-                e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
+                e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
             return (after, errors), None
 
@@ -276,9 +276,9 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
             acting = Input(drive, value, load)
             after, mean = held_step_and_mean(motors, propagator, acting, state, steps)
             read = _when_read(motors, propagator, acting, state, steps)
-            seen = _seen(motors, read, mean, over_last, block)
+            simulated = _seen(motors, read, mean, over_last, block)
             errors = tuple(
-                e + weight[c] * (seen[c] - measured[c]) ** 2 for c, e in enumerate(errors)
+                e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
             return (after, errors), None
 

@@ -42,19 +42,19 @@ def outputs(
     """
     reading, speed_seen, part_mean = propagator.reading, propagator.speed_seen, None
     if reading is None:
-        seen = [*motor.sensors(state)]
+        simulated = [*motor.sensors(state)]
     else:
         there, part_mean = at_instant(motor, reading, acting, state, steps)
-        seen = [*motor.sensors(there)]
+        simulated = [*motor.sensors(there)]
     if speed_seen is not None:
         there, part_mean = at_instant(motor, speed_seen, acting, state, steps)
-        seen.append(motor.sensors(there)[1])
+        simulated.append(motor.sensors(there)[1])
     if mean is not None:
-        seen.extend(motor.sensors(mean))
+        simulated.extend(motor.sensors(mean))
     instant = speed_seen or reading
     if instant is not None and part_mean is not None:
-        seen.append(instant.share * motor.sensors(part_mean)[1])
-    return jnp.stack(seen)
+        simulated.append(instant.share * motor.sensors(part_mean)[1])
+    return jnp.stack(simulated)
 
 
 def reports_of(propagator: Propagator) -> int:
@@ -65,7 +65,7 @@ def reports_of(propagator: Propagator) -> int:
 
 
 def reported(
-    motor: Motor, tape: Tape, seen: Float[Array, "blocks outputs samples"]
+    motor: Motor, tape: Tape, simulated: Float[Array, "blocks outputs samples"]
 ) -> Float[Array, "blocks 2 samples"]:
     """Current and speed from `outputs`, averaged as the tape says, and the speed delayed by the motor's sensor.
 
@@ -73,8 +73,8 @@ def reported(
     """
     delay, reading = motor.speed_delay(), tape.reading
     if delay is None and tape.averaging is None:
-        return seen
-    current, speed, *others = (seen[:, k].reshape(-1) for k in range(seen.shape[1]))
+        return simulated
+    current, speed, *others = (simulated[:, k].reshape(-1) for k in range(simulated.shape[1]))
     first = jnp.repeat(jnp.searchsorted(jnp.asarray(tape.run), tape.run) * BLOCK, BLOCK)
     begun, before = speed[first], jnp.arange(len(speed)) - 1
 
@@ -108,4 +108,4 @@ def reported(
         current = current + current_over_last * shift
         sampled = (1 - over_last - over_next) * speed
         speed = sampled + over_last * ending_within(last) + over_next * ending_within(last + 1)
-    return jnp.stack([x.reshape(seen[:, 0].shape) for x in (current, speed)], 1)
+    return jnp.stack([x.reshape(simulated[:, 0].shape) for x in (current, speed)], 1)

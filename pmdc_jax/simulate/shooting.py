@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compiled import compiled
 from ..motor import Motor
+from ..runtime.compiled import compiled
 from .blocks import MotorOnGrids, Pass, Start, Starts, pack, simulate_blocks, value_and_derivatives
 from .propagator import grid_propagators
 from .sensing import reported
@@ -65,12 +65,14 @@ def free_run(
     `own`, the unknowns of each run, is by default as recorded.
     """
     own = own or RunUnknowns.as_recorded(tape)
-    prepared = (motor, grid_propagators(motor, tape))
+    motor_on_grids = (motor, grid_propagators(motor, tape))
     initial = _initial_states(motor, own, tape)
     states = initial.shape[1]
-    starts, joined, last, *_ = _join_blocks(prepared, tape, own, initial)
-    seen = last.seen + jnp.einsum("sncb,bn->scb", last.d_seen[:, -states:], joined - starts)
-    return reported(motor, tape, seen.transpose(2, 1, 0))
+    starts, joined, last, *_ = _join_blocks(motor_on_grids, tape, own, initial)
+    simulated = last.simulated + jnp.einsum(
+        "sncb,bn->scb", last.d_simulated[:, -states:], joined - starts
+    )
+    return reported(motor, tape, simulated.transpose(2, 1, 0))
 
 
 @eqx.filter_jit
@@ -93,9 +95,11 @@ def sensitivities(
         motor = assemble(parameters)
         return motor, grid_propagators(motor, tape)
 
-    prepared, d_prepared = value_and_derivatives(prepare, (parameters,), (jnp.eye(count),))
-    motor = prepared[0]
-    d_motor = jax.tree.map(lambda leaf: _pad_columns(leaf, all_columns), d_prepared[0])
+    motor_on_grids, d_motor_on_grids = value_and_derivatives(
+        prepare, (parameters,), (jnp.eye(count),)
+    )
+    motor = motor_on_grids[0]
+    d_motor = jax.tree.map(lambda leaf: _pad_columns(leaf, all_columns), d_motor_on_grids[0])
     ones = jnp.eye(UNKNOWNS_PER_RUN, all_columns, count)[:, :, None]
     d_own = RunUnknowns(*(jnp.broadcast_to(one, (all_columns, tape.runs)) for one in ones))
     initial, d_initial = value_and_derivatives(
@@ -103,28 +107,30 @@ def sensitivities(
     )
     states = initial.shape[1]
     columns = count + 1 + states
-    d_prepared = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_prepared)
+    d_motor_on_grids = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_motor_on_grids)
 
     # joining takes several passes, with the columns of the start only; one more pass at the joined starts has all
-    starts = _join_blocks(prepared, tape, own, initial, MAX_PASSES).joined
-    passed = simulate_blocks(prepared, d_prepared, columns, tape, starts, own.load_offset)
+    starts = _join_blocks(motor_on_grids, tape, own, initial, MAX_PASSES).joined
+    passed = simulate_blocks(
+        motor_on_grids, d_motor_on_grids, columns, tape, starts, own.load_offset
+    )
     joined, d_starts = _newton_correction_with_derivatives(
         passed, tape, starts, initial, d_initial, count
     )
 
-    by_start = passed.d_seen[:, -states:]
-    seen = passed.seen + jnp.einsum("sncb,bn->scb", by_start, joined - starts)
+    by_start = passed.d_simulated[:, -states:]
+    simulated = passed.simulated + jnp.einsum("sncb,bn->scb", by_start, joined - starts)
     through = jnp.einsum("sncb,bnp->scbp", by_start, d_starts)
-    direct = _in_all_columns(jnp.moveaxis(passed.d_seen[:, : count + 1], 1, -1), count)
-    d_seen = (direct + through).transpose(2, 1, 0, 3)
+    direct = _in_all_columns(jnp.moveaxis(passed.d_simulated[:, : count + 1], 1, -1), count)
+    d_simulated = (direct + through).transpose(2, 1, 0, 3)
     if motor.speed_delay() is None and tape.averaging is None:
-        return seen.transpose(2, 1, 0), d_seen
-    seen, d_seen = value_and_derivatives(
-        lambda motor, seen: reported(motor, tape, seen),
-        (motor, seen.transpose(2, 1, 0)),
-        (d_motor, jnp.moveaxis(d_seen, -1, 0)),
+        return simulated.transpose(2, 1, 0), d_simulated
+    simulated, d_simulated = value_and_derivatives(
+        lambda motor, simulated: reported(motor, tape, simulated),
+        (motor, simulated.transpose(2, 1, 0)),
+        (d_motor, jnp.moveaxis(d_simulated, -1, 0)),
     )
-    return seen, jnp.moveaxis(d_seen, 0, -1)
+    return simulated, jnp.moveaxis(d_simulated, 0, -1)
 
 
 def _in_all_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "... columns"]:
@@ -173,7 +179,7 @@ class Joining(NamedTuple):
 
 
 def _join_blocks(
-    prepared: MotorOnGrids,
+    motor_on_grids: MotorOnGrids,
     tape: Tape,
     own: RunUnknowns,
     initial: Starts,
@@ -183,9 +189,9 @@ def _join_blocks(
 
     The joined starts are NaN if `max_passes` are not enough.
     """
-    motor, states = prepared[0], initial.shape[1]
+    motor, states = motor_on_grids[0], initial.shape[1]
     # of the prepared motor with respect to the starts
-    no_derivatives = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), prepared)
+    no_derivatives = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), motor_on_grids)
     guess = _guessed_starts(motor, own, tape, initial)
     # the correction of a single pass joins a linear motor exactly; otherwise every pass makes at least one more block
     # of each run exact, so this ends for any motor
@@ -193,7 +199,9 @@ def _join_blocks(
     allowed = 1 if exact else min(max_passes or len(guess) + 1, len(guess) + 1)
 
     def simulate(starts: Starts) -> Pass:
-        return simulate_blocks(prepared, no_derivatives, states, tape, starts, own.load_offset)
+        return simulate_blocks(
+            motor_on_grids, no_derivatives, states, tape, starts, own.load_offset
+        )
 
     def unjoined(joining: Joining) -> Bool[Array, ""]:
         return (joining.gap > MAX_RELATIVE_GAP) & (joining.passes < allowed)

@@ -14,12 +14,12 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.interpolate import CubicSpline
 
 from ..motor import Drive
-from ..recording import OVER_LAST, jumps_of
+from ..recordings.recording import OVER_LAST, jumps_of
 from .timing import HELD, Timing
 from .uneven import mean_and_rise, pieces_of, varies_linearly
 
 if TYPE_CHECKING:
-    from ..recording import Recording
+    from ..recordings.recording import Recording
 
 # on the host as laid out, or on the device
 Samples = Array | np.ndarray

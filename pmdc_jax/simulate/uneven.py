@@ -15,7 +15,7 @@ from ..motor import Drive, Motor
 from .exponential import scalar_phi
 
 if TYPE_CHECKING:
-    from ..recording import Recording
+    from ..recordings.recording import Recording
 
 # Closer eigenvalues are moved apart to this relative distance, which is then the relative error, too
 MIN_EIGENVALUE_GAP = 1e-7
@@ -66,14 +66,14 @@ def mean_and_rise(run: Recording, pieces: Pieces) -> tuple[np.ndarray, np.ndarra
     return mean, 12 * first / step
 
 
-def seen_at_record(
+def simulated_at_stamps(
     motor: Motor,
     drive: Drive,
     even: Recording,
-    seen: Float[np.ndarray, "samples 2"],
+    simulated: Float[np.ndarray, "samples 2"],
     straight: bool = False,
 ) -> Float[np.ndarray, "recorded 2"]:
-    """Current A and speed rad/s at the time stamps of a record, from those `seen` at the samples of its `even` clock.
+    """Current A and speed rad/s at the time stamps of a record, from those at the samples of its `even` clock.
 
     Exact for the linear motor, including the difference between the recorded drive and the straight line in its place.
     The contribution of effects is taken to grow in proportion to time within an even sample.
@@ -90,11 +90,11 @@ def seen_at_record(
 
     def moved(by: slice, of: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
         """Linear motion from even samples `of` on, along the straight line, by some of the `_phi_responses`."""
-        rate = seen[of] @ A.T + np.outer(line_start[of], B[:, 0]) + np.outer(load[of], B[:, 1])
+        rate = simulated[of] @ A.T + np.outer(line_start[of], B[:, 0]) + np.outer(load[of], B[:, 1])
         rate_slope = np.outer(line_slope[of], B[:, 0])
-        return seen[of] + _times(constant[by], rate) + _times(growing[by], rate_slope)
+        return simulated[of] + _times(constant[by], rate) + _times(growing[by], rate_slope)
 
-    by_effects = seen[1:] - moved(whole, np.arange(len(seen) - 1))
+    by_effects = simulated[1:] - moved(whole, np.arange(len(simulated) - 1))
     by_effects = np.append(by_effects, np.zeros((1, 2)), 0)[index] * (begins / step)[:, None]
     # the response to the drive's difference from the straight line: over the pieces of an even sample, and then from
     # sample to sample

@@ -5,10 +5,10 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from ..angle import unwrapped
-from ..clock import GAP, is_even
 from ..errors import InputError
-from ..recording import OVER_LAST, Recording
+from ..recordings.angle import unwrapped
+from ..recordings.clock import GAP, is_even
+from ..recordings.recording import OVER_LAST, Recording
 
 # More ticks of the even clock per recorded sample mean that the record has long gaps
 MAX_TICKS_PER_SAMPLE = 20
@@ -40,8 +40,8 @@ def uniform(recording: Recording) -> Recording:
     if even:
         return attrs.evolve(recording, time=np.linspace(time[0], time[-1], len(time)))
     grid = _resampling_clock(time)
-    held = {"voltage": recording.voltage, "load": recording.load, "torque": recording.torque}
-    seen = {"current": recording.current, "speed": recording.speed}
+    driving = {"voltage": recording.voltage, "load": recording.load, "torque": recording.torque}
+    simulated = {"current": recording.current, "speed": recording.speed}
     if len(grid) > MAX_TICKS_PER_SAMPLE * len(time):
         steps = np.diff(time)
         longest = int(np.argmax(steps))
@@ -56,8 +56,8 @@ def uniform(recording: Recording) -> Recording:
         angle=None,
         temperature=None,
         resampled_from=recording,
-        **{k: _interval_means(time, x, grid) for k, x in held.items() if x is not None},
-        **{k: _interpolate(time, x, grid) for k, x in seen.items() if x is not None},
+        **{k: _interval_means(time, x, grid) for k, x in driving.items() if x is not None},
+        **{k: _interpolate(time, x, grid) for k, x in simulated.items() if x is not None},
     )
 
 
@@ -78,10 +78,10 @@ def _resampling_clock(time: np.ndarray) -> np.ndarray:
     return time[0] + step * np.arange(np.ceil(elapsed[-1] / step - 1e-9) + 1)
 
 
-def _interval_means(time: np.ndarray, held: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    integral = np.concatenate([[0.0], np.cumsum(held[:-1] * np.diff(time))])
+def _interval_means(time: np.ndarray, driving: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    integral = np.concatenate([[0.0], np.cumsum(driving[:-1] * np.diff(time))])
     ends = np.append(grid, 2 * grid[-1] - grid[-2])
-    total = np.interp(ends, time, integral) + held[-1] * np.maximum(ends - time[-1], 0.0)
+    total = np.interp(ends, time, integral) + driving[-1] * np.maximum(ends - time[-1], 0.0)
     return np.diff(total) / np.diff(ends)
 
 

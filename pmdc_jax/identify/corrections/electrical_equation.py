@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ...recording import Recording
+from ...recordings.recording import Recording
 from ...simulate.exponential import scalar_phi
-from ..polish import Fit
+from ..fit.polish import Fit
 from ..prepare import Prepared
 
 # How many standard errors from zero the coefficient of the second voltage must be, and the share of the squared
@@ -61,11 +61,11 @@ class ElectricalEquation(NamedTuple):
         Z, X = self.instruments[:, used] / size, self.columns[:, used] / size
         inverse = np.linalg.pinv(Z.T @ X, rcond=1e-10)
         coefficients = inverse @ (Z.T @ self.current)
-        left = self.current - X @ coefficients
-        scores = inverse @ (Z * left[:, None]).T
+        residual = self.current - X @ coefficients
+        scores = inverse @ (Z * residual[:, None]).T
         of_all = np.zeros((2, COLUMNS))
         of_all[:, used] = coefficients / size, np.sqrt(np.square(scores).sum(1)) / size
-        return Solution(of_all[0], of_all[1], float(np.mean(np.square(left))))
+        return Solution(of_all[0], of_all[1], float(np.mean(np.square(residual))))
 
 
 class Solution(NamedTuple):
@@ -73,7 +73,7 @@ class Solution(NamedTuple):
 
     coefficients: Float[np.ndarray, " columns"]
     errors: Float[np.ndarray, " columns"]  # standard
-    left: float  # mean square that is left
+    mean_square: float  # of the residual
 
 
 class TwoVoltages(NamedTuple):
@@ -83,13 +83,13 @@ class TwoVoltages(NamedTuple):
     # share of a sample after which the outputs are read, if the voltages are held; None if the current settles too soon
     # to tell
     reading: float | None
-    # share of a current that is left after that time; at most, where it cannot be told from zero
-    left: float
+    # share of a current that remains after that time; at most, where it cannot be told from zero
+    remains: float
     sample_time: float  # s
 
     def time_constant(self, reading: float) -> float:
         """L / R, in s, if the outputs are read after this share of a sample."""
-        return -reading * self.sample_time / float(np.log(self.left))
+        return -reading * self.sample_time / float(np.log(self.remains))
 
 
 def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
@@ -100,13 +100,18 @@ def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
     own, other = (AFTER, BEFORE) if gains[AFTER] > gains[BEFORE] else (BEFORE, AFTER)
     by_one = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))
     by_two = equation.solve(np.delete(np.arange(COLUMNS), other))
-    if by_one.left - by_two.left < MIN_OF_THREE * (by_one.left - by_three.left):
+    if by_one.mean_square - by_two.mean_square < MIN_OF_THREE * (
+        by_one.mean_square - by_three.mean_square
+    ):
         # it explains much, or the two are collinear, as where a current settles within a sample
         if abs(gains[other]) > MAX_OTHER_SIDE * gains[own]:
             return None
         by_two = by_three
-    coefficients, errors, left = by_two
-    if coefficients[own] < MIN_Z * errors[own] or left > (1 - MIN_EXPLAINED) * by_one.left:
+    coefficients, errors, mean_square = by_two
+    if (
+        coefficients[own] < MIN_Z * errors[own]
+        or mean_square > (1 - MIN_EXPLAINED) * by_one.mean_square
+    ):
         return None
     later = AFTER if own == AFTER else NOW
     both = [later - 1, later]
@@ -118,7 +123,7 @@ def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
     return TwoVoltages(
         ahead=0 if own == AFTER else -1,
         reading=_reading(share, remains[1]) if np.ptp(readings) < MAX_SPREAD else None,
-        left=float(np.clip(remainder if lowest > 0 else highest, *REMAINING)),
+        remains=float(np.clip(remainder if lowest > 0 else highest, *REMAINING)),
         sample_time=equation.sample_time,
     )
 
@@ -131,15 +136,15 @@ class Settling(NamedTuple):
     as_mean: bool  # it depends on both speeds, as only a mean over the sample does
 
 
-def settling(equation: ElectricalEquation, given: Prepared, fit: Fit) -> Settling:
+def settling(equation: ElectricalEquation, prepared: Prepared, fit: Fit) -> Settling:
     """What the settling of the currents tells of the fit."""
-    motor = given.problem.parameters(fit.coordinates)
+    motor = prepared.problem.parameters(fit.coordinates)
     by_fit = np.exp(-float(motor.R / motor.L) * equation.sample_time)
-    found = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))
-    remains, before, after = found.coefficients[:3]  # of the current and of both speeds
+    solution = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))
+    remains, before, after = solution.coefficients[:3]  # of the current and of both speeds
     # the errors of both are opposite, because the speeds are nearly the same
     share = after / (before + after)
-    error = SHARE_ERRORS * found.errors[2] / abs(before + after)
+    error = SHARE_ERRORS * solution.errors[2] / abs(before + after)
     if by_fit > MAX_REMAINING or share - error > 1:
         return Settling(False, False)  # slow currents, or speeds that are not those at the samples
     # very soon settled, it tells its inductance too inaccurately to exclude that
@@ -147,7 +152,7 @@ def settling(equation: ElectricalEquation, given: Prepared, fit: Fit) -> Settlin
     return Settling(
         sooner=bool(share - _later_share(by_fit) > least),
         as_mean=bool(_later_share(remains) - share > MIN_EARLIER + error)
-        and given.averaging is None,
+        and prepared.averaging is None,
     )
 
 
@@ -162,30 +167,30 @@ def _reading(share: float, remains: float) -> float:
     """The share of a sample after which the outputs are read, from that of the later of two held voltages."""
     remains = float(np.clip(remains, *REMAINING))
     # of the current at the start of the sample
-    left = np.clip(1 - share * (1 - remains), remains, 1.0)
-    return float(np.log(left) / np.log(remains))
+    until_reading = np.clip(1 - share * (1 - remains), remains, 1.0)
+    return float(np.log(until_reading) / np.log(remains))
 
 
-def electrical_equation(given: Prepared, fit: Fit) -> ElectricalEquation | None:
+def electrical_equation(prepared: Prepared, fit: Fit) -> ElectricalEquation | None:
     """The equation of all training runs together; None if they differ in sample time or none has what it takes.
 
     **Arguments**: `fit`, to these runs, with voltages that are held from their samples on.
     """
-    tape, seen = given.problem.tape, np.asarray(fit.evaluation.seen)
+    tape, outputs = prepared.problem.tape, np.asarray(fit.evaluation.simulated)
     currents, columns, instruments = [], [], []
-    runs = [(k, run) for k, run in enumerate(given.training) if _is_usable(run)]
+    runs = [(k, run) for k, run in enumerate(prepared.training) if _is_usable(run)]
     if len({tape.grid_of(k) for k, _ in runs}) != 1:
         return None
     for k, run in runs:
         measured, simulated, weight, voltage = (
             tape.samples_of(k, signal, len(run))
-            for signal in (tape.measured, seen, tape.weight, tape.value)
+            for signal in (tape.measured, outputs, tape.weight, tape.value)
         )
         known = np.all(weight > 0, axis=1)
         used = known[1:-2] & known[2:-1] & known[3:]
         # where the current is next to nothing or reverses, brushes may drop any voltage
         flow = np.sign(measured[:, 0]) * (
-            np.abs(measured[:, 0]) > MIN_FLOW * given.problem.noise[0]
+            np.abs(measured[:, 0]) > MIN_FLOW * prepared.problem.noise[0]
         )
         flows = used & (flow[2:-1] != 0) & (flow[3:] != 0)
         one_way = flows & (flow[1:-2] == flow[2:-1]) & (flow[2:-1] == flow[3:])

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...differences import noise_by_differences
+from ...recordings.white_noise import noise_by_differences
 from ...simulate import Tape, uniform
-from ..generalised_least_squares import series_of
-from ..likelihood import negative_log_likelihood
-from ..noise_model import whitener
-from ..polish import Fit, fit_at, polish
+from ..fit.generalised_least_squares import series_of
+from ..fit.likelihood import negative_log_likelihood
+from ..fit.polish import Fit, fit_at, polish
+from ..noise.noise_model import whitener
 from ..prepare import Prepared
 from ..problem import Problem
 
@@ -41,64 +41,63 @@ MAX_FELT_SHARE, MIN_Z_SCORE = 0.5, 5.0
 MAX_SQUARES_RATIO = 1.1
 
 
-def without_input_noise(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def without_input_noise(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with their drives smoothed where the motor did not feel the rough part, and the fit to them.
 
     **Arguments**: `fit`, to the runs as they are. **Returns**: both unchanged if nothing was found, or if smoothing
     makes the runs less likely: where most of the residuals have another cause, their regression may mislead.
     """
-    drives = [np.asarray(getattr(run.recorded, run.drive)) for run in given.runs]
+    drives = [np.asarray(getattr(run.recorded, run.drive)) for run in prepared.runs]
     rough = [drive - denoised(drive) for drive in drives]
     if not any(map(np.any, rough)):
-        return given, fit
-    smooth = _with_drives(given, [d - r for d, r in zip(drives, rough, strict=True)])
-    felt = _felt_shares(given, fit, fit_at(smooth, fit.optimum))
+        return prepared, fit
+    smooth = _with_drives(prepared, [d - r for d, r in zip(drives, rough, strict=True)])
+    felt = _felt_shares(prepared, fit, fit_at(smooth, fit.optimum))
     if not any(share < 1 for share in felt):
-        return given, fit
+        return prepared, fit
     lost = [(1 - share) * r for share, r in zip(felt, rough, strict=True)]
-    problem = _with_drives(given, [d - x for d, x in zip(drives, lost, strict=True)])
+    problem = _with_drives(prepared, [d - x for d, x in zip(drives, lost, strict=True)])
     better = polish(problem, fit.optimum)
-    if negative_log_likelihood(given, better) > negative_log_likelihood(given, fit):
-        return given, fit
+    if negative_log_likelihood(prepared, better) > negative_log_likelihood(prepared, fit):
+        return prepared, fit
     taken = {
-        run.name: float(np.std(x)) for run, x in zip(given.runs, lost, strict=True) if np.any(x)
+        run.name: float(np.std(x)) for run, x in zip(prepared.runs, lost, strict=True) if np.any(x)
     }
-    return given._replace(problem=problem, input_noise=taken), better
+    return prepared._replace(problem=problem, input_noise=taken), better
 
 
-def _with_drives(given: Prepared, drives: list[np.ndarray]) -> Problem:
+def _with_drives(prepared: Prepared, drives: list[np.ndarray]) -> Problem:
     """The problem with these drives of the runs."""
     runs = [
         uniform(attrs.evolve(run.recorded, **{run.drive: drive}))
-        for run, drive in zip(given.runs, drives, strict=True)
+        for run, drive in zip(prepared.runs, drives, strict=True)
     ]
-    tape = given.problem.tape
-    driven = Tape.from_recordings(runs, timing=given.timing)
+    tape = prepared.problem.tape
+    driven = Tape.from_recordings(runs, timing=prepared.timing)
     value, rise = jax.tree.map(jnp.asarray, (driven.value, driven.rise))
-    return replace(given.problem, tape=replace(tape, value=value, rise=rise))
+    return replace(prepared.problem, tape=replace(tape, value=value, rise=rise))
 
 
-def _felt_shares(given: Prepared, rough: Fit, smooth: Fit) -> list[float]:
+def _felt_shares(prepared: Prepared, rough: Fit, smooth: Fit) -> list[float]:
     """The share of the rough part that the motor felt, for each run; 1 unless it is clearly less than half.
 
     By regression of the residuals with the whole drive on the response to its rough part, both filtered by the whitener
     of the residuals with the smooth drive.
     """
-    shares, tape = [], given.problem.tape
-    left, left_smooth = (
+    shares, tape = [], prepared.problem.tape
+    whole, smoothed = (
         -np.asarray(fit.evaluation.residuals) * fit.noise[:, None] for fit in (rough, smooth)
     )
-    for run in range(len(given.runs)):
-        both = series_of(tape, run, np.stack([left, left_smooth - left], -1))
-        white = whitener([series_of(tape, run, left_smooth)])(0, both)
+    for run in range(len(prepared.runs)):
+        both = series_of(tape, run, np.stack([whole, smoothed - whole], -1))
+        white = whitener([series_of(tape, run, smoothed)])(0, both)
         rest, response = white[:, 0], white[:, 1]
         power = response @ response
         share = 1 + rest @ response / power if power > 0 else 1.0
         error = np.std(rest) / np.sqrt(power) if power > 0 else 1.0
         mine = tape.blocks_of(run)
         squares, squares_smooth = (
-            np.square(residual[mine] / rough.noise[:, None]).sum()
-            for residual in (left, left_smooth)
+            np.square(residual[mine] / rough.noise[:, None]).sum() for residual in (whole, smoothed)
         )
         is_noise = (
             share < MAX_FELT_SHARE

@@ -19,9 +19,9 @@ from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
 from ...simulate import EARLY, LATE, SMOOTH, STRAIGHT, Timing
-from ..generalised_least_squares import training_indices
-from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
-from ..polish import Fit, fit_at
+from ..fit.generalised_least_squares import training_indices
+from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
+from ..fit.polish import Fit, fit_at
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
 from .electrical_equation import (
@@ -56,39 +56,41 @@ MIN_LEAD = 0.3
 MIN_LEAD_ERRORS = 5.0
 
 
-def other_timings(given: Prepared, fit: Fit) -> list[Timing]:
+def other_timings(prepared: Prepared, fit: Fit) -> list[Timing]:
     """The timings of the voltages that are clearly likelier than the assumed one, the likeliest first.
 
-    **Arguments**: `given`, the runs with the effects of their sensors corrected; `fit`, to these.
+    **Arguments**: `prepared`, the runs with the effects of their sensors corrected; `fit`, to these.
     """
-    if not all(given.problem.samples > 0) or not any(r.drive == "voltage" for r in given.runs):
+    if not all(prepared.problem.samples > 0) or not any(
+        r.drive == "voltage" for r in prepared.runs
+    ):
         return []  # without a current, or without a speed, only a delay would show
-    trials = _Trials(given, fit)
-    proposed = [*_at_samples(given, fit), *_by_electrical_equation(trials)]
+    trials = _Trials(prepared, fit)
+    proposed = [*_at_samples(prepared, fit), *_by_electrical_equation(trials)]
     plausible, score = _likelier(trials, proposed), trials.negative_log_likelihood
     # where everything is a mean, voltages on straight lines are as good, and simpler
-    found = [timing for timing in plausible if not timing.current_mean]
+    likely = [timing for timing in plausible if not timing.current_mean]
     means = [timing for timing in plausible if timing.current_mean]
-    found += trials.likelier(means, min(map(score, found), default=np.inf))
-    if any(run.load is not None for run in given.training):
-        found = [t if t.reading else min(t, t._replace(load=True), key=score) for t in found]
-    return sorted(found, key=score)
+    likely += trials.likelier(means, min(map(score, likely), default=np.inf))
+    if any(run.load is not None for run in prepared.training):
+        likely = [t if t.reading else min(t, t._replace(load=True), key=score) for t in likely]
+    return sorted(likely, key=score)
 
 
 class _Trials:
     """Fits of the runs with other timings, each made once."""
 
-    def __init__(self, given: Prepared, fit: Fit) -> None:
+    def __init__(self, prepared: Prepared, fit: Fit) -> None:
         """**Arguments**: as of `other_timings`."""
-        self.given, self.fit = given, fit
-        self.equation = electrical_equation(given, fit)
-        self.seen = two_voltages(self.equation) if self.equation else None
+        self.prepared, self.fit = prepared, fit
+        self.equation = electrical_equation(prepared, fit)
+        self.voltages = two_voltages(self.equation) if self.equation else None
         self._fitted: dict[Timing, tuple[Prepared, Fit]] = {}
 
     def fitted(self, timing: Timing) -> tuple[Prepared, Fit]:
         """The runs with this timing, and the fit to them."""
         if timing not in self._fitted:
-            refit = self._refitted(without_averaging(with_timing(self.given, timing)))
+            refit = self._refitted(without_averaging(with_timing(self.prepared, timing)))
             # only a fit with the right timing can tell a mean over the last sample from a delay
             self._fitted[timing] = with_averaging(*with_even_clock(*refit))
         return self._fitted[timing]
@@ -100,8 +102,8 @@ class _Trials:
     def with_fitted_rate(self, timing: Timing) -> Timing:
         """The timing of smooth voltages with the rate R / L of the motor fitted to them."""
         for _ in range(2):  # the first fit takes it for slow
-            given, fit = self.fitted(timing)
-            timing = timing._replace(smooth=electrical_rate(given.problem, fit))
+            prepared, fit = self.fitted(timing)
+            timing = timing._replace(smooth=electrical_rate(prepared.problem, fit))
         return timing
 
     def likelier(self, timings: Sequence[Timing], than: float) -> list[Timing]:
@@ -111,14 +113,14 @@ class _Trials:
 
     def is_right(self, timing: Timing) -> bool:
         """Whether nothing but noise is left with this timing, and not because the current alone was late."""
-        given, fit = self.fitted(timing)
-        return leaves_only_noise(given, fit) and not only_current_is_late(given, fit)
+        prepared, fit = self.fitted(timing)
+        return leaves_only_noise(prepared, fit) and not only_current_is_late(prepared, fit)
 
     def best_lead(self, ahead: int) -> float:
         """The lead that fits best, if the voltages act between two samples, at least so many ahead."""
 
         def misfit(lead: float) -> float:
-            return self._refitted(with_timing(self.given, Timing(lead)))[1].cost
+            return self._refitted(with_timing(self.prepared, Timing(lead)))[1].cost
 
         limits, tolerance = (ahead + MARGIN, ahead + 1 - MARGIN), {"xatol": LEAD_TOLERANCE}
         best = minimize_scalar(misfit, bounds=limits, method="bounded", options=tolerance)
@@ -127,57 +129,61 @@ class _Trials:
     def _refitted(self, other: Prepared) -> tuple[Prepared, Fit]:
         """The best fit to the runs with another timing, from the inductance with which the currents depend on two
         voltages as they were seen to."""
-        timing, seen = other.timing, self.seen
-        if not (seen and timing.reading and timing.ahead == seen.ahead):
+        timing, voltages = other.timing, self.voltages
+        if not (voltages and timing.reading and timing.ahead == voltages.ahead):
             return refitted(other, self.fit)
         R = float(other.problem.parameters(self.fit.coordinates).R)
-        return refitted(other, self.fit, R * seen.time_constant(timing.reading))
+        return refitted(other, self.fit, R * voltages.time_constant(timing.reading))
 
 
 def _likelier(trials: _Trials, proposed: Sequence[Timing]) -> list[Timing]:
     """The proposed timings that are clearly likelier than the assumed one; smooth voltages only if they are likelier
     than straight ones, too."""
-    given, fit = trials.given, trials.fit
-    found = trials.likelier(proposed, negative_log_likelihood_within(given, fit))
-    straight = trials.negative_log_likelihood(STRAIGHT) if STRAIGHT in found else np.inf
-    if SMOOTH in found and not trials.likelier([SMOOTH], straight):
-        found.remove(SMOOTH)
+    prepared, fit = trials.prepared, trials.fit
+    likely = trials.likelier(proposed, negative_log_likelihood_within(prepared, fit))
+    straight = trials.negative_log_likelihood(STRAIGHT) if STRAIGHT in likely else np.inf
+    if SMOOTH in likely and not trials.likelier([SMOOTH], straight):
+        likely.remove(SMOOTH)
     # of a slow difference the whitening filter takes most for noise
-    if SMOOTH in proposed and not found and not leaves_only_noise(given, fit):
-        found = [SMOOTH] if trials.is_right(SMOOTH) else []
-    return [t if t.smooth is None else trials.with_fitted_rate(t) for t in found]
+    if SMOOTH in proposed and not likely and not leaves_only_noise(prepared, fit):
+        likely = [SMOOTH] if trials.is_right(SMOOTH) else []
+    return [t if t.smooth is None else trials.with_fitted_rate(t) for t in likely]
 
 
-def _at_samples(given: Prepared, fit: Fit) -> list[Timing]:
+def _at_samples(prepared: Prepared, fit: Fit) -> list[Timing]:
     """The timings without an instant between samples that the residuals make plausible."""
-    lead, largest = _apparent_leads(given, fit)
+    lead, largest = _apparent_leads(prepared, fit)
     # a speed that is a mean over the last sample is half a sample late, too, and may hide the shift
-    hidden = given.averaging is None and seems_averaged(given)
-    found = []
+    hidden = prepared.averaging is None and seems_averaged(prepared)
+    likely = []
     if abs(lead) > MIN_LEAD or hidden:
-        found = [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
+        likely = [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
     # voltages that step at samples in some runs and are smooth in others seem early in these alone
-    even = all(run.resampled_from is None for run in given.runs)
-    if even and (STRAIGHT in found or largest > MIN_LEAD):
-        found.append(SMOOTH)
-    return found
+    even = all(run.resampled_from is None for run in prepared.runs)
+    if even and (STRAIGHT in likely or largest > MIN_LEAD):
+        likely.append(SMOOTH)
+    return likely
 
 
 def _by_electrical_equation(trials: _Trials) -> list[Timing]:
     """The timings that the electrical equation makes plausible."""
     if trials.equation is None:
         return []
-    return _hidden(trials, trials.equation) if trials.seen is None else _seen(trials, trials.seen)
+    return (
+        _hidden(trials, trials.equation)
+        if trials.voltages is None
+        else _suggested_by(trials, trials.voltages)
+    )
 
 
-def _seen(trials: _Trials, seen: TwoVoltages) -> list[Timing]:
+def _suggested_by(trials: _Trials, voltages: TwoVoltages) -> list[Timing]:
     """The plausible timings where the currents depend on two voltages: only right ones, if there are any."""
-    told = [] if seen.reading is None else _between_samples(seen.ahead + seen.reading)
-    means = [Timing(lead, current_mean=True) for lead in ((0, -1) if seen.ahead < 0 else (1,))]
+    told = [] if voltages.reading is None else _between_samples(voltages.ahead + voltages.reading)
+    means = [Timing(lead, current_mean=True) for lead in ((0, -1) if voltages.ahead < 0 else (1,))]
     if right := [timing for timing in told + means if trials.is_right(timing)]:
         return right
     # the equation takes the speed as straight between samples
-    between = [*told, *_between_samples(trials.best_lead(seen.ahead))]
+    between = [*told, *_between_samples(trials.best_lead(voltages.ahead))]
     # a filtered current is more like a mean than like an instant
     late = any(only_current_is_late(*trials.fitted(timing)) for timing in between)
     return [] if late else between + means
@@ -186,9 +192,9 @@ def _seen(trials: _Trials, seen: TwoVoltages) -> list[Timing]:
 def _hidden(trials: _Trials, equation: ElectricalEquation) -> list[Timing]:
     """The right timings for which a wrong inductance may make up, where the current settles from one sample to the next
     or the voltages are smooth."""
-    settles = settling(equation, trials.given, trials.fit)
+    settles = settling(equation, trials.prepared, trials.fit)
     hidden = _between_samples(trials.best_lead(-1)) if settles.sooner else []
-    if any(settles) or _current_seems_mean(trials.given.problem, trials.fit):
+    if any(settles) or _current_seems_mean(trials.prepared.problem, trials.fit):
         hidden.append(Timing(0, current_mean=True))
     return [timing for timing in hidden if trials.is_right(timing)]
 
@@ -205,17 +211,19 @@ def _between_samples(lead: float) -> list[Timing]:
     return [timing] if MIN_DISTANCE < lead - timing.ahead < 1 - MIN_DISTANCE else []
 
 
-def only_current_is_late(given: Prepared, fit: Fit) -> bool:
+def only_current_is_late(prepared: Prepared, fit: Fit) -> bool:
     """Whether the current alone was read late, as behind a filter, rather than that the voltages act between samples as
     the timing of the runs says.
 
     By regression of the residuals on the change that another lead makes in both outputs, and on that of a later reading
     in the current.
     """
-    if given.timing.reading is None or given.timing.ahead >= 0:
+    if prepared.timing.reading is None or prepared.timing.ahead >= 0:
         return False
-    late, error = _lateness_of_current(given.problem, fit, change_by_reading(given.problem, fit))
-    return late > max(MIN_LATE_SHARE * abs(given.timing.lead), MIN_LATE_ERRORS * error)
+    late, error = _lateness_of_current(
+        prepared.problem, fit, change_by_reading(prepared.problem, fit)
+    )
+    return late > max(MIN_LATE_SHARE * abs(prepared.timing.lead), MIN_LATE_ERRORS * error)
 
 
 def _lateness_of_current(
@@ -223,7 +231,7 @@ def _lateness_of_current(
 ) -> tuple[float, float]:
     """How much later than assumed the current was read, and the standard error of that, in samples, beside other
     `changes` of the outputs."""
-    current = fit.evaluation.seen[:, 0]
+    current = fit.evaluation.simulated[:, 0]
     rise = jnp.diff(current.reshape(-1), prepend=0.0).reshape(current.shape)
     rise = rise.at[jnp.asarray(problem.tape.begins), 0].set(0.0)
     later = jnp.stack([-rise, jnp.zeros_like(rise)], 1)
@@ -231,25 +239,25 @@ def _lateness_of_current(
     return float(amplitudes[0]), float(errors[0])
 
 
-def negative_log_likelihood_within(given: Prepared, fit: Fit) -> float:
+def negative_log_likelihood_within(prepared: Prepared, fit: Fit) -> float:
     """Negative log-likelihood of the runs without their first and last samples: where a voltage acts later, the
     beginning of a run cannot be predicted."""
-    return negative_log_likelihood(without_ends(given), fit)
+    return negative_log_likelihood(without_ends(prepared), fit)
 
 
-def _apparent_leads(given: Prepared, fit: Fit) -> tuple[float, float]:
+def _apparent_leads(prepared: Prepared, fit: Fit) -> tuple[float, float]:
     """How much earlier than assumed the voltages seem to act, in half samples, in all runs together and, if clearly, in
     one of them at most: regression of the residuals on the change that half a sample makes in the outputs, less the
     part that the parameters could explain.
 
     Half a sample earlier is a held mean of the voltages at a sample and the next, which reuses compiled programs.
     """
-    means = with_timing(given, STRAIGHT).problem
+    means = with_timing(prepared, STRAIGHT).problem
     means = replace(means, tape=replace(means.tape, rise=None))
-    change = fit_at(means, fit.optimum).evaluation.seen - fit.evaluation.seen
-    (lead,), _ = _amplitudes(given.problem, fit, [change])
-    blocks = [given.problem.tape.blocks_of(run) for run in training_indices(given)]
-    leads, errors = _amplitudes(given.problem, fit, [change * b[:, None, None] for b in blocks])
+    change = fit_at(means, fit.optimum).evaluation.simulated - fit.evaluation.simulated
+    (lead,), _ = _amplitudes(prepared.problem, fit, [change])
+    blocks = [prepared.problem.tape.blocks_of(run) for run in training_indices(prepared)]
+    leads, errors = _amplitudes(prepared.problem, fit, [change * b[:, None, None] for b in blocks])
     return float(lead), float(np.max(leads[leads > MIN_LEAD_ERRORS * errors], initial=0.0))
 
 

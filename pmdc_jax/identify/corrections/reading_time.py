@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..likelihood import leaves_only_noise
-from ..polish import Fit, polish
+from ..fit.likelihood import leaves_only_noise
+from ..fit.polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Nuisance, Problem, evaluate
 
@@ -23,30 +23,30 @@ MAX_REFITS, DIFFERENCE, MARGIN = 12, 1e-4, 0.005
 TOLERANCE = 2e-4
 
 
-def with_fitted_reading(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def with_fitted_reading(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the instant of reading fitted, as a nuisance parameter, and the fit to them; both unchanged where
     the outputs are read at the samples.
 
     Where something else is missing from the motor, the instant stays: it would move to make up for that.
     """
-    instant = given.timing.reading
+    instant = prepared.timing.reading
     if instant is None:
-        return given, fit
-    given, fit = _with_nuisance(given, fit)
-    moved, refit = given, fit
+        return prepared, fit
+    prepared, fit = _with_nuisance(prepared, fit)
+    moved, refit = prepared, fit
     for _ in range(MAX_REFITS):
         before, instant = instant, _better_instant(moved.problem, refit)
         moved, refit = _with_nuisance(_read_at(moved, instant), refit)
         if abs(instant - before) < TOLERANCE:
             break
-    return (moved, refit) if leaves_only_noise(moved, refit) else (given, fit)
+    return (moved, refit) if leaves_only_noise(moved, refit) else (prepared, fit)
 
 
-def _with_nuisance(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def _with_nuisance(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the instant of reading as a nuisance parameter, and the fit to them."""
-    nuisance = Nuisance(change_by_reading(given.problem, fit)[..., None], fit.noise)
-    given = given._replace(problem=replace(given.problem, nuisance=nuisance))
-    return given, polish(given.problem, fit.optimum)
+    nuisance = Nuisance(change_by_reading(prepared.problem, fit)[..., None], fit.noise)
+    prepared = prepared._replace(problem=replace(prepared.problem, nuisance=nuisance))
+    return prepared, polish(prepared.problem, fit.optimum)
 
 
 def change_by_reading(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
@@ -56,7 +56,7 @@ def change_by_reading(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samp
     def seen(difference: float) -> Float[Array, "blocks 2 samples"]:
         reading = jnp.asarray(problem.tape.reading) + difference
         read = replace(problem, tape=replace(problem.tape, reading=reading))
-        return evaluate(read, fit.unknowns).seen
+        return evaluate(read, fit.unknowns).simulated
 
     change = (seen(DIFFERENCE) - seen(-DIFFERENCE)) / (2 * DIFFERENCE)
     return change.at[jnp.asarray(problem.tape.begins), :, :2].set(0.0)
@@ -68,12 +68,12 @@ def _better_instant(problem: Problem, fit: Fit) -> float:
     assert problem.nuisance is not None
     tape, change = problem.tape, problem.nuisance.responses[..., 0]
     scale = tape.weight / fit.noise[:, None] * problem.fitted_blocks[:, None, None]
-    left, column = (tape.measured - fit.evaluation.seen) * scale, change * scale
-    later = float(jnp.sum(left * column) / jnp.sum(column**2))
+    residual, column = (tape.measured - fit.evaluation.simulated) * scale, change * scale
+    later = float(jnp.sum(residual * column) / jnp.sum(column**2))
     return float(np.clip(float(jnp.asarray(tape.reading)) + later, MARGIN, 1 - MARGIN))
 
 
-def _read_at(given: Prepared, reading: float) -> Prepared:
+def _read_at(prepared: Prepared, reading: float) -> Prepared:
     """The runs with the outputs read after this share of a sample."""
-    timing = given.timing._replace(lead=given.timing.ahead + reading)
-    return given.with_tape(reading=jnp.asarray(reading))._replace(timing=timing)
+    timing = prepared.timing._replace(lead=prepared.timing.ahead + reading)
+    return prepared.with_tape(reading=jnp.asarray(reading))._replace(timing=timing)

@@ -9,26 +9,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ...recording import Recording
+from ...recordings.recording import Recording
 from ...simulate import Tape, Timing, uniform
-from ..polish import Fit
+from ..fit.polish import Fit
 from ..prepare import Prepared
 from ..problem import Problem
 from .speed_averaging import without_ends
 
 
-def with_timing(given: Prepared, timing: Timing) -> Prepared:
+def with_timing(prepared: Prepared, timing: Timing) -> Prepared:
     """The runs with voltages of this timing."""
-    tape = given.problem.tape
+    tape = prepared.problem.tape
     runs = [
         attrs.evolve(uniform(_retimed(run, k, tape, timing)), current_averaged=timing.current_mean)
-        for k, run in enumerate(given.runs)
+        for k, run in enumerate(prepared.runs)
     ]
     driven = Tape.from_recordings(runs, timing=timing)
     names = ("value", "load", "rise", "reading", "averaging")
     tape = replace(tape, **jax.tree.map(jnp.asarray, {n: getattr(driven, n) for n in names}))
-    problem = replace(given.problem, tape=tape)
-    acting = given._replace(runs=runs, problem=problem, timing=timing)
+    problem = replace(prepared.problem, tape=tape)
+    acting = prepared._replace(runs=runs, problem=problem, timing=timing)
     # what acts during the first sample was not recorded: without outputs there, the initial state makes up for it
     return without_ends(acting) if timing.ahead < 0 or timing.current_mean else acting
 

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...recording import OVER_BOTH, OVER_LAST, Averaging
+from ...recordings.recording import OVER_BOTH, OVER_LAST, Averaging
 from ...simulate import Tape
-from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
-from ..noise import quantum
-from ..polish import Fit, polish
+from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
+from ..fit.polish import Fit, polish
+from ..noise.sensor_noise import quantum
 from ..prepare import Prepared
 
 # Most lines of an encoder, and by how much a computed number of lines may differ from a whole one
@@ -41,93 +41,93 @@ BOTH, SPEED = slice(None), slice(1, None)
 MAX_NYQUIST_RATIO = 1 / 8
 
 
-def seems_averaged(given: Prepared) -> bool:
+def seems_averaged(prepared: Prepared) -> bool:
     """Whether the speeds are encoder counts with the noise of a mean."""
-    mean, _, counted = _averaging_by_noise(given)
+    mean, _, counted = _averaging_by_noise(prepared)
     return counted and mean is not None
 
 
-def with_evident_averaging(given: Prepared) -> Prepared:
+def with_evident_averaging(prepared: Prepared) -> Prepared:
     """The runs with their speeds treated as means over the last sample where the noise leaves no doubt of it."""
-    mean, min_gain, _ = _averaging_by_noise(given)
+    mean, min_gain, _ = _averaging_by_noise(prepared)
     sure = mean is not None and np.isneginf(min_gain)
-    return _with_speeds_averaged(without_ends(given, SPEED), mean) if sure else given
+    return _with_speeds_averaged(without_ends(prepared, SPEED), mean) if sure else prepared
 
 
-def with_averaging(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def with_averaging(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with their speeds treated as means, where that is what was recorded, and the fit to them.
 
     A speed that lags more than a mean would is late for another reason.
 
     **Arguments**: `fit`, to the runs as they are. **Returns**: both unchanged if no mean was found.
     """
-    if given.averaging:
-        return given, fit
-    mean, min_gain, counted = _averaging_by_noise(given)
+    if prepared.averaging:
+        return prepared, fit
+    mean, min_gain, counted = _averaging_by_noise(prepared)
     if mean is None:
-        return given, fit
-    inner = without_ends(given, SPEED)
+        return prepared, fit
+    inner = without_ends(prepared, SPEED)
     averaged, better = refitted(_with_speeds_averaged(inner, mean), fit)
-    left = negative_log_likelihood(averaged, better)
-    if not negative_log_likelihood(inner, fit) - left > min_gain:
-        return given, fit
+    unlikeliness = negative_log_likelihood(averaged, better)
+    if not negative_log_likelihood(inner, fit) - unlikeliness > min_gain:
+        return prepared, fit
     if not counted:
         # a mean over the last and the next sample has no lag: a speed that fits better a sample earlier, or as a mean
         # over the last sample, is merely late
         last = negative_log_likelihood(*refitted(_with_speeds_averaged(inner, OVER_LAST), fit))
         other = better if mean == OVER_LAST else fit
-        if last < left or refitted(_shifted_earlier(inner), fit)[1].cost < other.cost:
-            return given, fit
+        if last < unlikeliness or refitted(_shifted_earlier(inner), fit)[1].cost < other.cost:
+            return prepared, fit
     return averaged, better
 
 
-def without_averaging(given: Prepared) -> Prepared:
+def without_averaging(prepared: Prepared) -> Prepared:
     """The runs with their recorded speeds treated as instantaneous again."""
-    return _with_speeds_averaged(given, None) if given.averaging else given
+    return _with_speeds_averaged(prepared, None) if prepared.averaging else prepared
 
 
-def without_ends(given: Prepared, outputs: slice = BOTH) -> Prepared:
+def without_ends(prepared: Prepared, outputs: slice = BOTH) -> Prepared:
     """The runs without the first and the last sample of some outputs: there a mean, or a voltage that acts at another
     time, depends on what was not recorded."""
-    tape = given.problem.tape
+    tape = prepared.problem.tape
     weight = np.array(tape.weight)
-    for k, run in enumerate(given.runs):
+    for k, run in enumerate(prepared.runs):
         first = int(np.argmax(tape.blocks_of(k)))
         for sample in (0, len(run) - 1):
             block, at = divmod(sample, weight.shape[2])
             weight[first + block, outputs, at] = 0.0
-    return given.with_tape(weight=jnp.asarray(weight))
+    return prepared.with_tape(weight=jnp.asarray(weight))
 
 
-def _with_speeds_averaged(given: Prepared, averaging: Averaging | None) -> Prepared:
+def _with_speeds_averaged(prepared: Prepared, averaging: Averaging | None) -> Prepared:
     """The runs with their recorded speeds treated as such means, or as instantaneous for None."""
     runs = [
         attrs.evolve(run, averaging=averaging) if run.speed is not None and not ours else run
-        for run, ours in zip(given.runs, given.differentiated, strict=True)
+        for run, ours in zip(prepared.runs, prepared.differentiated, strict=True)
     ]
     laid = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, follow=True))
-    averaged = given.with_tape(averaging=laid.averaging, turn=laid.turn)
+    averaged = prepared.with_tape(averaging=laid.averaging, turn=laid.turn)
     return averaged._replace(runs=runs, averaging=averaging)
 
 
-def _shifted_earlier(given: Prepared) -> Prepared:
+def _shifted_earlier(prepared: Prepared) -> Prepared:
     """The runs with their speeds shifted to one sample earlier."""
     runs = [
         run if run.speed is None else attrs.evolve(run, speed=np.append(run.speed[1:], np.nan))
-        for run in given.runs
+        for run in prepared.runs
     ]
     laid = Tape.from_recordings(runs)
-    weight = jnp.asarray(given.problem.tape.weight * laid.weight)
-    return given.with_tape(measured=jnp.asarray(laid.measured), weight=weight)
+    weight = jnp.asarray(prepared.problem.tape.weight * laid.weight)
+    return prepared.with_tape(measured=jnp.asarray(laid.measured), weight=weight)
 
 
-def refitted(given: Prepared, fit: Fit, inductance: float | None = None) -> tuple[Prepared, Fit]:
+def refitted(prepared: Prepared, fit: Fit, inductance: float | None = None) -> tuple[Prepared, Fit]:
     """The runs, and the best fit to them that starts from `fit`, or from there with a smaller inductance: a large one
     may have compensated part of a sample of delay.
 
     **Arguments**: `inductance`, H, if it is known about which, to start from.
     """
-    parameters = given.problem.parameters
+    parameters = prepared.problem.parameters
     starts = [fit.optimum]
     if "L" in parameters.names:
         L = parameters.names.index("L")
@@ -135,27 +135,27 @@ def refitted(given: Prepared, fit: Fit, inductance: float | None = None) -> tupl
         if inductance is not None:
             change = np.log(inductance) - float(fit.coordinates[L])
             starts = [fit.optimum.moved(parameters, change * along_L)]
-        elif given.averaging == OVER_LAST or given.timing.current_mean:
+        elif prepared.averaging == OVER_LAST or prepared.timing.current_mean:
             starts.append(fit.optimum.moved(parameters, -L_REDUCTION * along_L))
-    ends = [polish(given.problem, start) for start in starts]
-    return given, min(ends, key=lambda end: end.cost)
+    ends = [polish(prepared.problem, start) for start in starts]
+    return prepared, min(ends, key=lambda end: end.cost)
 
 
-def _averaging_by_noise(given: Prepared) -> tuple[Averaging | None, float, bool]:
+def _averaging_by_noise(prepared: Prepared) -> tuple[Averaging | None, float, bool]:
     """The mean that the noise of the speeds suggests, None if none; the gain in log-likelihood that it must bring, as
     in `averaging_of_counts`; and whether the speeds are counts.
 
     A mean over the last sample can be told from a delay only if the speed is counted, or where the current is such a
     mean, and from an inductance only if the current was measured.
     """
-    speeds = _speeds(given)
+    speeds = _speeds(prepared)
     counts = _in_counts(speeds)
     mean, min_gain = (
         averaging_of_counts(counts) if counts else averaging_of_differences([s for s, _ in speeds])
     )
-    if mean is None and speeds and not counts and given.timing.current_mean:
+    if mean is None and speeds and not counts and prepared.timing.current_mean:
         mean = OVER_LAST
-    if mean == OVER_LAST and not given.problem.samples[0] > 0:
+    if mean == OVER_LAST and not prepared.problem.samples[0] > 0:
         mean = None
     return mean, min_gain, bool(counts)
 
@@ -201,11 +201,11 @@ def _band_powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
     return np.mean(powers, axis=0)
 
 
-def _speeds(given: Prepared) -> list[tuple[np.ndarray, float]]:
+def _speeds(prepared: Prepared) -> list[tuple[np.ndarray, float]]:
     """The recorded speeds, rad/s, of all training runs long enough to show their noise, and their sample times, s."""
     recorded = [
         (run.speed, np.diff(run.time))
-        for run, ours in zip(given.training, given.differentiated, strict=False)
+        for run, ours in zip(prepared.training, prepared.differentiated, strict=False)
         if run.speed is not None and not ours
     ]
     known = [(speed[~np.isnan(speed)], float(np.median(steps))) for speed, steps in recorded]

@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import expm
 
-from ...recording import Averaging, Recording, jumps_of
+from ...recordings.recording import Averaging, Recording, jumps_of
 from ...simulate import SMOOTH, STRAIGHT
 from ...simulate.tape import BLOCK, rise_like_step
-from ..likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
-from ..polish import Fit, polish
+from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
+from ..fit.polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Nuisance, Problem
 from .retiming import electrical_rate, with_timing
@@ -52,57 +52,57 @@ class Steps(NamedTuple):
     share: Float[np.ndarray, " steps"]
 
 
-def with_step_times(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def with_step_times(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the steps of their voltages at the times when the motor felt them, and the fit to them; both
     unchanged if the steps coincide with samples or all have the same delay, which is a matter of `reading_time`."""
-    problem = given.problem
-    steps = [_as_laid_out(given, run) for run in range(len(given.runs))]
+    problem = prepared.problem
+    steps = [_as_laid_out(prepared, run) for run in range(len(prepared.runs))]
     count, most = sum(len(s.at) for s in steps), max(len(s.at) for s in steps)
     too_many = 2 * problem.tape.value.size * most > MAX_ELEMENTS
-    if given.timing.reading or not all(problem.samples > 0) or count < MIN_STEPS or too_many:
-        return given, fit
+    if prepared.timing.reading or not all(problem.samples > 0) or count < MIN_STEPS or too_many:
+        return prepared, fit
     min_gain = MIN_LOG_LIKELIHOOD_GAIN + MIN_GAIN_PER_STEP * count
     steps, predicted_gain = _fit_times(problem, fit, steps)
     if predicted_gain < min_gain or not _are_unsynchronised(steps):
-        return given, fit
-    placed = _refitted(given, fit, steps)
-    if given.timing == STRAIGHT:  # so do smooth voltages look beside steps anywhere in a sample
-        placed = min(placed, _refitted_smooth(given, placed), key=_negative_log_likelihood)
-    gain = negative_log_likelihood(given, fit) - _negative_log_likelihood(placed)
-    return (placed.given, placed.fit) if gain > min_gain else (given, fit)
+        return prepared, fit
+    placed = _refitted(prepared, fit, steps)
+    if prepared.timing == STRAIGHT:  # so do smooth voltages look beside steps anywhere in a sample
+        placed = min(placed, _refitted_smooth(prepared, placed), key=_negative_log_likelihood)
+    gain = negative_log_likelihood(prepared, fit) - _negative_log_likelihood(placed)
+    return (placed.prepared, placed.fit) if gain > min_gain else (prepared, fit)
 
 
 class _Placed(NamedTuple):
     """Runs with their steps at the times that fit best, and the fit to them."""
 
-    given: Prepared
+    prepared: Prepared
     fit: Fit
     steps: Sequence[Steps]
 
 
-def _refitted(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> _Placed:
+def _refitted(prepared: Prepared, fit: Fit, steps: Sequence[Steps]) -> _Placed:
     """The steps at the times that fit best, from the times and the fit given."""
-    placed = _placed(given, fit, steps)
+    placed = _placed(prepared, fit, steps)
     for _ in range(MAX_REFITS):
-        steps, _ = _fit_times(placed.given.problem, placed.fit, placed.steps)
+        steps, _ = _fit_times(placed.prepared.problem, placed.fit, placed.steps)
         moved = np.clip(_shares(steps), 0, 1) - np.clip(_shares(placed.steps), 0, 1)
         if np.max(np.abs(moved)) < TOLERANCE:
             break
-        placed = _placed(given, placed.fit, steps)
+        placed = _placed(prepared, placed.fit, steps)
     return placed
 
 
-def _placed(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> _Placed:
+def _placed(prepared: Prepared, fit: Fit, steps: Sequence[Steps]) -> _Placed:
     """The steps at these times, and the fit to the runs with them, from another fit."""
-    with_steps = _with_steps(given, fit, steps)
+    with_steps = _with_steps(prepared, fit, steps)
     return _Placed(with_steps, polish(with_steps.problem, fit.optimum), steps)
 
 
-def _refitted_smooth(given: Prepared, straight: _Placed) -> _Placed:
+def _refitted_smooth(prepared: Prepared, straight: _Placed) -> _Placed:
     """The steps at the times that fit best if the voltages are on smooth curves between them, from the fit for straight
     voltages."""
-    rate = electrical_rate(given.problem, straight.fit)
-    smooth = with_timing(given, SMOOTH._replace(smooth=rate))
+    rate = electrical_rate(prepared.problem, straight.fit)
+    smooth = with_timing(prepared, SMOOTH._replace(smooth=rate))
     steps = [
         _as_laid_out(smooth, run)._replace(share=s.share) for run, s in enumerate(straight.steps)
     ]
@@ -110,7 +110,7 @@ def _refitted_smooth(given: Prepared, straight: _Placed) -> _Placed:
 
 
 def _negative_log_likelihood(placed: _Placed) -> float:
-    return negative_log_likelihood(placed.given, placed.fit)
+    return negative_log_likelihood(placed.prepared, placed.fit)
 
 
 def steps_of(run: Recording) -> Steps:
@@ -122,17 +122,17 @@ def steps_of(run: Recording) -> Steps:
         and run.resampled_from is None
         and len(run) > 3
     ):
-        found = jumps_of(run.voltage, MIN_STEP_RATIO, MIN_STEP_SHARE)
-        if len(found) <= len(run) / MIN_SAMPLES_PER_STEP:
-            at, height = found, np.diff(run.voltage)[found - 1]
+        jumps = jumps_of(run.voltage, MIN_STEP_RATIO, MIN_STEP_SHARE)
+        if len(jumps) <= len(run) / MIN_SAMPLES_PER_STEP:
+            at, height = jumps, np.diff(run.voltage)[jumps - 1]
     return Steps(at, height, np.zeros(len(at)))
 
 
-def _as_laid_out(given: Prepared, k: int) -> Steps:
+def _as_laid_out(prepared: Prepared, k: int) -> Steps:
     """The steps of a run as they are on its tape."""
-    steps, timing, tape = steps_of(given.runs[k]), given.timing, given.problem.tape
+    steps, timing, tape = steps_of(prepared.runs[k]), prepared.timing, prepared.problem.tape
     if timing.smooth is not None:  # the curve before a step goes on until it
-        run = given.runs[k]
+        run = prepared.runs[k]
         before = tape.samples_of(k, tape.drive_at(1.0), len(run))[steps.at - 1]
         return steps._replace(height=np.asarray(run.voltage)[steps.at] - before)
     if timing.straight:  # a straight rise between two samples is a step in their middle
@@ -157,12 +157,12 @@ def _fit_times(problem: Problem, fit: Fit, steps: Sequence[Steps]) -> tuple[list
     """The steps at the times that minimise the residuals of a fit, and the gain in log-likelihood for white noise."""
     tape = problem.tape
     scale = np.asarray(tape.weight) / fit.noise[:, None]
-    left = (np.asarray(tape.measured) - np.asarray(fit.evaluation.seen)) * scale
+    residual = (np.asarray(tape.measured) - np.asarray(fit.evaluation.simulated)) * scale
     fitted, squares = [], 0.0
     for run, s in enumerate(steps):
         mine = tape.blocks_of(run)
         columns = _responses(problem, fit, run, s) * scale[mine][..., None]
-        rows, rest = columns.reshape(left[mine].size, len(s.at)), left[mine].ravel()
+        rows, rest = columns.reshape(residual[mine].size, len(s.at)), residual[mine].ravel()
         along = rows.T @ rest
         # a step that is hardly felt stays where it is
         by = np.linalg.pinv(rows.T @ rows, hermitian=True, rcond=RANK_TOLERANCE) @ along
@@ -171,9 +171,9 @@ def _fit_times(problem: Problem, fit: Fit, steps: Sequence[Steps]) -> tuple[list
     return fitted, squares / 2
 
 
-def _with_steps(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
+def _with_steps(prepared: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
     """The runs with the steps at their times, which become nuisance parameters of the problem."""
-    problem, tape = given.problem, given.problem.tape
+    problem, tape = prepared.problem, prepared.problem.tape
     value = np.array(tape.value)
     rise = np.zeros_like(value) if tape.rise is None else np.array(tape.rise)
     most, rate = max(len(s.at) for s in steps), electrical_rate(problem, fit)
@@ -184,7 +184,7 @@ def _with_steps(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
         share = np.clip(s.share, 0.0, 1.0)
         block, sample = np.divmod(s.at - 1, BLOCK)
         at = mine[block], sample
-        if given.timing.smooth is None:
+        if prepared.timing.smooth is None:
             value[at] -= rise[at] / 2
             rise[at] = 0.0
         value[at] += share * s.height
@@ -192,7 +192,7 @@ def _with_steps(given: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
     tape = replace(tape, value=jnp.asarray(value), rise=jnp.asarray(rise))
     nuisance = Nuisance(jnp.asarray(responses), fit.noise)
     problem = replace(problem, tape=tape, nuisance=nuisance)
-    return given._replace(problem=problem, stepped=True)
+    return prepared._replace(problem=problem, stepped=True)
 
 
 def _responses(

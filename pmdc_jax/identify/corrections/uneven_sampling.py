@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...clock import GAP
-from ...recording import Recording
+from ...recordings.clock import GAP
+from ...recordings.recording import Recording
 from ...simulate import Tape
-from ...simulate.uneven import seen_at_record
-from ..polish import Fit, fit_at, polish
+from ...simulate.uneven import simulated_at_stamps
+from ..fit.polish import Fit, fit_at, polish
 from ..prepare import Prepared
 
 # Refits at most
@@ -27,15 +27,15 @@ SHIFT_TOLERANCE = 0.01
 MAX_STEP_RATIO = 0.9
 
 
-def with_even_clock(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def with_even_clock(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with every sample of an uneven clock shifted to the nearest even sample along the simulated motion, and
     the fit to them; both unchanged where all clocks are even."""
-    uneven = any(run.resampled_from is not None for run in given.runs)
+    uneven = any(run.resampled_from is not None for run in prepared.runs)
     last = None
     for _ in range(MAX_REFITS if uneven else 0):
-        before, given = given, _shifted(given, fit)
-        fit, start = polish(given.problem, fit.optimum), fit
-        if _squares_between(before, given, fit) < SHIFT_TOLERANCE:
+        before, prepared = prepared, _shifted(prepared, fit)
+        fit, start = polish(prepared.problem, fit.optimum), fit
+        if _squares_between(before, prepared, fit) < SHIFT_TOLERANCE:
             break
         step = np.asarray(fit.coordinates - start.coordinates)
         rate = step @ last / (last @ last) if last is not None else 0.0
@@ -43,14 +43,14 @@ def with_even_clock(given: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
         if 0 < rate < MAX_STEP_RATIO:
             # where the current settles within a sample, samples shifted with a wrong inductance reproduce most of its
             # error, and plain iteration would converge slowly
-            fit, last = _extrapolated(given, fit, rate / (1 - rate) * step), None
-    return given, fit
+            fit, last = _extrapolated(prepared, fit, rate / (1 - rate) * step), None
+    return prepared, fit
 
 
-def _extrapolated(given: Prepared, fit: Fit, step: Float[np.ndarray, " parameters"]) -> Fit:
+def _extrapolated(prepared: Prepared, fit: Fit, step: Float[np.ndarray, " parameters"]) -> Fit:
     """The fit evaluated a `step` further on, within the bounds (Irons and Tuck, doi:10.1002/nme.1620010306)."""
-    further = fit.optimum.moved(given.problem.parameters, step)
-    return fit_at(given.problem, further)
+    further = fit.optimum.moved(prepared.problem.parameters, step)
+    return fit_at(prepared.problem, further)
 
 
 def _squares_between(before: Prepared, after: Prepared, fit: Fit) -> float:
@@ -60,21 +60,21 @@ def _squares_between(before: Prepared, after: Prepared, fit: Fit) -> float:
     return float(np.square(moved / fit.noise[:, None])[after.problem.fitted_blocks].sum())
 
 
-def _shifted(given: Prepared, fit: Fit) -> Prepared:
+def _shifted(prepared: Prepared, fit: Fit) -> Prepared:
     """The runs with their samples shifted along the simulated motion of this fit."""
-    tape, seen = given.problem.tape, fit.evaluation.seen
-    motor = given.problem.parameters(fit.coordinates)
+    tape, simulated = prepared.problem.tape, fit.evaluation.simulated
+    motor = prepared.problem.parameters(fit.coordinates)
     runs = []
-    for k, run in enumerate(given.runs):
+    for k, run in enumerate(prepared.runs):
         if run.resampled_from is not None:
-            now = tape.samples_of(k, seen, len(run))
-            then = seen_at_record(motor, tape.drive_of(k), run, now, given.timing.straight)
+            now = tape.samples_of(k, simulated, len(run))
+            then = simulated_at_stamps(motor, tape.drive_of(k), run, now, prepared.timing.straight)
             run = _nearest_samples(run, now, then)
         runs.append(run)
     laid, begins = Tape.from_recordings(runs), np.asarray(tape.begins)
     # the first sample of a run is the first of the even clock: it counts if it did before
     laid.weight[begins, :, 0] = np.asarray(tape.weight)[begins, :, 0]
-    moved = given._replace(runs=runs)
+    moved = prepared._replace(runs=runs)
     return moved.with_tape(measured=jnp.asarray(laid.measured), weight=jnp.asarray(laid.weight))
 
 

@@ -1,0 +1,1 @@
+"""The evidence that something is missing from a fitted motor."""

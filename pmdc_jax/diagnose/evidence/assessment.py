@@ -1,0 +1,180 @@
+"""Interpret the evidence against a model: is something missing, or may model-form error explain what is left?
+
+*Model-form error* is what effects leave because their formulas are only approximately those of the real motor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ...effects import EFFECTS
+from ...effects.base import AbstractEffect
+from ..hypotheses.effect_relations import CONTAINS, FULLER, unbalanced_equation
+from ..hypotheses.library import Curve
+from ..model import Model
+from .signals import Screen, Signal
+
+# False-alarm probability: that anything is called missing from a motor that lacks nothing, or, once effects were
+# added, that anything more is in all later looks together
+FALSE_ALARM = 0.01
+# Model-form error: the share of the squares explained by effects that imperfect formulas of them may leave; the larger
+# one if the rest is a curve over an effect's own variable
+MODEL_FORM_SHARE, OWN_MODEL_FORM_SHARE = 0.1, 0.5
+# Gain of a candidate or curve over that of the clearest signal: from the first share on a candidate is worth a trial,
+# from the second on a curve describes what is left, from the third on what is left is clearly a candidate's effect
+TRIAL_SHARE, CURVE_SHARE, EFFECT_SHARE = 0.3, 0.5, 0.7
+# By simple effect, its fuller form if that has no regression column: only a refit can test it, such as backlash
+REFIT_ONLY = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}
+# The clearest gain left, over what the effects explain, below which nothing more is worth a trial; the larger one for
+# models with a refit-only form, whose fit is never exact because when teeth meet is unpredictable
+NEGLIGIBLE, NEGLIGIBLE_REFIT_ONLY = 2e-3, 1e-2
+
+
+def familywise_p_value(
+    candidate_signals: Sequence[Signal], curve_signals: Sequence[Signal], count: int
+) -> float:
+    """P-value of the strongest evidence if nothing were missing, Bonferroni-corrected for `count` blocks."""
+    smallest = min(s.log_p for s in (*candidate_signals, *curve_signals))
+    return float(min(1.0, np.exp(smallest + np.log(count))))
+
+
+class Assessment(NamedTuple):
+    """The evidence against a model, and the decisions that depend on it."""
+
+    screen: Screen
+    candidate_signals: list[Signal]  # the most significant first
+    curve_signals: list[Signal]  # the most significant first
+    p_value: float  # of the evidence if nothing more were missing
+    # squared white residuals of the motor without effects, less those of the model
+    explained: float
+    explained_unfiltered: float  # the same for the unfiltered misfit, `Fit.fitness`
+
+    @property
+    def clearest(self) -> Signal:
+        """The signal with the largest gain."""
+        return max((*self.candidate_signals, *self.curve_signals), key=_gain)
+
+    @property
+    def unexplained(self) -> float:
+        """The gain of the clearest signal over what the model explains; infinite if it explains nothing."""
+        return float(self.clearest.gain / self.explained) if self.explained > 0 else np.inf
+
+    @property
+    def best_candidate_share(self) -> float:
+        """The largest gain of a single candidate over that of the clearest signal."""
+        best = max((s.gain for s in self.candidate_signals), default=0.0)
+        return float(best / self.clearest.gain)
+
+    def calls_for_effect(self) -> bool:
+        """Whether something more is missing, and a single candidate would explain enough of it for a trial."""
+        return bool(self.p_value < FALSE_ALARM and self.best_candidate_share > TRIAL_SHARE)
+
+    def is_clearly_effect(self) -> bool:
+        """Whether what is left is clearly one more effect rather than model-form error.
+
+        Never a periodic effect: gear teeth that meet at unpredictable times may look like one.
+        """
+        if (
+            not self.candidate_signals
+            or self.unexplained < MODEL_FORM_SHARE
+            or self.best_candidate_share < EFFECT_SHARE
+        ):
+            return False
+        best = max(self.candidate_signals, key=_gain).candidate
+        return best is not None and not best.own_phase
+
+    def exceeds_model_form_error(self, model: Model) -> bool:
+        """Whether a model leaves too much for model-form error, and that is not due to an effect it already has."""
+        return bool(self.unexplained > MODEL_FORM_SHARE and not self._belongs_to(model))
+
+    def may_be_model_form_error(self, model: Model) -> bool:
+        """Whether what is left may be model-form error of the model's effects.
+
+        Not if it is a larger part of the unfiltered misfit than they explain: the whitening filter has then absorbed
+        what is missing as noise.
+        """
+        if not model.effects or self._unexplained_unfiltered(model) > 1:
+            return False
+        if self.unexplained < MODEL_FORM_SHARE:
+            return True
+        clearest = self.clearest.term
+        own_curve = isinstance(clearest, Curve) and has_axes_of(model, clearest)
+        within = self.unexplained < OWN_MODEL_FORM_SHARE
+        return self._belongs_to(model) or bool(own_curve and within)
+
+    def is_sensor_error(self) -> bool:
+        """Whether the clearest signal is an error of a sensor that no effect of the library has."""
+        clearest = self.clearest.term
+        return isinstance(clearest, Curve) and clearest.is_sensor_error
+
+    def unfiltered_signals(self) -> list[Signal]:
+        """The candidates' signals with their gains on the unfiltered residuals."""
+        unfiltered = self.screen.unfiltered
+        before = unfiltered.regress().squares
+        return [
+            s._replace(gain=before - unfiltered.regress([s.block]).squares)
+            for s in self.candidate_signals
+        ]
+
+    def _unexplained_unfiltered(self, model: Model) -> float:
+        """`unexplained` for the unfiltered misfit: what the clearest signal would explain, over what the model does."""
+        if not self.explained_unfiltered > 0:
+            return np.inf
+        unfiltered = self.screen.unfiltered
+        after = unfiltered.regress([self.clearest.block]).squares
+        share = 1 - after / unfiltered.regress().squares
+        return float(share * model.fit.fitness / self.explained_unfiltered)
+
+    def _belongs_to(self, model: Model) -> bool:
+        """Whether the clearest signal belongs to an effect that the model has."""
+        clearest = self.clearest.candidate
+        return clearest is not None and clearest.effect in model.effects
+
+    def is_negligible(self, model: Model) -> bool:
+        """Whether too little is left for another trial (`NEGLIGIBLE`)."""
+        return self.unexplained < (NEGLIGIBLE_REFIT_ONLY if _has_refit_only(model) else NEGLIGIBLE)
+
+    def is_unrelated_to(self, model: Model) -> bool:
+        """Whether what is left is clearly one more effect, in another equation or over another variable than any of the
+        model's, so that these cannot have left it.
+
+        Never beside a refit-only form: what gear teeth leave, which meet at unpredictable times, can look like any
+        effect.
+        """
+        if (
+            _has_refit_only(model)
+            or self.p_value >= FALSE_ALARM
+            or self.best_candidate_share < EFFECT_SHARE
+        ):
+            return False
+        best_curve = max(self.curve_signals, key=_gain)
+        best = max(self.candidate_signals, key=_gain).candidate
+        assert isinstance(best_curve.term, Curve) and best is not None
+        # of model-form error a curve over the effect's own variable explains nearly all
+        own_curve = (
+            has_axes_of(model, best_curve.term)
+            and best_curve.gain > CURVE_SHARE * self.clearest.gain
+        )
+        return not (own_curve or has_axes_of(model, EFFECTS[best.effect]))
+
+
+def _gain(signal: Signal) -> float:
+    return signal.gain
+
+
+def _has_refit_only(model: Model) -> bool:
+    """Whether one of the model's effects is a refit-only form (`REFIT_ONLY`)."""
+    return bool(set(model.effects) & set(REFIT_ONLY.values()))
+
+
+def has_axes_of(model: Model, term: Curve | type[AbstractEffect]) -> bool:
+    """Whether a curve or an effect has the same equation and variable as one of the model's effects."""
+    return term.variable is not None and _axes(term) in {_axes(EFFECTS[e]) for e in model.effects}
+
+
+def _axes(term: Curve | type[AbstractEffect]) -> tuple[str, str | None]:
+    """The equation in which a term shows, and the variable that it depends on."""
+    return unbalanced_equation(term.equation), term.variable

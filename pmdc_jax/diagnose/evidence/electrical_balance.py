@@ -1,0 +1,226 @@
+"""Whether a model satisfies the electrical equation to within the noise of the sensors, whatever torque acts.
+
+A fluctuating torque makes the residuals of a free run large and slow, and a whitening filter then absorbs what a model
+lacks as noise. But no torque enters the electrical equation: from sample to sample the residual of the current follows
+from that of the speed, up to the white noise of the sensors.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import least_squares
+
+from ...identify.corrections.electrical_equation import MIN_FLOW
+from ...identify.fit.generalised_least_squares import residuals_of, series_of
+from ...identify.noise.noise_model import Series
+from ...identify.noise.sensor_noise import noise_of_sensor, rms, white_noise
+from ...motor import Motor
+from ...recordings.recording import OVER_LAST
+from ...simulate.exponential import scalar_phi
+from ..model import Model
+
+# A run with fewer usable samples is left out
+MIN_SAMPLES = 50
+# Lags, in samples, at which residuals of the equation are correlated only by what the equation lacks. A sensor's error
+# enters two successive steps, with opposite signs, and the ripple of a bridge's pulses, where a step does not end with
+# one of them, only one. A positive correlation of successive steps shows what the equation lacks, too, unless samples
+# of an uneven clock were moved.
+LAGS = range(2, 9)
+# Standard errors of a correlation that chance may bring
+CHANCE_ERRORS = 3.0
+# The drop of the brushes may set in gradually: currents, over their root mean square, at which it is within 1/e of its
+# final value
+ONSETS = (0.02, 0.06, 0.2)
+# Bounds of the natural logarithms of R, Kb and L over those of the model, and the first guess of L, if it is less, as a
+# share of R times the sample time: a smaller one is not felt, and no gradient leads back
+MAX_LOGARITHM, MIN_GUESS = 7.0, 0.1
+
+
+class _Electrical(NamedTuple):
+    """What the electrical equation depends on."""
+
+    R: float
+    Kb: float
+    L: float
+    # amplitudes, V, of voltages that oppose the current, beside those of the model (see `_Steps.opposing`)
+    drop: Float[np.ndarray, " shapes"] = np.zeros(1 + len(ONSETS))
+
+    def changed(self, by: Float[np.ndarray, " changes"]) -> _Electrical:
+        """With R, Kb and L changed by these natural logarithms, and these amplitudes of the drop."""
+        R, Kb, L = np.array(self[:3]) * np.exp(by[:3])
+        return _Electrical(R, Kb, L, by[3:])
+
+
+class _Steps(NamedTuple):
+    """What acts in the steps of one run from sample to sample, at the start and at the end of each."""
+
+    seconds: float
+    current: Float[np.ndarray, " steps"]  # A, at the start
+    speed: Float[np.ndarray, "steps 2"]  # rad/s
+    voltage: Float[np.ndarray, "steps 2"]  # V
+    # what brushes oppose the current with, per V of each of the `_shapes`; zero without brushes
+    opposing: Float[np.ndarray, "steps 2 shapes"]
+
+    def predicted(self, motor: _Electrical) -> Float[np.ndarray, " steps"]:
+        """Current at the end of the steps by the electrical equation, with voltage and speed on straight lines."""
+        decay, weights = _weights(motor, self.seconds)
+        voltage = self.voltage - motor.Kb * self.speed - self.opposing @ motor.drop
+        return decay * self.current + voltage @ weights
+
+
+class _Balance(NamedTuple):
+    """The electrical equation in the measured steps of one run."""
+
+    measured: _Steps
+    # current at the end less what the model has there beside its electrical equation, A
+    reached: Float[np.ndarray, " steps"]
+    noise: float  # of the sensors, in a residual, A
+    even_clock: bool
+
+    def residuals(self, motor: _Electrical) -> Float[np.ndarray, " steps"]:
+        """The residuals of the electrical equation, over the noise of the sensors."""
+        return (self.reached - self.measured.predicted(motor)) / self.noise
+
+
+def _weights(motor: _Electrical, seconds: float) -> tuple[float, Float[np.ndarray, "2"]]:
+    """What a step leaves of a current, and the current at its end per V at its start and at its end, in A/V, if the
+    voltage changes linearly."""
+    decay = -motor.R / motor.L * seconds
+    mean, later = scalar_phi(decay, 1), scalar_phi(decay, 2)
+    return float(np.exp(decay)), seconds / motor.L * np.array([mean - later, later])
+
+
+def electrical_misfit(model: Model) -> float:
+    """Residual of the electrical equation over the white noise of the sensors, as root mean square, of the worst run.
+
+    L di/dt = v - R i - Kb w between two samples, with v and w on straight lines, and with what the simulation of the
+    model has beside it, such as the drop of its brushes. R, Kb, L and a further drop of the brushes are fitted to the
+    measured steps of all runs, because torques that the model lacks bias the fit of a free run. Only what steps some
+    samples apart (`LAGS`) have in common is added to the noise: a rough voltage, whose errors differ from step to step,
+    is no missing effect.
+
+    **Returns**: at least 1; 1 if no run has voltage, current and speed, or if the model is exact.
+    """
+    if model.is_exact:
+        return 1.0
+    series = residuals_of(model.prepared, model.fit)
+    balances = [
+        balance
+        for run, residual in zip(model.training, series, strict=True)
+        if (balance := _balance(model, run, residual)) is not None
+    ]
+    if not balances:
+        return 1.0
+    start = _electrical_part(model.motor)
+    guess = MIN_GUESS * start.R / start.L * min(b.measured.seconds for b in balances)
+    largest = np.array([*3 * [MAX_LOGARITHM], *np.full_like(start.drop, np.inf)])
+    best = least_squares(
+        lambda by: np.concatenate([b.residuals(start.changed(by)) for b in balances]),
+        [0.0, 0.0, np.clip(np.log(guess), 0.0, MAX_LOGARITHM / 2), *start.drop],
+        bounds=(-largest, largest),
+        x_scale="jac",
+    )
+    motor = start.changed(best.x)
+    beyond = [_covariance_beyond_chance(b.residuals(motor), b.even_clock) for b in balances]
+    return float(np.sqrt(1 + max(beyond)))
+
+
+def _electrical_part(motor: Motor) -> _Electrical:
+    return _Electrical(float(motor.R), float(motor.Kb), float(motor.L))
+
+
+def _covariance_beyond_chance(residuals: Float[np.ndarray, " samples"], even_clock: bool) -> float:
+    """The largest mean product, in magnitude, of two residuals at one of the `LAGS`, or the positive one of neighbours,
+    less what may be chance."""
+    lags = [*LAGS, 1] if even_clock else LAGS
+    products = [residuals[lag:] * residuals[:-lag] for lag in lags]
+    means = [p.mean() if lag == 1 else abs(p.mean()) for lag, p in zip(lags, products, strict=True)]
+    chance = [CHANCE_ERRORS * p.std() / np.sqrt(len(p)) for p in products]
+    return float(max(0.0, *np.subtract(means, chance)))
+
+
+def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
+    """The measured steps of a run; None if they are too few, a signal was not recorded, or the current is a mean."""
+    prepared, tape = model.prepared, model.prepared.problem.tape
+    drive, known, residuals = tape.drive_of(run), residual.known, residual.values
+    recorded = prepared.runs[run]
+    both = residual.kind[1] == (0, 1) and not recorded.current_averaged
+    if not both or not drive.voltage or known.sum() < MIN_SAMPLES:
+        return None
+    measured = series_of(tape, run, np.asarray(tape.measured)).values
+    simulated = measured - residuals
+    current_noise, speed_noise = (
+        _sensor_noise(measured[known, c], residuals[known, c]) for c in range(2)
+    )
+    brushes = any(effect.holds == "current" for effect in model.motor.effects)
+    if brushes:
+        threshold = MIN_FLOW * current_noise
+        known = known & _flows(measured[:, 0], simulated[:, 0], threshold)
+    pairs = known[1:] & known[:-1]
+    if pairs.sum() < MIN_SAMPLES:
+        return None
+    motor, seconds = _electrical_part(model.motor), tape.sample_time_of(run)
+    # a speed that is the mean over just this step
+    is_mean = recorded.averaging == OVER_LAST
+    voltage = _voltage_between_readings(model, run, len(known))[pairs]
+
+    shapes = brushes * _shapes(measured[:, 0])
+    opposing = np.stack([shapes[:-1], shapes[1:]], 1)[pairs]
+
+    def steps(signals: Float[np.ndarray, "samples 2"]) -> _Steps:
+        i, w = signals[:-1, 0][pairs], signals[:, 1]
+        speed = np.stack([w[1:] if is_mean else w[:-1], w[1:]], 1)[pairs]
+        return _Steps(seconds, i, speed, voltage, opposing)
+
+    reached = residuals[1:, 0][pairs] + steps(simulated).predicted(motor)
+    decay, weights = _weights(motor, seconds)
+    by_speed = motor.Kb * (weights.sum() if is_mean else np.hypot(*weights))
+    parts = (
+        current_noise * np.hypot(1, decay),
+        speed_noise * by_speed,
+        prepared.input_noise.get(recorded.name, 0.0) * weights.sum(),
+    )
+    noise, even_clock = float(np.linalg.norm(parts)), recorded.resampled_from is None
+    return _Balance(steps(measured), reached, noise, even_clock)
+
+
+def _shapes(current: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "samples shapes"]:
+    """Shapes of which the drop of the brushes may be made up: constant, and less so below each of the `ONSETS`."""
+    onsets, size = np.array(ONSETS) * max(rms(current), 1e-300), np.abs(current)[:, None]
+    gradual = np.exp(-size / onsets)
+    return np.sign(current)[:, None] * np.hstack([np.ones_like(size), gradual])
+
+
+def _voltage_between_readings(model: Model, run: int, length: int) -> Float[np.ndarray, "steps 2"]:
+    """The voltage at the start and at the end of each step between the samples of a run, of this number, V."""
+    prepared, tape = model.prepared, model.prepared.problem.tape
+    ends = np.stack([tape.samples_of(run, tape.drive_at(end), length) for end in (0.0, 1.0)], 1)
+    if (
+        share := prepared.timing.reading
+    ) is not None:  # from one reading to the next two voltages act
+        ends[:-1] = (1 - share) * ends[:-1] + share * ends[1:]
+    return ends[:-1]
+
+
+def _flows(
+    measured: Float[np.ndarray, " samples"],
+    simulated: Float[np.ndarray, " samples"],
+    threshold: float,
+) -> Bool[np.ndarray, " samples"]:
+    """Where measured and simulated current both clearly flow, in one direction.
+
+    Elsewhere brushes may hold the current at zero and take up any voltage.
+    """
+    return (np.abs(simulated) > threshold) & (measured * np.sign(simulated) > threshold)
+
+
+def _sensor_noise(
+    measured: Float[np.ndarray, " samples"], residuals: Float[np.ndarray, " samples"]
+) -> float:
+    """Standard deviation of a sensor's white noise: the smaller of two estimates, from the measured signal and from its
+    residuals, which show it better the rougher the motion is; the latter is at least that of the sensor's resolution.
+    """
+    return min(white_noise([measured]) or np.inf, noise_of_sensor(measured, residuals))

@@ -1,0 +1,93 @@
+"""The evidence against a fitted motor: a score test of its white residuals for everything that may be missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain
+
+import numpy as np
+
+from ...identify.noise.noise_model import Series, Whitener, scaling_whitener, whitener
+from ...simulate import UNKNOWNS_PER_RUN
+from ..hypotheses.library import Curve, Library, curves_along
+from ..model import Model
+from .quantisation import ROUNDING_DRAWS
+from .regression import Block, Evidence, consecutive_blocks, gather_evidence
+from .rows import TIMING_ERRORS, Rows, gather_rows
+from .signals import Screen, Signal, signals
+
+
+def screen(model: Model, library: Library) -> Screen:
+    """Gather the evidence against a model.
+
+    The whitening filter is fitted to what the clearest candidate or curve leaves of the residuals. One fitted to the
+    residuals themselves would absorb what is missing as noise, above all a constant offset, and hide it.
+    """
+    tape, path = model.prepared.problem.tape, model.path
+    curves, changes_of_curves = curves_along(library, tape, path)
+    orders = [(c.order, c.own_phase) for c in library.candidates]
+    orders += [(c.order, c.per_run) for c in curves]
+    count = sum(order for order, _ in orders)
+    changes = chain(library.changes(tape, path), changes_of_curves)
+    rows = gather_rows(model, library.bare, path, changes, count)
+    scaling = scaling_whitener([run.fit.residual for run in rows])
+    unfiltered = _evidence(rows, scaling)
+    blocks = consecutive_blocks(orders, unfiltered.first_column)
+    plain = Screen(
+        evidence=unfiltered,
+        white=scaling,
+        unfiltered=unfiltered,
+        candidates=library.candidates,
+        candidate_blocks=blocks[: len(library.candidates)],
+        curves=curves,
+        curve_blocks=blocks[len(library.candidates) :],
+        coulomb_torque=model.coulomb_torque,
+        sensor_floors=library.sensor_floors,
+    )
+    white = whitener(_without_clearest(plain, rows))
+    return plain._replace(evidence=_evidence(rows, white), white=white)
+
+
+def share_beyond(plain: Screen, blocks: Sequence[Block]) -> float:
+    """Share of a model's unfiltered squared residuals that remains after some blocks."""
+    return plain.unfiltered.regress(blocks).squares / plain.unfiltered.regress().squares
+
+
+def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
+    """The evidence from all rows, whitened by one filter."""
+    white = (run.white(k, whiten) for k, run in enumerate(rows))
+    return gather_evidence(
+        white,
+        parameters=rows[0].fit.shared.values.shape[-1],
+        run_unknowns=UNKNOWNS_PER_RUN,
+        timing_errors=TIMING_ERRORS,
+        rounding_errors=ROUNDING_DRAWS,
+    )
+
+
+def _is_definite(curve: Signal) -> bool:
+    """Whether noise can hardly look like a curve: one that all runs share, or an error of a sensor."""
+    assert isinstance(curve.term, Curve)
+    return not curve.term.per_run or curve.term.is_sensor_error
+
+
+def _without_clearest(plain: Screen, rows: Sequence[Rows]) -> list[Series]:
+    """The residuals of each run less the most significant candidate or shared curve, and all that is fitted with it."""
+    candidate_signals, curve_signals = signals(plain)
+    clearest = min(
+        (s for s in (*candidate_signals, *curve_signals) if s.candidate or _is_definite(s)),
+        key=lambda s: s.log_p,
+    ).block
+    best = plain.evidence.regress([clearest])
+    columns = np.array(clearest.columns) - plain.evidence.first_column
+    series = []
+    for k, (fit, _, X, _) in enumerate(rows):
+        coefficients = best.coefficients[0][k] if clearest.per_run else best.coefficients[0]
+        known = fit.residual.known
+        # late readings are noise, and stay
+        rest = fit.residual.values - fit.shared.values @ best.parameter_changes
+        rest = rest - X[..., columns] @ coefficients
+        own = fit.own.values
+        unknowns = np.linalg.lstsq(own[known].reshape(-1, own.shape[-1]), rest[known].ravel())[0]
+        series.append(fit.residual._replace(values=rest - own @ unknowns))
+    return series

@@ -1,0 +1,1 @@
+"""What may be missing: effects in the shapes that are tried, and curves."""

@@ -1,0 +1,1 @@
+"""Selection of the effects that a motor is missing."""

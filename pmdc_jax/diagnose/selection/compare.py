@@ -1,0 +1,79 @@
+"""Models fitted to the same runs, compared by the squares of their residuals, whitened by one common filter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ...identify.fit.generalised_least_squares import fit_whitened, residuals_of, sum_of_squares
+from ...identify.noise.noise_model import Whitener, whitener
+from ..hypotheses.effect_relations import is_simpler_form
+from ..model import Model
+
+# Models whose criteria (BIC, in noise variances) differ by less are equivalent
+BIC_MARGIN = 8.0
+# Fall of the squares, in noise variances, below which no further fitting step is made
+MIN_DECREASE = 0.1
+# A model that leaves so many times the unfiltered squares of another one is worse, whatever its filtered squares are
+DECISIVE_RATIO = 3.0
+
+
+class Fitted(NamedTuple):
+    """A model among others fitted to the same runs, and how well it does by a common whitening filter."""
+
+    model: Model
+    squares: float  # sum of its squared white residuals
+    # BIC: squares + (number of parameters) ln(number of measured values); less is better
+    criterion: float
+
+
+class Comparison:
+    """Fits models by common whitening filters, each model once by each filter, and keeps the results."""
+
+    def __init__(self) -> None:
+        self._filters: dict[Model, Whitener] = {}
+        self._fitted: dict[tuple[Model, Whitener], Fitted] = {}
+
+    def ranked(self, models: Sequence[Model], white: Whitener) -> list[Fitted]:
+        """Models by their criteria when fitted to residuals whitened by one filter, the best first.
+
+        One that leaves far more unfiltered squares than another is ruled out (infinite criterion): a whitening filter
+        suppresses whatever changes slowly.
+        """
+        least = min(m.fit.fitness for m in models)
+        fitted = [
+            self.fitted(m, white)
+            if m.fit.fitness < DECISIVE_RATIO * least
+            else Fitted(m, np.inf, np.inf)
+            for m in models
+        ]
+        return sorted(fitted, key=lambda f: f.criterion)
+
+    def fitted(self, model: Model, white: Whitener) -> Fitted:
+        """A model fitted to its residuals whitened by a filter."""
+        key = model, white
+        if key not in self._fitted:
+            prepared, polished = fit_whitened(model.prepared, model.fit, white, MIN_DECREASE)
+            squares = sum_of_squares(prepared, polished)
+            samples = prepared.problem.samples.sum()
+            penalty = len(prepared.problem.parameters.names) * np.log(samples)
+            self._fitted[key] = Fitted(model, squares, squares + penalty)
+        return self._fitted[key]
+
+    def filter_of(self, model: Model) -> Whitener:
+        """The filter that whitens the residuals of a model."""
+        if model not in self._filters:
+            self._filters[model] = whitener(residuals_of(model.prepared, model.fit))
+        return self._filters[model]
+
+
+def simplest_equivalent(ranked: Sequence[Fitted]) -> Model:
+    """The best model, or one with an effect in a simpler form whose criterion is within `BIC_MARGIN` of the best."""
+    best = ranked[0]
+    for other in ranked[1:]:
+        is_simpler = is_simpler_form(set(other.model.effects), set(best.model.effects))
+        if is_simpler and other.criterion < best.criterion + BIC_MARGIN:
+            return other.model
+    return best.model

@@ -1,0 +1,232 @@
+"""Which effects are missing: forward selection from the motor without effects, each step refitted in full simulation.
+
+`proposals` are what a step tries; here it is decided whether one of them is better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeGuard
+
+import numpy as np
+
+from ...effects import EFFECTS
+from ...identify.fit.polish import Fit
+from ...identify.noise.noise_model import Whitener
+from ...identify.prepare import Prepared
+from ...identify.solve import Solved
+from ...progress import ReportProgress
+from ..diagnosis import VaryingParameter
+from ..evidence.assessment import FALSE_ALARM, REFIT_ONLY, has_axes_of
+from ..evidence.constancy import varying_parameter
+from ..evidence.periodic import Line, line_of
+from ..evidence.screen import share_beyond
+from ..evidence.signals import Screen
+from ..hypotheses.effect_relations import are_rivals
+from ..hypotheses.library import Library
+from ..model import Model, final_fit
+from .assessor import Assessor
+from .compare import BIC_MARGIN, DECISIVE_RATIO, Comparison, Fitted, simplest_equivalent
+from .elimination import BackwardElimination
+from .proposals import Proposals, Proposed
+from .refits import Refits
+from .rivals import p_values_without, rivals_of
+
+# What a better model may still leave, as a share of the squares that it takes away (`_leaves_little`). The larger limit
+# applies where an effect was replaced by another form, or where the effects before cannot have left the misfit.
+STRICT_REST, LENIENT_REST = 0.1, 0.5
+# Where the clearest signal gains a smaller share of what the model explains, the whitening filter may have absorbed an
+# effect: the unfiltered misfit is examined first
+ABSORBED_SHARE = 1e-2
+
+# Whether a better model, the second, is accepted in place of the first
+Accepts = Callable[[Model, Model], bool]
+
+
+class Naming(NamedTuple):
+    """The model chosen, its rivals, and what is left that no candidate explains."""
+
+    chosen: Model
+    rivals: list[Model]
+    base_screen: Screen  # evidence against the motor without effects
+    chosen_screen: Screen  # evidence against the chosen model
+    p_nothing: float  # p-value of the evidence if nothing were missing
+    p_nothing_more: float  # p-value of what is left if nothing more were missing
+    may_be_model_form_error: bool  # what is left, of the chosen effects
+    leaves_sensor_error: bool  # whether what is left is most like that
+    # root mean square of the chosen one's residuals beyond all curves over that of all; 1 if nothing more is missing
+    noise_share: float
+    p_without: dict[str, float]  # by effect of the chosen model: p-value of the data without it
+    final_fit: tuple[Prepared, Fit]  # of the chosen model
+    line: Line | None  # a steady oscillation that the chosen model does not have
+    # the parameter that differs from run to run, if that is what is left
+    varies: VaryingParameter | None
+
+
+class StepwiseSelection:
+    """Forward selection with backward elimination: gathers evidence, refits sets of effects, compares them."""
+
+    def __init__(self, base: Model, solved: Solved, report: ReportProgress) -> None:
+        """`base` is the motor without effects, and `solved` how it was found."""
+        self.base, self.library = base, Library(base)
+        self.comparison = Comparison()
+        self.refits = Refits(base, solved, self.library.scales, self.comparison, report)
+        self.assess = Assessor(base, self.library, self.comparison)
+        # by effect: alternatives that were as good when it was added
+        self.equivalents: dict[str, set[str]] = {}
+        # models that are not returned to: by different filters, each of two may look like the better one
+        self.superseded: set[Model] = set()
+        self.proposals = Proposals(self.refits, self.assess, self.superseded)
+        self.elimination = BackwardElimination(
+            self.refits, self.comparison, self.assess, self._is_new
+        )
+
+    def name(self) -> Naming:
+        """Add effects while the evidence calls for them; then try other effects in place of those found."""
+        current = self.base
+        self.superseded.add(current)
+        while better := self._step(current):
+            current = better
+            self.superseded.add(current)
+        others = self.proposals.by_swap(current, self.equivalents)
+        # even if little is left: what backlash leaves is small beside what a large effect explains
+        if self.assess(current).p_value < FALSE_ALARM:
+            others += self.proposals.in_refit_only_forms(current, set(current.effects))
+        chosen = self._better(current, others) or current
+        return self._without_compensation(self._naming(chosen))
+
+    def without(self, named: Naming, effect: str) -> Naming:
+        """The naming for the chosen set without one of its effects."""
+        white = self.comparison.filter_of(named.chosen)
+        return self._naming(self.refits.without(named.chosen, effect, white))
+
+    def _step(self, current: Model) -> Model | None:
+        """The next model: of several kinds of proposals the first that is better and accepted; None if there is none.
+
+        What gains little to first order is accepted only if it then leaves little.
+        """
+        propose, genuine, little = self.proposals, self._is_genuine_improvement, self._leaves_little
+        kinds: list[tuple[Callable[[Model], Proposed], Accepts]] = [
+            (propose.by_evidence, genuine),
+            (propose.by_largest_gain, little),
+            (propose.by_unfiltered_misfit, genuine),
+            (propose.by_earlier_evidence, little),
+            (propose.by_exchange, genuine),
+        ]
+        if self.assess(current).unexplained < ABSORBED_SHARE:
+            kinds.insert(0, kinds.pop(2))
+        for proposed, accepts in kinds:
+            better = self._better(current, proposed(current))
+            if accepted := self._in_accepted_form(accepts, current, better):
+                return accepted
+        return None
+
+    def _in_accepted_form(
+        self, accepts: Accepts, current: Model, better: Model | None
+    ) -> Model | None:
+        """A better model if it is accepted; else one with another form of what was added that is."""
+        if better is None or accepts(current, better):
+            return better
+        # the simple form may be only a step towards the fuller one that the motor has
+        added = set(better.effects) - set(current.effects)
+        best = self._better(better, self.proposals.in_other_forms(better, added))
+        return best if best and accepts(current, best) else None
+
+    def _better(self, current: Model, tried: Sequence[Model | None]) -> Model | None:
+        """The best of some models after backward elimination; None if the current one is as good."""
+        possible = [model for model in tried if self._is_new(model)]
+        if not possible:
+            return None
+        # by the filter fitted without the clearest signal: one fitted to the current residuals absorbs what is missing
+        white = self.assess(current).screen.white
+        best = self._best(possible, white)
+        if simplest_equivalent(self.comparison.ranked([current, best], white)) is current:
+            return None
+        return self.elimination.reduced(best)
+
+    def _is_new(self, model: Model | None) -> TypeGuard[Model]:
+        """Whether a model exists, is physically possible, and was not superseded by a better one."""
+        return model is not None and model.is_possible and model not in self.superseded
+
+    def _is_genuine_improvement(self, current: Model, better: Model) -> bool:
+        """Whether a better model does more than compensate for model-form error of the current one's effects.
+
+        It does if what was left is clearly something else, if the better one leaves little, if it adds a refit-only
+        form, or an effect on other axes that makes the unfiltered misfit decisively smaller.
+        """
+        added = set(better.effects) - set(current.effects)
+        if added & set(REFIT_ONLY.values()):
+            return True
+        decisive = better.fit.fitness < current.fit.fitness / DECISIVE_RATIO
+        on_other_axes = not any(has_axes_of(current, EFFECTS[effect]) for effect in added)
+        if current.effects and decisive and on_other_axes:
+            return True
+        assessment = self.assess(current)
+        return assessment.exceeds_model_form_error(current) or self._leaves_little(current, better)
+
+    def _leaves_little(self, current: Model, better: Model) -> bool:
+        """Whether a better model leaves nothing significant, or little compared with what it takes away."""
+        assessment = self.assess(better)
+        if assessment.p_value >= FALSE_ALARM:
+            return True
+        white = self.comparison.filter_of(better)
+        before, after = (self.comparison.fitted(m, white).squares for m in (current, better))
+        added = len(better.effects) > len(current.effects)
+        strict = added and not self.assess(current).is_unrelated_to(current)
+        share = STRICT_REST if strict else LENIENT_REST
+        return bool(assessment.clearest.gain < share * (before - after))
+
+    def _without_compensation(self, named: Naming) -> Naming:
+        """The naming without effects if they only compensate for a parameter that differs from run to run: with a value
+        for each run, the motor without them explains the runs as well."""
+        if named.varies is None or not named.chosen.effects:
+            return named
+        plain = self._naming(self.base)
+        if plain.varies is None:
+            return named
+        gain = plain.varies.negative_log_likelihood - named.varies.negative_log_likelihood
+        more = len(named.chosen.fit.coordinates) - len(self.base.fit.coordinates)
+        limit = more * np.log(self.base.prepared.problem.most_samples) + BIC_MARGIN
+        return named if 2 * gain > limit else plain
+
+    def _naming(self, current: Model) -> Naming:
+        """The naming with a model as the chosen one."""
+        base, assessment = self.assess(self.base), self.assess(current)
+        more_missing = assessment.p_value < FALSE_ALARM
+        curves = [block for block in assessment.screen.curve_blocks if not block.per_run]
+        return Naming(
+            chosen=current,
+            rivals=rivals_of(current, assessment, self.refits, self.comparison),
+            base_screen=base.screen,
+            chosen_screen=assessment.screen,
+            p_nothing=base.p_value,
+            p_nothing_more=assessment.p_value,
+            may_be_model_form_error=assessment.may_be_model_form_error(current),
+            leaves_sensor_error=more_missing and assessment.is_sensor_error(),
+            noise_share=np.sqrt(share_beyond(assessment.screen, curves)) if more_missing else 1.0,
+            p_without=p_values_without(
+                current, assessment.screen.white, self.refits, self.comparison
+            ),
+            final_fit=final_fit(current, self.comparison.filter_of(current)),
+            line=line_of(current),
+            varies=varying_parameter(current, assessment),
+        )
+
+    def _best(self, tried: Sequence[Model], white: Whitener) -> Model:
+        """The best of some refits, compared by the whitening filter of the one with the least squares."""
+        if len(tried) == 1:
+            return tried[0]
+        least = self.comparison.ranked(tried, white)[0].model
+        ranked = self.comparison.ranked(tried, self.comparison.filter_of(least))
+        best = simplest_equivalent(ranked)
+        self._note_equivalents(best, ranked)
+        return best
+
+    def _note_equivalents(self, best: Model, ranked: Sequence[Fitted]) -> None:
+        """Record the effects that are as good as one of the best model's (within `BIC_MARGIN`)."""
+        chosen = set(best.effects)
+        least = next(f.criterion for f in ranked if f.model is best)
+        for other in (f for f in ranked if f.criterion < least + BIC_MARGIN):
+            rival = set(other.model.effects)
+            if len(chosen - rival) == len(rival - chosen) == 1 and are_rivals(chosen, rival):
+                self.equivalents.setdefault(*(chosen - rival), set()).update(rival - chosen)

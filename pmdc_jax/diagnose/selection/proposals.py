@@ -1,0 +1,218 @@
+"""Models that a step of the selection tries: with one effect more, or with another form of one that is there.
+
+A *richer* form of an effect contains and replaces it, as Stribeck friction does Coulomb friction; a *refit-only* form
+has no column in the regression, such as backlash for a compliant shaft.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence, Set
+
+from ...effects import EFFECTS
+from ..evidence.assessment import FALSE_ALARM, REFIT_ONLY, TRIAL_SHARE, Assessment
+from ..evidence.signals import Signal
+from ..hypotheses.effect_relations import CONTAINS
+from ..hypotheses.trials import TRIALS
+from ..model import MAX_EFFECTS, Model
+from .compare import DECISIVE_RATIO
+from .refits import Refits
+from .shortlist import (
+    SHORTLIST,
+    additional_effects,
+    clear_signals,
+    effect_of,
+    most_promising,
+    richer_form,
+    shortlist,
+)
+
+# Least share of the unfiltered squares that a candidate must promise to be tried on the unfiltered misfit
+MIN_UNFILTERED_SHARE = 0.05
+# Misfit (noise variances per output) from which a first-order start may lead a refit to a wrong optimum
+POOR_MISFIT = 10.0
+
+# None where physics forbids the coefficients found
+Proposed = list[Model | None]
+
+
+class Proposals:
+    """Refits what may be better than a model; which of it is, `naming` decides."""
+
+    def __init__(
+        self, refits: Refits, assess: Callable[[Model], Assessment], superseded: Set[Model]
+    ) -> None:
+        """`assess` gathers the evidence against a model; `superseded` are those that a better one has replaced."""
+        self.refits, self.assess, self.superseded = refits, assess, superseded
+
+    def by_evidence(self, current: Model) -> Proposed:
+        """The current model with one effect more, or with a richer or refit-only form of one that it has."""
+        assessment, present = self.assess(current), set(current.effects)
+        if len(present) == MAX_EFFECTS:
+            return []
+        if assessment.is_negligible(current):
+            unrelated = assessment.is_unrelated_to(current)
+            one_more = (shortlist if unrelated else richer_form)(current, assessment)
+            return self._with_signals(current, one_more)
+        refit_only = []
+        if not assessment.is_clearly_effect():
+            refit_only = self.in_refit_only_forms(current, present)
+        if any(self._is_sufficient(model) for model in refit_only):
+            return refit_only
+        tried = []
+        if assessment.calls_for_effect():
+            tried += self._with_signals(current, shortlist(current, assessment))
+            if any(model and model.effects_at_end for model in tried):
+                # not a richer form alone: asymmetric friction, at its bound, is no load larger than friction
+                tried += self._with_signals(current, additional_effects(current, assessment))
+        if assessment.p_value < FALSE_ALARM and not present:
+            tried += self._searched_with_friction(current, tried)
+        return tried + refit_only
+
+    def by_largest_gain(self, current: Model) -> Proposed:
+        """The current model with the effect of the largest gain, however small that is.
+
+        An effect gains more in a refit than to first order if its absence biases the parameters of others, or if the
+        motor's have moved far to compensate for two effects.
+        """
+        assessment = self.assess(current)
+        if not _is_room_for_another(current, assessment):
+            return []
+        if current.effects:
+            others = [s for s in clear_signals(assessment) if effect_of(s) not in current.effects]
+            likeliest = _of_largest_gain(others)
+        else:
+            likeliest = shortlist(current, assessment)
+        return self._with_signals(current, likeliest)
+
+    def by_earlier_evidence(self, current: Model) -> Proposed:
+        """The current model with the effect of the largest gain among those that were clear before its own were added:
+        the whitening filter of what is left now may absorb it."""
+        assessment = self.assess(current)
+        if not _is_room_for_another(current, assessment):
+            return []
+        present = set(current.effects)
+        earlier = [self.assess(m) for m in self.superseded if set(m.effects) < present]
+        clear = {effect_of(s) for before in earlier for s in clear_signals(before)}
+        others = [s for s in assessment.candidate_signals if effect_of(s) in clear - present]
+        return self._with_signals(current, _of_largest_gain(others))
+
+    def by_unfiltered_misfit(self, current: Model) -> Proposed:
+        """The current model with one of the effects that gain most on the unfiltered misfit, if that falls by a factor
+        of `DECISIVE_RATIO`: a whitening filter absorbs as noise what lasts as long as a short run."""
+        assessment, decisive = self.assess(current), current.fit.fitness / DECISIVE_RATIO
+        full = len(current.effects) == MAX_EFFECTS
+        if full or assessment.p_value >= FALSE_ALARM or decisive < current.prepared.problem.outputs:
+            return []
+        unfiltered = assessment.screen._replace(evidence=assessment.screen.unfiltered)
+        least = MIN_UNFILTERED_SHARE * assessment.screen.unfiltered.regress().squares
+        promising = most_promising(assessment.unfiltered_signals(), set(current.effects), least)
+        tried = [self.refits.with_signal(current, s, unfiltered) for s in promising]
+        return [m for m in tried if m is not None and m.fit.fitness < decisive]
+
+    def by_exchange(self, current: Model) -> Proposed:
+        """A model with `MAX_EFFECTS` effects, with the new one of largest gain in place of one in the same equation."""
+        assessment = self.assess(current)
+        if (
+            len(current.effects) < MAX_EFFECTS
+            or assessment.p_value >= FALSE_ALARM
+            or assessment.is_negligible(current)
+        ):
+            return []
+        others = [s for s in clear_signals(assessment) if effect_of(s) not in current.effects]
+        if not others:
+            return []
+        new = effect_of(max(others, key=lambda s: s.gain))
+        tried: Proposed = []
+        for old in current.effects:
+            if EFFECTS[old].equation == EFFECTS[new].equation:
+                smaller = self.refits.without(current, old, assessment.screen.white)
+                signals = self.assess(smaller).candidate_signals
+                of_new = [s for s in signals if effect_of(s) == new][:1]
+                tried += self._with_signals(smaller, of_new)
+        return tried
+
+    def in_other_forms(self, model: Model, added: set[str]) -> Proposed:
+        """The model with the effects added last replaced by a richer or a refit-only form."""
+        richer = richer_form(model, self.assess(model), TRIAL_SHARE)
+        of_added = [s for s in richer if CONTAINS[effect_of(s)] & added]
+        replaced = self._with_signals(model, of_added)
+        return replaced + self.in_refit_only_forms(model, added)
+
+    def in_refit_only_forms(self, model: Model, effects: set[str]) -> Proposed:
+        """The model with each of some effects replaced by its refit-only form, if it has one."""
+        white = self.assess(model).screen.white
+        return [
+            self.refits.with_replacement(model, white, simpler, REFIT_ONLY[simpler])
+            for simpler in sorted(effects & REFIT_ONLY.keys())
+        ]
+
+    def by_swap(self, current: Model, equivalents: Mapping[str, set[str]]) -> Proposed:
+        """The model with one effect replaced by one of its `equivalents`, that was as good when it was added, or by one
+        that resembles it (`Trial.alike`)."""
+        if len(current.effects) < 2:
+            return []
+        white = self.assess(current).screen.white
+        return [
+            self.refits.with_replacement(current, white, effect, other)
+            for effect in current.effects
+            for other in sorted(
+                (equivalents.get(effect, set()) | TRIALS[effect].alike.keys())
+                - set(current.effects)
+            )
+        ]
+
+    def _is_sufficient(self, model: Model | None) -> bool:
+        """Whether a model leaves nothing that is worth another trial.
+
+        If a refit-only form is sufficient, no other effect is tried: what a simple form leaves of gear teeth may look
+        like many.
+        """
+        if model is None or not model.is_possible:
+            return False
+        assessment = self.assess(model)
+        return assessment.p_value >= FALSE_ALARM or assessment.is_negligible(model)
+
+    def _searched_with_friction(self, current: Model, tried: Sequence[Model | None]) -> Proposed:
+        """The motor with Coulomb friction from a new global search, if stiction may explain a large misfit.
+
+        A rotor that sticks for long is too far from one that creeps for first-order evidence. So this is tried if no
+        possible model was `tried`, or the best of them is far from the noise, and a leading effect makes a rotor stick.
+        The result must cut the misfit by a factor of `DECISIVE_RATIO`. With a load, too, where asymmetric friction
+        ended at a bound: a load larger than friction drives the rotor in one direction.
+        """
+        possible = [model for model in tried if model is not None and model.is_possible]
+        if possible:
+            nearest = min(possible, key=lambda m: m.fit.fitness)
+            suspects, noise = nearest.effects, POOR_MISFIT * current.prepared.problem.outputs
+        else:
+            by_gain = sorted(self.assess(current).candidate_signals, key=lambda s: -s.gain)
+            suspects = tuple(dict.fromkeys(effect_of(s) for s in by_gain))[:SHORTLIST]
+            nearest, noise = current, current.prepared.problem.outputs
+        sticks = any(EFFECTS[effect].holds == "speed" for effect in suspects)
+        decisive = nearest.fit.fitness / DECISIVE_RATIO
+        if not sticks or decisive < noise:  # not even a perfect fit would cut the misfit so far
+            return []
+        searched = [self.refits.with_global_search(current, "coulomb_friction")]
+        if "asymmetric_friction" in nearest.effects_at_end:
+            searched.append(self.refits.with_global_search(searched[0], "constant_load"))
+        return [model for model in searched if model.fit.fitness < decisive]
+
+    def _with_signals(self, current: Model, signals: Sequence[Signal]) -> Proposed:
+        """The model with the effect of each signal."""
+        screen = self.assess(current).screen
+        return [self.refits.with_signal(current, s, screen) for s in signals]
+
+
+def _is_room_for_another(current: Model, assessment: Assessment) -> bool:
+    """Whether one more effect may be missing, rather than model-form error or an error of a sensor."""
+    return (
+        len(current.effects) < MAX_EFFECTS
+        and assessment.p_value < FALSE_ALARM
+        and not assessment.may_be_model_form_error(current)
+        and not assessment.is_sensor_error()
+    )
+
+
+def _of_largest_gain(signals: Sequence[Signal]) -> list[Signal]:
+    """The signal of the largest gain; empty if there is none."""
+    return sorted(signals, key=lambda s: -s.gain)[:1]

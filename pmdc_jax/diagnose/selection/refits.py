@@ -1,0 +1,299 @@
+"""Motors with sets of effects, each fitted in full simulation and stored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from ...effects import EFFECTS
+from ...identify.fit.generalised_least_squares import residuals_of, with_whitening
+from ...identify.fit.polish import fit_at, polish
+from ...identify.fit.refine import Optimum
+from ...identify.fit.run_unknowns import best_backlash_start
+from ...identify.noise.noise_model import Whitener, whitener
+from ...identify.prepare import Prepared
+from ...identify.search.nearby import best_nearby
+from ...identify.solve import POOR_FIT, Solved, search_and_refine
+from ...identify.uncertainty.covariance import information_of
+from ...identify.uncertainty.identifiability import moved_by
+from ...progress import ReportProgress
+from ...runtime.threads import map_in_threads_until
+from ..evidence.signals import Screen, Signal
+from ..hypotheses.candidates import Scales
+from ..hypotheses.effect_relations import FULLER
+from ..hypotheses.trials import TRIALS
+from ..model import Model, model_of, refit_from
+from .compare import Comparison
+from .shortlist import effect_of
+from .starts import Start, Starts, effects_with
+
+# Share of the gain promised by the evidence that a refit must realise; otherwise it is fitted in another way
+MIN_REALISED_SHARE = 0.5
+# A plain fit that leaves less than this share of a filtered one's misfit replaces it
+MAX_PLAIN_MISFIT = 0.5
+# A new refit of a set replaces the stored one if its misfit is smaller by this share
+MIN_IMPROVEMENT = 1e-3
+# Gauss-Newton steps of a short refit, one of several from different starts
+SHORT_REFIT_STEPS = 8
+# ... two of which found the same optimum if their misfits differ by less than this factor
+SAME_OPTIMUM_RATIO = 1.05
+# A fuller form whose short refits leave no less than this share of the simple form's misfit is searched no further
+MAX_FULLER_MISFIT = 0.9
+# A fuller form held where it clearly acts is fitted no further if a short refit leaves so many times the squares
+MAX_HELD_MISFIT = 4.0
+
+# Fits a model; None if physics forbids it
+Refit = Callable[[], Model | None]
+
+
+class Refits:
+    """Fits models and keeps one for each set of effects."""
+
+    def __init__(
+        self,
+        base: Model,
+        solved: Solved,
+        scales: Scales,
+        comparison: Comparison,
+        report: ReportProgress,
+    ) -> None:
+        """`base` is the motor without effects, and `solved` how it was found; `scales` are those of the recordings."""
+        self.starts, self.solved, self.report = Starts(scales), solved, report
+        self.comparison = comparison
+        self.models: dict[frozenset[str], Model] = {frozenset(): base}
+        # pairs of a set and a model from which it has been refitted, or need not be
+        self.refitted_from: set[tuple[frozenset[str], Model]] = set()
+
+    def with_signal(self, current: Model, signal: Signal, found: Screen) -> Model | None:
+        """The current model with the effect of a signal added; None if physics forbids the coefficients found.
+
+        A set that was fitted from another model and does not realise the promised gain is fitted again from this one.
+        """
+        effects = effects_with(current.effects, effect_of(signal))
+
+        def refit() -> Model | None:
+            start = self.starts.from_signal(current, effects, signal, found)
+            if start is None:
+                return None
+            of_trial = self.starts.of_trial(current, effects)
+            if of_trial:
+                return self._best_of_starts(effects, [start, *of_trial], found.white)
+            return self._refit_from_signal(effects, start, current, signal, found.white)
+
+        model, key = self._stored_or_fitted(effects, current, refit), frozenset(effects)
+        if model is None or (key, current) in self.refitted_from:
+            return model
+        if self._realises_gain(model, current, signal, found.white):
+            return model
+        return self._stored_or_better(key, current, refit)
+
+    def with_replacement(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
+        """The current model with `new` in place of `old`: a fuller or a simpler form of it, an effect that resembles
+        it, one with starts of its own, or one fitted before. Others have no values to start from."""
+        effects = (*(e for e in current.effects if e != old), new)
+
+        def refit() -> Model:
+            starts = self.starts.of_trial(current, effects)
+            if not starts:
+                values = self.starts.values_from_replaced(current, old, new)
+                starts = [self.starts.from_model(current, effects, values)]
+            max_misfit = np.inf
+            if old in FULLER and FULLER[old].effect == new:
+                starts = [self.starts.from_simple_form(current, old, effects), *starts]
+                max_misfit = MAX_FULLER_MISFIT * _misfit(current)
+            return self._best_of_starts(effects, starts, white, max_misfit)
+
+        return self._stored_or_fitted(effects, current, refit)
+
+    def with_global_search(self, current: Model, effect: str) -> Model:
+        """The current model with one more effect, by a new global search; or the stored fit of the set, if better."""
+        effects = (*current.effects, effect)
+
+        def search() -> Model:
+            prepared = current.prepared.with_effects([EFFECTS[e] for e in effects])
+            method, seed = self.solved.search.method, self.solved.seed
+            prepared, solved = search_and_refine(prepared, method, seed, searches=1)
+            return model_of(effects, prepared, solved.fit)
+
+        if (key := frozenset(effects)) in self.models:
+            return self._stored_or_better(key, current, search)
+        model = self._stored_or_fitted(effects, current, search)
+        assert model is not None
+        return model
+
+    def with_fuller_form_held(self, current: Model, white: Whitener, effect: str) -> Model | None:
+        """The current model with a fuller form of an effect, whose extra parameters are held where they clearly act;
+        None if a short refit shows that it fits far worse."""
+        fuller = FULLER[effect]
+        effects = (*(e for e in current.effects if e != effect), fuller.effect)
+        prepared, start = self.starts.from_simple_form(current, effect, effects)
+        fixed = {f"{fuller.effect}.{field}" for field in fuller.extra}
+        if "Kt" in _parameters_in_unseen_directions(current):
+            # all torques could scale up with Kt, until the part that is held is negligible
+            fixed.add("Kt")
+        free = jnp.asarray([name not in fixed for name in prepared.problem.parameters.names])
+        prepared = prepared._replace(problem=replace(prepared.problem, free=free))
+        end = polish(with_whitening(prepared, white).problem, start, SHORT_REFIT_STEPS).optimum
+        squares = end.fitness * prepared.problem.most_samples
+        if squares > MAX_HELD_MISFIT * self.comparison.fitted(current, white).squares:
+            return None
+        return refit_from(effects, prepared, end, white)
+
+    def without(self, model: Model, effect: str, white: Whitener) -> Model:
+        """The model without one of its effects; fitted again if the larger one's parameters beat the stored fit."""
+        rest = tuple(e for e in model.effects if e != effect)
+        prepared, start = self.starts.from_model(model, rest, {})
+
+        def refit() -> Model:
+            return refit_from(rest, prepared, start, white)
+
+        smaller = self._stored_or_fitted(rest, model, refit)
+        assert smaller is not None
+        key = frozenset(rest)
+        if (key, model) not in self.refitted_from:
+            self.refitted_from.add((key, model))
+            at_start = fit_at(prepared.problem, start).fitness
+            if at_start < (1 - MIN_IMPROVEMENT) * _misfit(smaller):
+                return self._stored_or_better(key, model, refit)
+        return smaller
+
+    def _stored_or_fitted(
+        self, effects: Sequence[str], current: Model, refit: Refit
+    ) -> Model | None:
+        """The stored fit of a set; if there is none, a new one from the current model, which is then stored."""
+        key = frozenset(effects)
+        if key not in self.models:
+            model = self._fitted(key, current, refit)
+            if model is None:
+                return None
+            self.models[key] = model
+        return self.models[key]
+
+    def _stored_or_better(self, key: frozenset[str], current: Model, refit: Refit) -> Model:
+        """The better of the stored fit of a set and a new one from the current model, which is then stored."""
+        again = self._fitted(key, current, refit)
+        if again and _misfit(again) < (1 - MIN_IMPROVEMENT) * _misfit(self.models[key]):
+            self.models[key] = again
+        return self.models[key]
+
+    def _fitted(self, key: frozenset[str], current: Model, refit: Refit) -> Model | None:
+        """A new fit of a set from the current model, reported and recorded in `refitted_from`."""
+        self.report(f"trying {' + '.join(sorted(key))}", _misfit(current))
+        self.refitted_from.add((key, current))
+        return refit()
+
+    def _realises_gain(self, model: Model, current: Model, signal: Signal, white: Whitener) -> bool:
+        """Whether a refit realises more than `MIN_REALISED_SHARE` of the gain that the evidence promised."""
+        before, after = (self.comparison.fitted(m, white).squares for m in (current, model))
+        return bool(before - after > MIN_REALISED_SHARE * signal.gain)
+
+    def _refit_from_signal(
+        self,
+        effects: tuple[str, ...],
+        start: Start,
+        current: Model,
+        signal: Signal,
+        white: Whitener,
+    ) -> Model:
+        """A refit from where the evidence points; if that does not realise the promised gain, plain least squares, too.
+
+        The plain fit is returned if it leaves far less unfiltered misfit: the filter had taken the missing effect for
+        noise. Otherwise a second filtered refit starts from it, and the better of the two filtered ones is returned.
+        """
+        prepared, point = start
+        model = refit_from(effects, prepared, point, white)
+        if self._realises_gain(model, current, signal, white):
+            return model
+        plain = polish(prepared.problem, point)
+        if plain.fitness < MAX_PLAIN_MISFIT * _misfit(model):
+            return model_of(effects, prepared, plain)
+        from_plain = refit_from(effects, prepared, plain.optimum, white)
+        return min((model, from_plain), key=lambda m: self.comparison.fitted(m, white).squares)
+
+    def _best_of_starts(
+        self,
+        effects: tuple[str, ...],
+        starts: Sequence[Start],
+        white: Whitener,
+        max_misfit: float = np.inf,
+    ) -> Model:
+        """The best refit from several starts of the last effect: the best of short refits, refitted in full.
+
+        With `Trial.factors`, populations search around each start first; and around the end, if the best short refit
+        has a misfit below `max_misfit`.
+        """
+        seed, prepared, runs = self.solved.seed, starts[0].prepared, starts[0].point.unknowns.runs
+        factors = {f"{effects[-1]}.{f}": x for f, x in TRIALS[effects[-1]].factors.items()}
+        if factors:
+            starts = [
+                Start(prepared, _best_around(prepared, s.point, factors, seed)) for s in starts
+            ]
+        best = _best_short_refit(starts)
+        start = best._replace(unknowns=best_backlash_start(prepared.problem, best.unknowns, runs))
+        if factors and best.fitness < max_misfit:
+            return _refit_with_population(effects, prepared, start, factors, seed)
+        return refit_from(effects, prepared, start, white)
+
+
+def _misfit(model: Model) -> float:
+    """The unfiltered misfit of a model, as in `Optimum.fitness`."""
+    return model.fit.fitness
+
+
+def _best_short_refit(starts: Sequence[Start]) -> Optimum:
+    """The best of short refits, made until the best reaches the noise (`POOR_FIT`) or another found the same optimum
+    (`SAME_OPTIMUM_RATIO`)."""
+    noise = POOR_FIT * starts[0].prepared.problem.outputs
+
+    def is_enough(ends: list[Optimum]) -> bool:
+        least, *others = sorted(end.fitness for end in ends)
+        return bool(least < noise or (others and others[0] < SAME_OPTIMUM_RATIO * least))
+
+    ends = map_in_threads_until(_short_refit, starts, is_enough)
+    return min(ends, key=lambda end: end.fitness)
+
+
+def _short_refit(start: Start) -> Optimum:
+    """A refit of a few steps; its misfit is infinite where it cannot be simulated."""
+    return polish(start.prepared.problem, start.point, SHORT_REFIT_STEPS).optimum
+
+
+def _refit_with_population(
+    effects: tuple[str, ...],
+    prepared: Prepared,
+    start: Optimum,
+    factors: Mapping[str, float],
+    seed: int,
+) -> Model:
+    """A refit; or a second one from the best of a population around where the first ended, if that point is better and
+    so is the refit, by the whitening filter of the residuals at the start."""
+    white = whitener(residuals_of(prepared, fit_at(prepared.problem, start)))
+    whitened = with_whitening(prepared, white).problem
+
+    def whitened_misfit(model: Model) -> float:
+        return fit_at(whitened, model.fit.optimum).fitness
+
+    model = refit_from(effects, prepared, start, white)
+    nearer = {name: np.sqrt(factor) for name, factor in factors.items()}
+    elsewhere = _best_around(prepared, model.fit.optimum, nearer, seed)
+    if elsewhere.fitness >= _misfit(model):
+        return model
+    return min((model, refit_from(effects, prepared, elsewhere, white)), key=whitened_misfit)
+
+
+def _best_around(
+    prepared: Prepared, start: Optimum, factors: Mapping[str, float], seed: int
+) -> Optimum:
+    """The best point of a population search around a start; `factors` as in `best_nearby`."""
+    fit = fit_at(prepared.problem, start)
+    return best_nearby(prepared.problem, fit, factors, seed)
+
+
+def _parameters_in_unseen_directions(model: Model) -> set[str]:
+    """The parameters with a part in any direction that the runs do not determine."""
+    problem = model.prepared.problem
+    unseen = information_of(problem, model.fit).unseen
+    return {name for d in unseen for name in moved_by(d, problem.parameters)}

@@ -1,0 +1,89 @@
+"""Effects named for the likeliest timing of the voltages: which that is, a fit without the effects may not tell."""
+
+from __future__ import annotations
+
+import time
+from functools import cache
+from typing import NamedTuple
+
+from ...effects import EFFECTS
+from ...identify.corrections.input_timing import (
+    negative_log_likelihood_within,
+    only_current_is_late,
+    other_timings,
+)
+from ...identify.fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN
+from ...identify.prepare import Prepared
+from ...identify.solve import Solved, polish_with_angle, solve
+from ...progress import ReportProgress
+from ...simulate import HELD, Timing
+from ..model import Model, model_of
+from .naming import Naming, StepwiseSelection
+
+# Difference of two leads, in samples, below which they are the same
+SAME_LEAD = 0.05
+
+
+class Attempt(NamedTuple):
+    """Effects named for one timing of the voltages."""
+
+    prepared: Prepared
+    solved: Solved
+    selection: StepwiseSelection
+    naming: Naming
+    identifying: float  # s that the identification of the motor without effects took
+
+
+def likeliest_attempt(
+    prepared: Prepared, search: str, seed: int, report: ReportProgress
+) -> Attempt:
+    """The effects named, and then once more if these reveal another timing of the voltages: the likelier ones of both,
+    or those with held voltages if nothing speaks against these any more."""
+
+    @cache
+    def identified(timing: Timing | None) -> tuple[Prepared, Solved, float]:
+        began = time.perf_counter()
+        timed, solved = solve(prepared, search, seed, report, timing)
+        return timed, solved, time.perf_counter() - began
+
+    def attempt(timing: Timing | None = None) -> Attempt:
+        prepared, solved, identifying = identified(timing)
+        report("gathering evidence", solved.fit.fitness)
+        selection = StepwiseSelection(model_of((), prepared, solved.fit), solved, report)
+        return Attempt(prepared, solved, selection, selection.name(), identifying)
+
+    first = attempt()
+    held, timing = first.naming.chosen, first.prepared.timing
+    if not held.effects:
+        return first
+    if timing != HELD:
+        chosen = held
+        if only_current_is_late(chosen.prepared, chosen.fit):
+            return attempt(HELD)
+        held = _with_effects_of(chosen, identified(HELD)[0])
+        gain = _negative_log_likelihood(held) - _negative_log_likelihood(chosen)
+        if not gain > MIN_LOG_LIKELIHOOD_GAIN:
+            return attempt(HELD)
+    others = [t for t in other_timings(held.prepared, held.fit)[:1] if not _is_tried(t, timing)]
+    if not others:
+        return first
+    attempts = (first, attempt(others[0]))
+    return min(attempts, key=lambda a: _negative_log_likelihood(a.naming.chosen))
+
+
+def _with_effects_of(model: Model, prepared: Prepared) -> Model:
+    """The effects of a model fitted to runs with another timing."""
+    prepared = prepared.with_effects([EFFECTS[effect] for effect in model.effects])
+    return model_of(model.effects, *polish_with_angle(prepared, model.fit.optimum))
+
+
+def _negative_log_likelihood(model: Model) -> float:
+    return negative_log_likelihood_within(model.prepared, model.fit)
+
+
+def _is_tried(other: Timing, timing: Timing) -> bool:
+    """Whether another timing is of the same kind as the one assumed, and nearly the same; smooth voltages are found
+    from straight ones."""
+    alike = (other.straight, other.current_mean) == (timing.straight, timing.current_mean)
+    smoother = other.smooth is not None and timing.smooth is None
+    return alike and not smoother and abs(other.lead - timing.lead) < SAME_LEAD

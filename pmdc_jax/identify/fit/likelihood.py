@@ -1,0 +1,55 @@
+"""Likelihood of recordings under a fit with coloured residuals, which decides on corrections for their sensors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..noise.noise_model import Series, whitener
+from ..noise.sensor_noise import ratio_to_noise
+from ..prepare import Prepared
+from .by_run import FitByRun
+from .generalised_least_squares import series_of, training_indices
+from .polish import Fit
+
+# Root mean square of residuals, over the white noise of the sensor, up to which they are nothing but that noise
+MAX_NOISE_RATIO = 1.3
+# Gain in log-likelihood from which a recording is interpreted in another way than by default
+MIN_LOG_LIKELIHOOD_GAIN = 30.0
+
+
+def negative_log_likelihood(prepared: Prepared, fit: Fit | FitByRun) -> float:
+    """Negative log-likelihood of the training runs as recorded, up to a constant.
+
+    Of Gaussian innovations: the one-step prediction errors of an autoregressive model of the residuals.
+
+    **Arguments**: `fit`, to these recordings or to corrected ones.
+    **Source**: Ljung, "System Identification", 2nd edition, section 7.4.
+    """
+    tape, simulated, total = prepared.problem.tape, np.asarray(fit.evaluation.simulated), 0.0
+    for run in training_indices(prepared):
+        measured = series_of(tape, run, np.asarray(tape.measured))
+        expected = series_of(tape, run, simulated).values
+        if not np.isfinite(expected).all():
+            return np.inf  # it diverges
+        residual = Series(measured.values - expected, measured.known, measured.kind)
+        white = whitener([residual])
+        rest = white(0, residual).reshape(-1, expected.shape[1])
+        spread = np.linalg.slogdet(rest.T @ rest / len(rest))[1]
+        total += len(rest) * (spread / 2 - np.linalg.slogdet(white.scales[0])[1])
+    return float(total)
+
+
+def leaves_only_noise(prepared: Prepared, fit: Fit) -> bool:
+    """Whether a fit leaves nothing of the training runs but the white noise of the sensors."""
+    tape, training = prepared.problem.tape, training_indices(prepared)
+    residual = np.where(tape.weight > 0, tape.measured - fit.evaluation.simulated, np.nan)
+
+    def of_output(c: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        lengths = [(k, len(prepared.runs[k])) for k in training]
+        measured, residuals = (
+            [tape.samples_of(k, signal[:, c], length) for k, length in lengths]
+            for signal in (np.asarray(tape.measured), residual)
+        )
+        return list(zip(measured, residuals, strict=True))
+
+    return all(ratio_to_noise(of_output(c)) <= MAX_NOISE_RATIO for c in range(2))

@@ -1,0 +1,171 @@
+"""Final Gauss-Newton iterations of a fit, each output weighted by the standard deviation of its own residuals."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..parameters import Parameters
+from ..problem import (
+    Evaluation,
+    Problem,
+    Unknowns,
+    evaluate,
+    flatten,
+    normal_matrix,
+    scaled,
+    unflatten,
+    whitened,
+)
+from .gauss_newton import (
+    TOLERANCE,
+    gauss_newton_step,
+    residual_noise,
+    ridge_of,
+    squares_of_outputs,
+)
+from .refine import Optimum
+
+# The polish stops if the cost fell by less than MIN_COST_DECREASE over the last PATIENCE steps: dry elements leave
+# kinks, at which the linearised model predicts a larger reduction than there is
+PATIENCE, MIN_COST_DECREASE = 5, 1e-5
+# Gauss-Newton steps at most
+MAX_STEPS = 20
+
+
+class Fit(NamedTuple):
+    """A motor fitted to the runs: the optimum, the simulation there, and the noise estimated from the residuals."""
+
+    optimum: Optimum
+    evaluation: Evaluation
+    noise: Float[np.ndarray, "2"]  # standard deviations of current A and speed rad/s
+    cost: float  # what the polish minimises (see `_WeightedPoint`)
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """The unknowns at the optimum."""
+        return self.optimum.unknowns
+
+    @property
+    def coordinates(self) -> Float[Array, " parameters"]:
+        """The search coordinates at the optimum."""
+        return self.optimum.unknowns.coordinates
+
+    @property
+    def fitness(self) -> float:
+        """Mean square of the residuals in noise variances; infinite where the simulation fails."""
+        return self.optimum.fitness
+
+    @property
+    def at_bound(self) -> tuple[int, ...]:
+        """The coordinates that are held at a bound."""
+        return self.optimum.at_bound
+
+
+def polish(
+    problem: Problem,
+    start: Optimum,
+    steps: int = MAX_STEPS,
+    tolerance: float = TOLERANCE,
+    known: Evaluation | None = None,
+) -> Fit:
+    """Gauss-Newton iterations in which each output is weighted by the standard deviation of its own residuals.
+
+    It ends where no step within the bounds is predicted to lower the sum of squares by more than `tolerance`, in noise
+    variances, or none is found that lowers it. A coordinate held at a bound is released where the gradient points back
+    inside. `known` is the evaluation at the start, if there is one already.
+    """
+    low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
+    ridge = ridge_of(problem)
+    fixed = set(start.at_bound)
+    best = trial = _evaluate_weighted(problem, start.unknowns, known)
+    step, share, gain = np.zeros(len(flatten(start.unknowns))), 1.0, np.inf
+    costs = [best.cost]
+    for _ in range(steps):
+        if len(costs) > PATIENCE and costs[-1 - PATIENCE] - costs[-1] < MIN_COST_DECREASE:
+            break
+        if not np.isfinite(best.cost):
+            break  # a failed simulation has no gradient
+        if trial.cost <= best.cost + 1e-9:
+            best, share = trial, 1.0
+            coordinates = np.asarray(best.unknowns.coordinates)
+            fixed = {k for k in fixed if (best.matrix[k, -1] > 0) == (coordinates[k] <= low[k])}
+            step, gain = gauss_newton_step(best.matrix, fixed, ridge)
+            if gain <= tolerance * _residual_variance(problem, best):
+                break
+        elif share > 1e-3:
+            share /= 4  # the last step was too long
+        else:
+            break
+        moved = np.asarray(flatten(best.unknowns)) + _damped_log_step(
+            problem.parameters, share * step
+        )
+        inside = np.clip(moved[: len(low)], low, high)
+        fixed |= set(np.flatnonzero(inside != moved[: len(low)]).tolist())
+        moved[: len(low)] = inside
+        trial = _evaluate_weighted(problem, unflatten(problem, jnp.asarray(moved)))
+        costs.append(min(trial.cost, best.cost))
+    distance = float(np.sqrt(gain / _residual_variance(problem, best)))
+    optimum = Optimum(best.unknowns, best.fitness, tuple(sorted(fixed)), distance)
+    return Fit(optimum, best.evaluation, best.noise, best.cost)
+
+
+def fit_at(problem: Problem, point: Optimum) -> Fit:
+    """The fit that stays at a point: its evaluation and its noise."""
+    return polish(problem, point, steps=0)
+
+
+def _damped_log_step(parameters: Parameters, step: np.ndarray) -> np.ndarray:
+    """A step s in which a positive parameter grows linearly, p (1 + s), instead of by exp(s): one that is nearly zero,
+    such as friction hidden by another effect, would otherwise grow without limit."""
+    rises = np.zeros(len(step), bool)
+    rises[: len(parameters.names)] = parameters.logarithmic
+    return np.where(rises & (step > 0), np.log1p(np.maximum(step, 0.0)), step)
+
+
+class _WeightedPoint(NamedTuple):
+    """An evaluated point, each output weighted by its own residuals."""
+
+    unknowns: Unknowns
+    evaluation: Evaluation
+    noise: np.ndarray
+    matrix: np.ndarray
+    # what maximum likelihood minimises: the sum of the logarithms of the outputs' noise; for whitened residuals, the
+    # logarithm of their sum of squares
+    cost: float
+    fitness: float
+
+
+def _residual_variance(problem: Problem, best: _WeightedPoint) -> float:
+    """Mean square of the weighted residuals. Unless they are whitened it is at least 1, the noise they are weighted by:
+    fitted to a simulation without noise they are next to nothing."""
+    mean = best.matrix[-1, -1] / max(float(np.sum(problem.samples)), 1.0)
+    return max(mean, 1e-300 if problem.whitening is not None else 1.0)
+
+
+def reweighted(problem: Problem, fit: Fit) -> Evaluation:
+    """The evaluation at a fit to plain residuals, weighted as in a problem with another noise."""
+    return whitened(problem, scaled(fit.evaluation, fit.noise / np.asarray(problem.noise)))
+
+
+def _evaluate_weighted(
+    problem: Problem, unknowns: Unknowns, known: Evaluation | None = None
+) -> _WeightedPoint:
+    evaluation = evaluate(problem, unknowns) if known is None else known
+    with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
+        squares = squares_of_outputs(problem, evaluation)
+        noise, stretch = residual_noise(problem, squares)
+        weighted = scaled(evaluation, stretch)
+        matrix = np.array(normal_matrix(weighted, problem.tape, problem.fitted_runs))
+        if problem.whitening is not None:
+            cost = float(np.log(np.maximum(squares.sum(), 1e-300)))
+        else:
+            over = squares * stretch**2 / np.maximum(problem.samples, 1.0)
+            cost = float(np.log(np.maximum(noise, 1e-300)).sum() + over.sum() / 2)
+    fitness = float(squares.sum()) / problem.most_samples
+    # a failed simulation is infinitely bad
+    cost, fitness = (x if np.isfinite(x) else np.inf for x in (cost, fitness))
+    return _WeightedPoint(unknowns, weighted, noise, matrix, cost, fitness)

@@ -1,0 +1,1 @@
+"""Noise of the sensors, and the filters that whiten residuals."""

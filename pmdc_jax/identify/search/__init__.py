@@ -1,0 +1,1 @@
+"""Global search of the parameters by evolutionary algorithms."""

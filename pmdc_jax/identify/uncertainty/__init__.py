@@ -1,0 +1,1 @@
+"""Covariance, intervals, and what the data cannot determine."""

@@ -1,0 +1,106 @@
+"""Explanations of the parameter directions that the data do not determine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...recordings.recording import Recording
+from ..identification import Direction
+from ..parameters import Parameters
+
+# A parameter belongs to an unseen direction if it makes up at least this share of it.
+MIN_SHARE = 0.05
+
+
+def moved_by(direction: np.ndarray, parameters: Parameters) -> tuple[str, ...]:
+    """The parameters that belong to a direction."""
+    return tuple(n for n, x in zip(parameters.names, direction, strict=True) if abs(x) > MIN_SHARE)
+
+
+def torque_scale(unseen: Sequence[np.ndarray], names: Sequence[str]) -> np.ndarray | None:
+    """The unseen direction along which all torques, Kt, J and f change in proportion, while Kb stays; None if the runs
+    show the scale."""
+    if not {"Kt", "Kb"} <= set(names):
+        return None
+    k, b = names.index("Kt"), names.index("Kb")
+    return next((d for d in unseen if abs(d[k]) > 0.1 and abs(d[b]) < 1e-2), None)
+
+
+def step_to_equal_constants(
+    along: np.ndarray, coordinates: np.ndarray, names: Sequence[str]
+) -> np.ndarray:
+    """The step along the `torque_scale` that makes Kt equal Kb, as they are in SI."""
+    k, b = names.index("Kt"), names.index("Kb")
+    return along * (coordinates[b] - coordinates[k]) / along[k]
+
+
+def explain_directions(
+    unseen: Sequence[np.ndarray], parameters: Parameters, recordings: Sequence[Recording]
+) -> tuple[Direction, ...]:
+    """For each unseen direction: which parameters it moves together, why the data do not determine it, and a remedy."""
+    directions = []
+    for vector in unseen:
+        names = moved_by(vector, parameters)
+        directions.append(Direction(names, *_reason(set(names), recordings)))
+    # directions that move the same parameters are reported once
+    return tuple(dict.fromkeys(directions))
+
+
+def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]:
+    loads = [r.load for r in recordings if r.load is not None]
+    loaded = any(np.ptp(load) > 0 or np.any(load != 0) for load in loads)
+    electrical = any(r.voltage is not None for r in recordings)
+    driven = any(r.drive == "torque" for r in recordings)
+    measured = any(r.voltage is not None and r.current is not None for r in recordings)
+    turning = any(r.speed is not None or r.angle is not None for r in recordings if not r.held)
+    listed = _listed(sorted(names))
+    if electrical and not measured and names & {"R", "L", "Kb", "Kt"}:
+        return (
+            f"No run has both voltage and current, so {listed} trade off against each other",
+            "Record the current too, or give values with --known",
+        )
+    if not turning and names & {"Kb", "Kt", "J", "f"}:
+        return (
+            f"No run with a turning rotor has a speed or an angle, so {listed} trade off against each other",
+            "Record the speed or the angle too, or give values with --known",
+        )
+    if {"J", "f"} <= names and not electrical and not loaded and not driven:
+        return (
+            "No run has a voltage or a nonzero known load torque, so only the ratios of Kt, J and f are identifiable",
+            "Record the voltage too, add a run with a known load torque, or give Kt with --known",
+        )
+    if {"Kt", "J"} <= names and not loaded and not driven:
+        return (
+            "No run has a nonzero known load torque, so only the ratios of Kt, J and f are identifiable",
+            "Add a run with a known load torque, or tie Kt = Kb with --tie Kt=Kb",
+        )
+    if names == {"L"}:
+        return (
+            "The sampling is too slow, or the voltage too smooth, to show the electrical time constant",
+            "Record voltage steps at a sample time below L / R, or give L with --known",
+        )
+    if names == {"f"}:
+        return (
+            "Viscous friction changes these runs by less than their noise",
+            "Record long steady runs at several speeds with little load",
+        )
+    if "J" in names and not names & {"Kt", "Kb"}:
+        return (
+            "The speed changes too little to show the inertia",
+            "Add a run with voltage steps or a rapidly changing voltage",
+        )
+    if {"R", "Kb"} & names:
+        return (
+            f"Voltage, current and speed keep the same proportions, so {listed} trade off against each other",
+            "Add runs at other loads, at stall, or with voltage steps",
+        )
+    return (
+        f"The runs cannot distinguish {listed}",
+        "Add a run with more excitation: voltage steps, both directions, several speeds and loads",
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

@@ -1,0 +1,1 @@
+"""Recorded runs: their files, units, clocks and noise."""

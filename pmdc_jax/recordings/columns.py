@@ -1,0 +1,323 @@
+"""The meaning of column headers: quantity, and conversion of the unit to SI."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+
+from attrs import evolve, frozen
+
+from ..errors import InputError
+from .units import UnitError, conversion
+
+
+@frozen
+class Quantity:
+    """One canonical column.
+
+    **Fields**: `header`, written to files; `units`, the SI units it is converted to, that of a rotating shaft first and
+    that of a linear axis second; `names`, recognised without a unit; `symbols`, recognised only with one.
+    """
+
+    header: str
+    units: tuple[str, ...]
+    names: tuple[str, ...]
+    symbols: tuple[str, ...] = ()
+
+
+QUANTITIES = {
+    "time": Quantity("time_s", ("s",), ("time", "t", "zeit", "elapsed_time"), ("t", "timestamp")),
+    "voltage": Quantity(
+        "voltage_V",
+        ("V",),
+        (
+            "voltage",
+            "motor_voltage",
+            "armature_voltage",
+            "terminal_voltage",
+            "spannung",
+            "motorspannung",
+            "ankerspannung",
+            "klemmenspannung",
+        ),
+        ("u", "v", "ua", "u_a", "va", "v_a"),
+    ),
+    "current": Quantity(
+        "current_A",
+        ("A",),
+        ("current", "motor_current", "armature_current", "strom", "motorstrom", "ankerstrom"),
+        ("i", "ia", "i_a"),
+    ),
+    "speed": Quantity(
+        "speed_rad_s",
+        ("rad/s", "m/s"),
+        (
+            "speed",
+            "motor_speed",
+            "shaft_speed",
+            "rotor_speed",
+            "angular_speed",
+            "velocity",
+            "angular_velocity",
+            "omega",
+            "winkelgeschwindigkeit",
+        ),
+        # a bare "Drehzahl" or "n" is nearly always in 1/min, so these need their unit
+        ("w", "n", "v", "drehzahl", "motordrehzahl", "rotational_speed"),
+    ),
+    "load": Quantity(
+        "load_torque_Nm",
+        ("N m", "N"),
+        ("load_torque", "load", "load_force", "lastmoment", "lastdrehmoment"),
+    ),
+    "angle": Quantity(
+        "angle_rad",
+        ("rad", "m"),
+        ("angle", "shaft_angle", "motor_angle", "rotor_angle", "theta", "winkel", "drehwinkel"),
+        ("phi", "pos", "position"),
+    ),
+    "temperature": Quantity(
+        "temperature_C",
+        ("degC",),
+        ("temperature", "temp", "temperatur", "motor_temperature", "winding_temperature"),
+        ("t",),
+    ),
+    "torque": Quantity(
+        "torque_Nm",
+        ("N m", "N"),
+        ("torque", "motor_torque", "motor_force", "motormoment", "antriebsmoment"),
+        ("force",),
+    ),
+}
+
+
+# Symbols with a suffix for the motor, such as u_motor and Vmot, which need no unit
+MOTOR_SYMBOLS = {
+    quantity: re.compile(rf"({symbol})_?(mot|motor|arm|armature)")
+    for quantity, symbol in {"voltage": "u|v", "current": "i", "speed": "w|omega"}.items()
+}
+# Quantities recognised by their unit alone, if only one column has it; not torques, which may be load or motor torque
+TOLD_BY_UNIT = ("time", "voltage", "current", "speed", "angle")
+# Words in the names of columns that hold set points, limits or supplies rather than a measurement of the motor
+NOT_MEASURED = re.compile(
+    r"(?i)(?<![a-z])(ref|set|soll|cmd|command|target|demand|desired|limit|max|min|supply|bat)"
+)
+
+
+@frozen
+class Column:
+    """A header understood: SI value = scale * number + offset.
+
+    `unit` is None where the header names none and SI was assumed; `base` is the SI unit; `by_unit` is true where the
+    quantity was recognised by the unit alone.
+    """
+
+    header: str
+    quantity: str
+    unit: str | None
+    base: str
+    scale: float = 1.0
+    offset: float = 0.0
+    by_unit: bool = False
+
+
+def match_columns(
+    headers: Sequence[str], columns: Mapping[str, str] | None, where: str
+) -> dict[str, Column]:
+    """Which header holds which quantity.
+
+    **Arguments**: `headers` of the file; `columns`, the mapping of the user from quantity to "header[:unit]", which
+    takes precedence; `where`, the file, for messages.
+
+    **Returns**: the columns by quantity.
+
+    **Raises**: `InputError` for unknown names or units, and if two headers mean the same quantity.
+    """
+    if not isinstance(columns, Mapping | None):
+        what = f"columns is {columns!r}, not a mapping"
+        raise InputError(where, what, 'Write for example {"speed": "rpm_meas:rpm"}')
+    by_hand = [_by_hand(name, spec, headers, where) for name, spec in (columns or {}).items()]
+    matched = {column.quantity: column for column in by_hand}
+    _refuse_shared(matched, where)
+    taken = {column.header for column in matched.values()}
+    refused: dict[str, InputError] = {}
+    understood: dict[str, Column] = {}
+    for header in headers:
+        try:
+            column = understand(header)
+        except UnitError as error:
+            mend = f"Write it as in {QUANTITIES[error.quantity].header}, or map it with --column"
+            refused[error.quantity] = InputError(f"{where}, column {header}", str(error), mend)
+            continue
+        if column is None or column.quantity in matched or header in taken:
+            continue
+        if column.quantity in understood:
+            raise _ambiguous_headers(understood[column.quantity], column, where)
+        understood[column.quantity] = column
+    matched |= understood
+    for quantity, error in refused.items():
+        if quantity not in matched:
+            raise error
+    return matched | _match_by_unit_or_symbol(headers, matched)
+
+
+def _match_by_unit_or_symbol(
+    headers: Sequence[str], matched: Mapping[str, Column]
+) -> dict[str, Column]:
+    """Quantities recognised by the unit or the motor symbol of exactly one of the remaining headers."""
+    taken = {column.header for column in matched.values()}
+    free = [header for header in headers if header not in taken]
+    known: dict[str, Column] = {}
+    for quantity in (q for q in TOLD_BY_UNIT if q not in matched):
+        alike = [
+            evolve(_column(header, quantity, unit), by_unit=True)
+            for header in free
+            if (unit := _measured_unit(header, quantity))
+        ]
+        if symbol := MOTOR_SYMBOLS.get(quantity):
+            marked = (header for header in free if symbol.fullmatch(_normalised(header)))
+            alike += [_column(header, quantity, None) for header in marked]
+        if len(alike) == 1:
+            known[quantity] = alike[0]
+    return known
+
+
+def _measured_unit(header: str, quantity: str) -> str | None:
+    """The shaft unit of the quantity in a header, None without one or if the name has a word of `NOT_MEASURED`."""
+    for name, unit, _ in _readings(header):
+        if unit and _is_unit_of(unit, quantity, QUANTITIES[quantity].units[:1]):
+            return None if NOT_MEASURED.search(name) else unit
+    return None
+
+
+def understand(header: str) -> Column | None:
+    """What a header such as `Speed [rpm]`, `u / V` or `time_ms` means; None if it is not recognised.
+
+    **Raises**: `UnitError` if the name identifies the quantity but the unit in brackets does not measure it.
+    """
+    if _normalised(header) == "rpm":
+        return _column(header, "speed", "rpm")
+    for name, unit, explicit in _readings(header):
+        key = _normalised(name)
+        named = [q for q, known in QUANTITIES.items() if key in known.names]
+        if unit is None and named:
+            return _column(header, named[0], None)
+        if unit is None:
+            continue
+        meant = [
+            q for q, quantity in QUANTITIES.items() if key in quantity.names + quantity.symbols
+        ]
+        fitting = [q for q in meant if _is_unit_of(unit, q)]
+        if len(fitting) == 1:
+            return _column(header, fitting[0], unit)
+        if explicit and named and len(meant) == 1:
+            return _column(header, named[0], unit)  # raises: the unit is wrong
+    stem, dot, leaf = header.rpartition(".")
+    column = understand(leaf) if dot and stem else None  # a path into a MATLAB structure
+    return column and evolve(column, header=header)
+
+
+def likely_quantity(header: str) -> str | None:
+    """The quantity that an unused header may hold: the one whose name it begins with, such as speed for `speed_kg`; or
+    the load for a unit of torque, as in `M_Nm`; else None."""
+    readings = [(name, unit) for name, unit, _ in _readings(header) if unit is not None]
+    for name, _ in readings:
+        for quantity, known in QUANTITIES.items():
+            if _normalised(name) in known.names:
+                return quantity
+    torque = QUANTITIES["load"].units[:1]
+    return "load" if any(_is_unit_of(unit, "load", torque) for _, unit in readings) else None
+
+
+def mixed_axes(matched: Mapping[str, Column]) -> tuple[Column, Column] | None:
+    """A column in units of a shaft (rad, N m) and one in those of a linear axis (m, N); None without both."""
+    sorts: dict[bool, Column] = {}
+    for quantity in ("speed", "angle", "load", "torque"):
+        column = matched.get(quantity)
+        if column and column.unit:
+            sorts.setdefault(column.base == QUANTITIES[quantity].units[1], column)
+    return (sorts[False], sorts[True]) if len(sorts) == 2 else None
+
+
+def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column:
+    option = f"{where}, --column {name}={spec}"
+    quantity = "load" if name == "load_torque" else name
+    if quantity not in QUANTITIES:
+        raise InputError(option, f"unknown quantity '{name}'", f"Known: {', '.join(QUANTITIES)}")
+    header, unit = spec, None
+    if spec not in headers:
+        header, _, unit = (part.strip() for part in spec.rpartition(":"))
+        header, unit = (header, unit) if header else (spec.strip(), None)
+    # `header` may lack the unit that was read from the line below the names
+    named = [h for h in headers if h.rpartition(" [")[0] == header]
+    if header not in headers and len(named) == 1:
+        (header,) = named
+    if header not in headers:
+        listed = ", ".join(headers[:20]) or "none"
+        raise InputError(option, f"the file has no column '{header}'", f"Its columns are: {listed}")
+    try:
+        return _column(header, quantity, unit or _unit_in_header(header, quantity))
+    except UnitError as error:
+        example = f"--column {name}={header}:{QUANTITIES[quantity].units[0]}"
+        counts = f", or {name}={header}:rev/2000 for 2000 counts per turn"
+        mend = f"Write for example {example}{counts if quantity == 'angle' else ''}"
+        raise InputError(option, str(error), mend) from None
+
+
+def _unit_in_header(header: str, quantity: str) -> str | None:
+    """The unit in a header, whose name need not be recognised."""
+    for _, unit, explicit in _readings(header):
+        if unit is not None and (explicit or _is_unit_of(unit, quantity)):
+            return unit
+    return None
+
+
+def _column(header: str, quantity: str, unit: str | None) -> Column:
+    if unit is None:
+        return Column(header, quantity, None, QUANTITIES[quantity].units[0])
+    return Column(header, quantity, unit, *conversion(unit, quantity, QUANTITIES[quantity].units))
+
+
+def _readings(header: str) -> Iterator[tuple[str, str | None, bool]]:
+    """Ways to split a header into name and unit, the most certain first; True if the unit is in brackets."""
+    header = header.strip()
+    # a colon in brackets is MATLAB notation for a column or a row of a matrix
+    if brackets := re.fullmatch(r"(.*?)[\s_]*[\[({]\s*([^:]*?)\s*[\])}]", header):
+        name, unit = brackets.groups()
+        yield name, None if unit in ("", "-") else unit, True
+        return
+    yield header, None, False
+    if marked := re.fullmatch(r"(.*?)\s*(?:/|,|\bin\b)\s*(.+)", header):
+        yield marked[1], marked[2], False
+    for cut in reversed([match.start() for match in re.finditer(r"[_ ]", header)]):
+        yield header[:cut], header[cut + 1 :], False
+
+
+def _normalised(name: str) -> str:
+    name = name.strip().casefold().replace("ω", "omega").replace("θ", "theta").replace("φ", "phi")
+    return re.sub(r"\W+|_+", "_", name).strip("_")
+
+
+def _is_unit_of(unit: str, quantity: str, units: tuple[str, ...] | None = None) -> bool:
+    try:
+        conversion(unit, quantity, units or QUANTITIES[quantity].units)
+    except UnitError:
+        return False
+    return True
+
+
+def _refuse_shared(matched: Mapping[str, Column], where: str) -> None:
+    by_header: dict[str, str] = {}
+    for quantity, column in matched.items():
+        other = by_header.setdefault(column.header, quantity)
+        if other != quantity:
+            what = f"--column maps '{column.header}' to both {other} and {quantity}"
+            raise InputError(where, what, "Give each quantity a column of its own")
+
+
+def _ambiguous_headers(first: Column, second: Column, where: str) -> InputError:
+    return InputError(
+        f"{where}, columns {first.header} and {second.header}",
+        f"both mean {first.quantity}",
+        f"Choose one, for example with --column {first.quantity}={second.header}",
+    )

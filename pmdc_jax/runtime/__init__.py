@@ -1,0 +1,1 @@
+"""How computations run: precision, threads, and compiled programs."""
