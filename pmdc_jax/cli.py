@@ -106,7 +106,7 @@ def identify(
     from .files import check_outputs
 
     check_outputs({"--save": save, "--json": json, "--report": report}, [*runs, *holdout])
-    columns = dict(pairs("--column", column))
+    columns = pairs("--column", column)
     options = fit_options(tie, known, unloaded, search, seed) | {"effects": tuple(effect)}
     from .identify import identify
 
@@ -149,7 +149,7 @@ def diagnose(
 
     outputs = {"--save": save, "--json": json, "--report": report, "--experiment": experiment}
     check_outputs(outputs, [*runs, *holdout])
-    columns = dict(pairs("--column", column))
+    columns = pairs("--column", column)
     options = fit_options(tie, known, unloaded, search, seed)
     from .diagnose import diagnose
 
@@ -316,17 +316,17 @@ def _read_and_fit(
     fit: Callable[..., Result],
     runs: list[Path],
     holdout: list[Path],
-    columns: dict[str, str],
+    columns: list[tuple[str, str]],
     options: dict[str, Any],
 ) -> Result:
     """Read the runs and call `fit`, which is `identify` or `diagnose`, on them, showing progress."""
-    from .recordings.recording_file import read_recording
+    from .recordings.recording_file import read_recordings
     from .report.terminal import progress
 
     with progress() as on_progress:
-        recordings = [read_recording(run, columns) for run in runs]
-        held_out = [read_recording(run, columns) for run in holdout]
-        return fit(recordings, holdout=held_out, progress=on_progress, **options)
+        recordings = read_recordings([*runs, *holdout], columns)
+        train, held_out = recordings[: len(runs)], recordings[len(runs) :]
+        return fit(train, holdout=held_out, progress=on_progress, **options)
 
 
 def _print_findings_and_save(identification: Identification, path: Path | None) -> None:

@@ -41,7 +41,8 @@ Column = Annotated[
     list[str],
     typer.Option(
         metavar="QUANTITY=HEADER:UNIT",
-        help="Quantity and unit of a column whose header is not recognised. Repeatable.",
+        help="Quantity and unit of a column whose header is not recognised; -UNIT reverses its sign."
+        " For all files with that header. Repeatable.",
     ),
 ]
 Tie = Annotated[

@@ -153,6 +153,13 @@ def cases() -> Iterator[Case]:
     )
     yield Case("clock time", with_line(2, "12:00:01,1,2,3"), "line 2, column time_s: '12:00:01'")
     yield Case(
+        "days or months",
+        csv(
+            "time,voltage_V,speed_rpm", *[f"03/0{1 + k // 6}/2026 12:00:{k},1,2" for k in range(12)]
+        ),
+        "line 2, column time: '03/01/2026 12:00:0' may begin with the day or the month",
+    )
+    yield Case(
         "text after comments",
         csv("# bench 3", "", HEADER, "# begin", *rows(12), "", "0.5,1,x,2"),
         "line 18, column current_A: 'x'",
@@ -215,6 +222,14 @@ def cases() -> Iterator[Case]:
     yield Case(
         "time rounded away", csv(HEADER, *rows(step=0.0)), "line 3, column time_s: the time stamp"
     )
+    yield Case(
+        "wrong last time", with_line(21, "1e12,1,2,3"), "line 21, column time_s: a gap of 1e+12 s"
+    )
+    yield Case(
+        "a long gap",
+        csv(HEADER, *rows(30), *rows(30, start=2500.0)),
+        "line 32, column time_s: a gap of 2500 s in time before it, where most steps are 0.01 s",
+    )
     yield Case("time missing", with_line(6, ",1,2,3"), "line 6, column time_s: 1 of 20 values")
     yield Case("voltage missing", with_line(6, "0.04,,2,3"), "line 6, column voltage_V: 1 of 20")
     yield Case("voltage NaN", with_line(3, "0.01,NaN,2,3"), "line 3, column voltage_V: 1 of 20")
@@ -239,7 +254,17 @@ def cases() -> Iterator[Case]:
     yield Case(
         "voltage column empty, nothing else drives",
         csv("time_s,voltage_V,speed_rad_s", *[f"{k / 100},,{k}" for k in range(20)]),
-        "too few columns to identify a motor",
+        "only time, speed; nothing is in voltage_V",
+    )
+    yield Case(
+        "speeds that are dates",
+        csv("time_s,voltage_V,speed_rpm", *[f"{k},1,2026-03-01 12:00:{k:02}" for k in range(20)]),
+        "column speed_rpm: it contains dates",
+    )
+    yield Case(
+        "numbers named timestamp",
+        csv("timestamp,voltage_V,current_A,speed_rpm", *rows()),
+        "there is no time column",
     )
     yield from mapping_cases()
     yield from binary_cases()
@@ -252,6 +277,8 @@ def mapping_cases() -> Iterator[Case]:
     yield Case("map no quantity", mapped(*three, "torsion=c"), "unknown quantity 'torsion'")
     yield Case("map in a wrong unit", mapped(*three, "speed=c:kg"), "'kg' does not measure speed")
     yield Case("map in no unit", mapped(*three, "speed=c:rpn"), "unknown unit 'rpn'")
+    for unit in ("A/-1", "A-", "A/0", "0*A", "--A"):
+        yield Case(f"map in {unit}", mapped(*three, f"current=c:{unit}"), "for current (A)")
     yield Case(
         "map one to two", mapped(*three, "speed=c:rpm", "current=c:A"), "both speed and current"
     )

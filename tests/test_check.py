@@ -174,6 +174,26 @@ def with_missing_values(run):
     return evolve(run, speed=speed)
 
 
+def test_dropped_rows_are_gaps_and_no_jitter():
+    """Each of one, two or three rows; steps of three samples or fewer leave no output missing."""
+    run = good_run(1, "prbs")
+    for drops, severity in (({149: 3, 551: 1, 1245: 2}, "warning"), ({551: 1, 1245: 1}, "note")):
+        dropped = [row + k for row, count in drops.items() for k in range(count)]
+        keep = np.setdiff1d(np.arange(len(run)), dropped)
+        short = evolve(run, **{q: values[keep] for q, values in run.columns().items()})
+        (found,) = [f for f in check([short]) if f.column == "time"]
+        assert found.severity == severity
+        assert f"{len(drops)} gaps in time" in found.what
+        assert f"sample interval of {run.sample_time:.4g} s" in found.what
+
+
+def test_time_stamps_rounded_to_a_coarse_clock_are_no_gaps():
+    run = good_run(1, "prbs")
+    coarse = evolve(run, time=1e-3 * np.floor(1.4 * np.arange(len(run))))
+    (found,) = [f for f in check([coarse]) if f.column == "time"]
+    assert "jitter by" in found.what and "sample interval of 0.0014 s" in found.what
+
+
 def clipped(run, quantity, share):
     values = getattr(run, quantity)
     limit = np.min(values) + share * np.ptp(values)

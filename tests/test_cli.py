@@ -50,15 +50,18 @@ def faked(monkeypatch, tmp_path, no_terminal):
         calls.read.append((str(path), columns))
         return Path(path).stem
 
+    def read_recordings(paths, mappings):
+        return [read_recording(path, mappings) for path in paths]
+
     def save_motor(path, motor, identification):
         calls.saved.append(path)
         Path(path).write_text("{}")
 
     replace_function(monkeypatch, "pmdc_jax.identify", "identify", identify)
     replace_function(monkeypatch, "pmdc_jax.diagnose", "diagnose", diagnose)
-    replace_function(
-        monkeypatch, "pmdc_jax.recordings.recording_file", "read_recording", read_recording
-    )
+    for function in (read_recording, read_recordings):
+        module = "pmdc_jax.recordings.recording_file"
+        replace_function(monkeypatch, module, function.__name__, function)
     replace_function(monkeypatch, "pmdc_jax.motor_file", "save_motor", save_motor)
     monkeypatch.chdir(tmp_path)
     return calls
@@ -128,7 +131,7 @@ def test_identify_passes_on_every_option(faked, capsys):
         "search": "genetic",
         "seed": 7,
     }
-    assert faked.read[0] == ("a.csv", {"speed": "rpm_meas:rpm"})
+    assert faked.read[0] == ("a.csv", [("speed", "rpm_meas:rpm")])
 
 
 def test_identify_prints_parameters_and_runs(faked, capsys):
@@ -184,7 +187,7 @@ def test_diagnose_passes_on_every_option(faked, capsys):
         "search": "genetic",
         "seed": 7,
     }
-    assert faked.read[0] == ("a.csv", {"speed": "rpm_meas:rpm"})
+    assert faked.read[0] == ("a.csv", [("speed", "rpm_meas:rpm")])
     out, err = capsys.readouterr()
     assert "Missing: Stribeck friction" in out
     assert err == ""

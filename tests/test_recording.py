@@ -20,7 +20,13 @@ from scipy.io import savemat
 from pmdc_jax.errors import InputError
 from pmdc_jax.recordings.columns import understand
 from pmdc_jax.recordings.recording import Recording
-from pmdc_jax.recordings.recording_file import read_recording, recordings_of, write_recording
+from pmdc_jax.recordings.recording_file import (
+    named_apart,
+    read_recording,
+    read_recordings,
+    recordings_of,
+    write_recording,
+)
 
 T = np.arange(12) * 0.01
 NUMBER = {"allow_nan": False, "allow_infinity": False, "width": 64}
@@ -42,7 +48,10 @@ def read_text(folder, text, columns=None, name="run.csv", encoding="utf-8"):
 @st.composite
 def recordings(draw):
     count = draw(st.integers(10, 40))
-    steps = draw(arrays(float, count, elements=st.floats(1e-6, 1e3, **NUMBER)))
+    # less alike, they would have a gap too long for an even clock
+    steps = draw(st.floats(1e-6, 1e3)) * draw(
+        arrays(float, count, elements=st.floats(0.5, 10.0, **NUMBER))
+    )
     start = draw(st.floats(-1e3, 1e3, **NUMBER))
     channel = arrays(float, count, elements=st.floats(-1e12, 1e12, **NUMBER))
     optional = ("current", "load", "angle", "temperature", "torque")
@@ -67,6 +76,7 @@ def test_written_recordings_are_read_back_exactly(recording, suffix):
 
 
 RPM, DEGREE = np.pi / 30, np.pi / 180
+LB_IN = 0.45359237 * 9.80665 * 0.0254  # N m
 UNDERSTOOD = [
     ("Speed [rpm]", "speed", RPM),
     ("SPEED (RPM)", "speed", RPM),
@@ -102,6 +112,18 @@ UNDERSTOOD = [
     ("Lastmoment [mNm]", "load", 1e-3),
     ("load_torque [N·m]", "load", 1),
     ("torque [Ncm]", "torque", 1e-2),
+    ("load [oz-in]", "load", LB_IN / 16),
+    ("load [ozf-in]", "load", LB_IN / 16),
+    ("load_oz.in", "load", LB_IN / 16),
+    ("torque (lb-in)", "torque", LB_IN),
+    ("torque [lbf·ft]", "torque", 12 * LB_IN),
+    ("torque [ft-lbs]", "torque", 12 * LB_IN),
+    ("torque [kgf·cm]", "torque", 9.80665e-2),
+    ("torque [kg-cm]", "torque", 9.80665e-2),
+    ("load torque Kgcm", "load", 9.80665e-2),
+    ("load [gcm]", "load", 9.80665e-5),
+    ("speed [r.p.m.]", "speed", RPM),
+    ("speed [r/s]", "speed", 2 * np.pi),
     ("T [°C]", "temperature", 1),
 ]
 
@@ -121,6 +143,9 @@ def test_headers_are_understood(header, quantity, scale):
         "i",
         "n",
         "T [Nm]",
+        "M [gm]",
+        "n [1/s]",
+        "n [Hz]",
         "Drehzahl",
         "speed_ref",
         "speed_max",
@@ -153,7 +178,7 @@ def test_units_are_understood_in_every_notation(pattern, name, unit):
 
 
 def test_a_torque_column_of_unknown_name_is_noted(tmp_path):
-    run = read_text(tmp_path, table("time_s,voltage_V,n_rpm,M_Nm,flag_N", T, T, T, T, T))
+    run = read_text(tmp_path, table("time_s,voltage_V,n_rpm,i_A,M_Nm,flag_N", T, T, T, T, T, T))
     (note,) = run.notes
     assert note.column == "M_Nm" and "looks like load" in note.what
 
@@ -191,7 +216,7 @@ def test_columns_are_converted_to_si_and_others_are_listed_as_ignored(tmp_path):
     run = read_text(tmp_path, text)
     np.testing.assert_allclose(run.time, T, atol=1e-15)
     np.testing.assert_allclose(run.speed, 2 * np.pi + T * RPM)
-    assert run.current is None and run.ignored == ("flag",) and run.notes == ()
+    assert run.current is None and run.ignored == ("flag",)
     assert len(run) == 12 and run.sample_time == pytest.approx(0.01)
     assert run.duration == pytest.approx(0.11)
 
@@ -212,7 +237,7 @@ def test_a_second_line_may_hold_the_units(tmp_path, units):
     np.testing.assert_allclose(run.time, T, atol=1e-15)
     np.testing.assert_allclose(run.voltage, T)
     np.testing.assert_allclose(run.speed, 2 * np.pi + T * RPM)
-    assert run.notes == ()
+    assert not any("assumed" in note.what for note in run.notes)
 
 
 @pytest.mark.parametrize(
@@ -235,12 +260,61 @@ def test_dates_become_seconds_since_the_first(tmp_path, form):
         lines = [f"{s.strftime(form)},{x},{x}" for s, x in zip(stamps, T, strict=True)]
         run = read_text(tmp_path, "\n".join(["time,voltage_V,speed_rpm", *lines]))
     np.testing.assert_allclose(run.time, T, atol=1e-9)
+    assert run.notes == ()
+
+
+@pytest.mark.parametrize(
+    "header", ["timestamp", "datetime", "Date/Time", "Date", "time_ms", "Zeit [µs]"]
+)
+def test_dates_are_the_time_in_seconds_whatever_their_header_says(tmp_path, header):
+    lines = [f"2026-03-01T12:00:00.{k:02},{k},{k}" for k in range(12)]
+    run = read_text(tmp_path, "\n".join([f"{header},voltage_V,speed_rpm", *lines]))
+    np.testing.assert_allclose(run.time, T, atol=1e-9)
+    assert run.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("form", "day"),
+    [("%m/%d/%Y", 27), ("%d/%m/%Y", 27), ("%d-%m-%Y", 27), ("%m/%d/%Y", 2), ("%d-%m-%Y", 2)],
+)
+def test_days_and_months_are_told_apart_where_they_can_be_or_need_not_be(tmp_path, form, day):
+    """From the 27th to the 28th; within the 2nd."""
+    seconds = (59.95 if day > 12 else 0) + T
+    stamps = [datetime(2026, 3, day, 23, 59) + timedelta(seconds=t) for t in seconds]
+    lines = [f"{s.strftime(form + ' %H:%M:%S.%f')},0,{t}" for s, t in zip(stamps, T, strict=True)]
+    run = read_text(tmp_path, "\n".join(["time,voltage_V,speed_rpm", *lines]))
+    np.testing.assert_allclose(run.time, T, atol=1e-9)
 
 
 def test_an_unused_column_that_resembles_a_quantity_is_noted(tmp_path):
     run = read_text(tmp_path, table("time_s,voltage_V,current_A,speed_kg", T, T, T, T))
     (note,) = run.notes
     assert note.column == "speed_kg" and "looks like speed" in note.what
+
+
+@pytest.mark.parametrize(
+    ("headers", "missing"),
+    [
+        ("time_s,voltage_V,current_A,n,flag", "speed=n:UNIT"),
+        ("time_s,voltage_V,c urent,speed_rpm,flag", "'current=c urent:UNIT'"),
+        ("time_s,i_A,Ch1,omega_mot,flag", "voltage=Ch1:UNIT"),
+        ("time_s,i_A,voltage_V,angle_rad,flag", None),
+        ("time_s,i_A,voltage_V,speed_rpm,flag", None),
+    ],
+)
+def test_columns_that_are_not_understood_are_noted_once_where_a_quantity_is_missing(
+    tmp_path, headers, missing
+):
+    run = read_text(tmp_path, table(headers, T, T, T, T, T))
+    found = [note for note in run.notes if "not understood" in note.what]
+    assert len(found) == (missing is not None)
+    for note in found:
+        assert note.what.endswith(", flag") and f"--column {missing}" in note.mend
+
+
+def test_a_suggested_mapping_can_be_pasted_into_a_shell(tmp_path):
+    with pytest.raises(InputError, match=r"--column 'speed=Speed \[rpm\]'"):
+        read_text(tmp_path, table("time_s,voltage_V,speed_rad_s,Speed [rpm]", T, T, T, T))
 
 
 def test_linear_and_rotary_units_together_give_a_warning(tmp_path):
@@ -257,12 +331,28 @@ def test_linear_and_rotary_units_together_give_a_warning(tmp_path):
         ({"speed": "w:a [rpm]"}, RPM),
         ({"speed": "w:a [rpm]:deg/s"}, DEGREE),
         ({"speed": "enc_rpm"}, RPM),
+        ({"speed": "rpm_meas:-rpm"}, -RPM),
+        ({"speed": "rpm_meas:-1*rpm/10"}, -RPM / 10),
+        ({"speed": "enc_rpm:-"}, -RPM),
     ],
 )
 def test_columns_are_mapped_by_hand(tmp_path, mapping, scale):
     text = table("time_s,voltage_V,rpm_meas,w:a [rpm],enc_rpm", T, T, T, T, T)
     run = read_text(tmp_path, text, mapping)
     np.testing.assert_allclose(run.speed, T * scale)
+
+
+def test_files_of_several_loggers_are_mapped_each_by_its_headers(tmp_path):
+    paths = [tmp_path / name for name in ("a.csv", "b.csv", "c.csv")]
+    for path, speed in zip(paths, ("n1", "n2 [rad/s]", "speed_rad_s"), strict=True):
+        path.write_text(table(f"time_s,voltage_V,{speed}", T, T, T))
+    runs = read_recordings(paths, [("speed", "n1:rpm"), ("speed", "n2")])
+    for run, scale in zip(runs, (RPM, 1, 1), strict=True):
+        np.testing.assert_allclose(run.speed, T * scale)
+    with pytest.raises(InputError, match=r"speed=n3:rpm: no column 'n3' in .*a\.csv, .*b\.csv.*n1"):
+        read_recordings(paths[:2], [("speed", "n3:rpm")])
+    with pytest.raises(InputError, match=r"a\.csv, --column speed=n1:rpm: voltage_V is mapped"):
+        read_recordings(paths[:1], [("speed", "voltage_V"), ("speed", "n1:rpm")])
 
 
 def test_mapped_columns_take_precedence_over_understood_headers(tmp_path):
@@ -282,8 +372,15 @@ def test_dialects_of_csv_are_read(tmp_path, separator, end):
     lines.insert(6, "# pause")
     lines.insert(9, "")
     text = end.join([*lines, "", ""])
-    run = read_text(tmp_path, text)
-    np.testing.assert_array_equal(run.speed, T)
+    for footer in ("", "# end of file", f"# end,{end}# of file{end}{end}"):
+        np.testing.assert_array_equal(read_text(tmp_path, text + footer).speed, T)
+
+
+def test_a_comment_after_many_rows_is_skipped(tmp_path):
+    """Of so many that polars reads them in pieces."""
+    t = np.arange(3000) * 1e-3
+    run = read_text(tmp_path, table("time_s,voltage_V,speed_rad_s", t, t, t) + "# end of file")
+    np.testing.assert_array_equal(run.speed, t)
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
@@ -317,6 +414,20 @@ def test_missing_outputs_are_nan(tmp_path, cell):
     assert run.current is not None and run.speed is not None
     assert np.flatnonzero(np.isnan(run.current)).tolist() == [3]
     assert np.flatnonzero(np.isnan(run.speed)).tolist() == [3]
+
+
+def test_runs_of_files_of_the_same_name_are_named_after_their_paths(tmp_path):
+    paths = [tmp_path / name for name in ("a/x/run.csv", "b/x/run.csv", "c.csv", "c.txt", "d.csv")]
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(table("time_s,voltage_V,speed", T, T, T))
+    runs = named_apart(recordings_of(paths))
+    names = [run.name for run in runs]
+    assert names == ["a/x/run.csv", "b/x/run.csv", "c.csv", "c.txt", "d"]
+    assert [note.run for run in runs for note in run.notes] == names
+    again = tmp_path / "a" / ".." / "d.csv"
+    with pytest.raises(InputError, match=r"d\.csv: this file is listed twice"):
+        named_apart(recordings_of([*paths, again]))
 
 
 def test_an_empty_column_counts_as_absent(tmp_path):

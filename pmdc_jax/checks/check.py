@@ -21,6 +21,7 @@ from .plausibility import (
 )
 
 MAX_JITTER = 0.02  # of a step, root mean square
+MISSING_ROW = 1.5  # longer steps, in typical ones of an even clock, lack a row
 MAX_MISSING_AS_NOTE = 0.05  # share of missing samples beyond which they are worth a warning
 MAX_JUMP = 0.2  # from sample to sample, of the range of a current that drives
 
@@ -44,17 +45,18 @@ def check(recordings: Sequence[Recording]) -> tuple[Finding, ...]:
 
 
 def gaps(run: Recording) -> Iterator[Finding]:
-    """Steps of time much longer than the others."""
-    steps = np.diff(run.time)
-    rows = np.flatnonzero(steps > GAP * np.median(steps))
+    """Steps of time much longer than the others, or of several samples where the clock is otherwise even."""
+    steps, typical = np.diff(run.time), run.sample_time
+    _, deviation = _clock(run)
+    rows = np.flatnonzero(steps > (MISSING_ROW if deviation <= MAX_JITTER else GAP) * typical)
     if len(rows):
         longest = rows[np.argmax(steps[rows])]
         yield Finding(
             run.name,
             "time",
-            "warning",
+            "warning" if steps[longest] > GAP * typical else "note",
             f"{_count(len(rows), 'gap')} in time, the longest {steps[longest]:.4g} s "
-            f"against a sample interval of {np.median(steps):.4g} s",
+            f"against a sample interval of {typical:.4g} s",
             place_of_sample(run, int(longest)),
             "The voltage is assumed constant during a gap. If it was not, split the run at its gaps",
         )
@@ -62,24 +64,32 @@ def gaps(run: Recording) -> Iterator[Finding]:
 
 def jitter(run: Recording) -> Iterator[Finding]:
     """Time stamps that scatter about a uniform grid."""
-    steps = np.diff(run.time)
-    steps = steps[steps <= GAP * np.median(steps)]
-    # scatter from step to step, not of the stamps, so that a slowly drifting clock is no jitter
-    scatter = steps / np.mean(steps) - 1
-    deviation = float(np.sqrt(np.mean(scatter**2) / 2))
+    interval, deviation = _clock(run)
     if deviation > MAX_JITTER:
         samples = "the stamps are used as the sampling times"
         if is_evenly_sampled(run):
             samples = "the signals were sampled evenly, so an even time grid is used"
-        worst = int(np.argmax(np.abs(np.diff(run.time) - np.mean(steps))))
+        worst = int(np.argmax(np.abs(np.diff(run.time) - interval)))
         yield Finding(
             run.name,
             "time",
             "note",
-            f"time stamps jitter by {deviation:.1%} of the sample interval of {np.mean(steps):.4g} s; {samples}",
+            f"time stamps jitter by {deviation:.1%} of the sample interval of {interval:.4g} s; {samples}",
             f"worst near {place_of_sample(run, worst)}",
             "If the stamps are not the sampling times, export the time of the sampling clock",
         )
+
+
+def _clock(run: Recording) -> tuple[float, float]:
+    """The sample interval, s, and the jitter, in intervals: the root mean square scatter of the time stamps."""
+    steps = np.diff(run.time)
+    steps = steps[steps <= GAP * run.sample_time]
+    samples = np.ones(len(steps))
+    if not is_evenly_sampled(run):  # else a step of two samples only has stamps rounded so
+        samples = np.maximum(np.rint(steps / run.sample_time), 1.0)
+    interval = np.sum(steps) / np.sum(samples)
+    # scatter from step to step, not of the stamps, so that a slowly drifting clock is no jitter
+    return float(interval), float(np.sqrt(np.mean((steps / interval - samples) ** 2) / 2))
 
 
 def missing_samples(run: Recording) -> Iterator[Finding]:

@@ -58,7 +58,7 @@ class Term(NamedTuple):
 def reversed_signs(run: Recording) -> Iterator[Finding]:
     """Channels wired or defined the other way round."""
     for column, what in _reversed_channels(run):
-        mend = f"Reverse the sign of the {column} column, or swap its wires"
+        mend = f"Reverse the sign of the {column} column (--column {column}=HEADER:-UNIT), or swap its wires"
         yield Finding(run.name, column, "warning", what, "whole run", mend)
 
 
@@ -161,7 +161,10 @@ def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
         return
     if Kt.negative:
         what = "the load rises where the current falls: its sign is reversed"
-        mend = "A load that opposes positive motion is positive: reverse the sign of the column"
+        mend = (
+            "A load that opposes positive motion is positive: reverse the sign of the column"
+            " (--column load=HEADER:-UNIT)"
+        )
         yield Finding(names, "load", "warning", what, "all loaded runs", mend)
     if not Kt.positive:
         return

@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..motor import PARAMETERS
 from ..recordings.clock import evenly_stamped
 from ..recordings.recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
-from ..recordings.recording_file import Runs, recordings_of
+from ..recordings.recording_file import Runs, named_apart, recordings_of
 from ..simulate import HELD, Tape, Timing, uniform
 from .identification import Role
 from .noise.sensor_noise import white_noise
@@ -93,7 +93,7 @@ def prepare(
 ) -> Prepared:
     """Check the recordings and lay them out; raises `InputError` where they cannot give an answer."""
     recordings, holdout = recordings_of(recordings), recordings_of(holdout)
-    cleaned = without_unmeasured([*recordings, *holdout])
+    cleaned = without_unmeasured(named_apart([*recordings, *holdout]))
     recordings, holdout = cleaned[: len(recordings)], cleaned[len(recordings) :]
     _check_arguments(recordings, holdout, tie, known)
     findings = check([*recordings, *holdout])
@@ -149,10 +149,6 @@ def _check_arguments(
             raise InputError(
                 run.source or run.name, what, f"Needed besides time: {NEEDED_TO_IDENTIFY}"
             )
-    names = [r.name for r in (*recordings, *holdout)]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(name, "two runs have this name", "Rename one, or list it only once")
     check_names("--tie", [name for pair in tie for name in pair])
     check_names("--known", list(known or {}))
     targets = [target for target, _ in tie]

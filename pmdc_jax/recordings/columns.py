@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from shlex import quote
 
 from attrs import evolve, frozen
 
@@ -98,6 +99,8 @@ MOTOR_SYMBOLS = {
 }
 # Quantities recognised by their unit alone, if only one column has it; not torques, which may be load or motor torque
 TOLD_BY_UNIT = ("time", "voltage", "current", "speed", "angle")
+# Names of columns that are the time if they hold dates with times; numbers need a unit
+DATED = ("timestamp", "time_stamp", "datetime", "date_time", "date", "datum")
 # Words in the names of columns that hold set points, limits or supplies rather than a measurement of the motor
 NOT_MEASURED = re.compile(
     r"(?i)(?<![a-z])(ref|set|soll|cmd|command|target|demand|desired|limit|max|min|supply|bat)"
@@ -126,8 +129,8 @@ def match_columns(
 ) -> dict[str, Column]:
     """Which header holds which quantity.
 
-    **Arguments**: `headers` of the file; `columns`, the mapping of the user from quantity to "header[:unit]", which
-    takes precedence; `where`, the file, for messages.
+    **Arguments**: `headers` of the file; `columns`, the mapping of the user from quantity to "header[:[-]unit]", which
+    takes precedence, and where a minus reverses the sign; `where`, the file, for messages.
 
     **Returns**: the columns by quantity.
 
@@ -229,6 +232,16 @@ def likely_quantity(header: str) -> str | None:
     return "load" if any(_is_unit_of(unit, "load", torque) for _, unit in readings) else None
 
 
+def may_be_dates(header: str) -> bool:
+    """Whether a header is that of a column of dates with times."""
+    return _normalised(header) in DATED
+
+
+def column_option(quantity: str, header: str, unit: str = "") -> str:
+    """The option that maps a header, to be pasted into a shell."""
+    return f"--column {quote(f'{quantity}={header}' + (unit and f':{unit}'))}"
+
+
 def mixed_axes(matched: Mapping[str, Column]) -> tuple[Column, Column] | None:
     """A column in units of a shaft (rad, N m) and one in those of a linear axis (m, N); None without both."""
     sorts: dict[bool, Column] = {}
@@ -244,24 +257,32 @@ def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column
     quantity = "load" if name == "load_torque" else name
     if quantity not in QUANTITIES:
         raise InputError(option, f"unknown quantity '{name}'", f"Known: {', '.join(QUANTITIES)}")
-    header, unit = spec, None
+    header, unit = header_and_unit(spec, headers)
+    if header not in headers:
+        listed = ", ".join(headers[:20]) or "none"
+        raise InputError(option, f"the file has no column '{header}'", f"Its columns are: {listed}")
+    sign, unit = -1.0 if unit.startswith("-") else 1.0, unit.removeprefix("-")
+    try:
+        column = _column(header, quantity, unit or _unit_in_header(header, quantity))
+        return evolve(column, scale=sign * column.scale)
+    except UnitError as error:
+        mend = f"Write for example {column_option(name, header, QUANTITIES[quantity].units[0])}"
+        if quantity == "angle":
+            mend += f", or {column_option(name, header, 'rev/2000')} for 2000 counts per turn"
+        raise InputError(option, str(error), mend) from None
+
+
+def header_and_unit(spec: str, headers: Sequence[str]) -> tuple[str, str]:
+    """The header, which may be none of these, and the unit, if any, of the mapping "header[:[-]unit]"."""
+    header, unit = spec, ""
     if spec not in headers:
         header, _, unit = (part.strip() for part in spec.rpartition(":"))
-        header, unit = (header, unit) if header else (spec.strip(), None)
+        header, unit = (header, unit) if header else (spec.strip(), "")
     # `header` may lack the unit that was read from the line below the names
     named = [h for h in headers if h.rpartition(" [")[0] == header]
     if header not in headers and len(named) == 1:
         (header,) = named
-    if header not in headers:
-        listed = ", ".join(headers[:20]) or "none"
-        raise InputError(option, f"the file has no column '{header}'", f"Its columns are: {listed}")
-    try:
-        return _column(header, quantity, unit or _unit_in_header(header, quantity))
-    except UnitError as error:
-        example = f"--column {name}={header}:{QUANTITIES[quantity].units[0]}"
-        counts = f", or {name}={header}:rev/2000 for 2000 counts per turn"
-        mend = f"Write for example {example}{counts if quantity == 'angle' else ''}"
-        raise InputError(option, str(error), mend) from None
+    return header, unit
 
 
 def _unit_in_header(header: str, quantity: str) -> str | None:
@@ -319,5 +340,5 @@ def _ambiguous_headers(first: Column, second: Column, where: str) -> InputError:
     return InputError(
         f"{where}, columns {first.header} and {second.header}",
         f"both mean {first.quantity}",
-        f"Choose one, for example with --column {first.quantity}={second.header}",
+        f"Choose one, for example with {column_option(first.quantity, second.header)}",
     )

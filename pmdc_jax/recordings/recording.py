@@ -18,6 +18,9 @@ Samples = Float[np.ndarray, " samples"]
 
 MIN_SAMPLES = 10
 MAX_MISSING = 0.2  # share of an output's samples that may be missing
+# Most sample intervals that a run may last, per sample: an even clock ticks through the gaps, too, and its ticks must
+# fit into memory
+MAX_INTERVALS_PER_SAMPLE = 20
 OUTPUTS = ("speed", "angle", "current")
 # Columns needed besides time: to simulate, and to identify
 NEEDED_TO_SIMULATE = "voltage, current or torque"
@@ -236,6 +239,7 @@ def _faults_of_values(
 def _faults_of_time(time: np.ndarray) -> Iterator[Fault]:
     steps = np.diff(time)
     if (steps > 0).all():
+        yield from _long_gaps(steps)
         return
     row = int(np.argmax(~(steps > 0))) + 1
     before, now = (f"{value:.9g}" for value in time[row - 1 : row + 1])
@@ -247,6 +251,18 @@ def _faults_of_time(time: np.ndarray) -> Iterator[Fault]:
         what = f"the time stamp {now} s is repeated" + (f", as are {others} more" if others else "")
         mend = "Export time with more digits, or delete repeated lines"
     yield Fault("time", row, what, mend)
+
+
+def _long_gaps(steps: np.ndarray) -> Iterator[Fault]:
+    typical, longest = np.median(steps), int(np.argmax(steps))
+    limit = MAX_INTERVALS_PER_SAMPLE * (len(steps) + 1)
+    if np.sum(steps) > limit * typical:
+        what = (
+            f"a gap of {steps[longest]:.4g} s in time before it, where most steps are {typical:.4g} s: on an even"
+            f" clock the run would have more than {limit} samples"
+        )
+        mend = "Correct the time stamp, or split the run at its gaps"
+        yield Fault("time", longest + 1, what, mend)
 
 
 def jumps_of(

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from attrs import evolve
 
 from ..errors import InputError
 from ..files import replacing
-from .columns import QUANTITIES, Column, likely_quantity, match_columns, mixed_axes
+from .columns import (
+    QUANTITIES,
+    Column,
+    column_option,
+    header_and_unit,
+    likely_quantity,
+    match_columns,
+    may_be_dates,
+    mixed_axes,
+)
 from .recording import (
     NEEDED_TO_IDENTIFY,
     NEEDED_TO_SIMULATE,
@@ -22,7 +33,7 @@ from .recording import (
     is_driven,
     is_identifiable_from,
 )
-from .tables import Table, open_table
+from .tables import NUMBERS_ONLY, Table, open_table
 
 # one run or several, each a recording or the path of its file
 Run = Recording | str | os.PathLike[str]
@@ -37,7 +48,8 @@ def read_recording(
     """Read one run from a CSV, Parquet or MAT file.
 
     **Arguments**: `path`; `columns`, for headers that are not understood by themselves: a mapping from quantity (time,
-    voltage, current, speed, load, angle, temperature, torque) to "header" or "header:unit"; `to_simulate`, whether the
+    voltage, current, speed, load, angle, temperature, torque) to "header" or "header:unit", as "header:-unit" with the
+    sign reversed; `to_simulate`, whether the
     inputs of a simulation suffice, so that no output need be recorded.
 
     **Returns**: the run in SI, named after the file.
@@ -45,15 +57,56 @@ def read_recording(
     **Raises**: `InputError` that names the file, the line or column, the fault and its remedy.
     """
     path = Path(path)
-    table = open_table(path)
+    return _read(open_table(path), path, columns, to_simulate)
+
+
+def read_recordings(
+    paths: Sequence[Path], mappings: Sequence[tuple[str, str]] = ()
+) -> list[Recording]:
+    """Read runs, which may be of several loggers.
+
+    **Arguments**: `paths`; `mappings` from quantity to "header" or "header:unit", each for the files with that header.
+
+    **Raises**: `InputError` as `read_recording` does, and if no file has the header of a mapping, or one has those of
+    two mappings of one quantity.
+    """
+    tables = {path: open_table(path) for path in paths}
+    columns: dict[Path, dict[str, str]] = {path: {} for path in paths}
+    for quantity, spec in mappings:
+        having = [p for p, table in tables.items() if _has(table, spec)]
+        if not having:
+            header, _ = header_and_unit(spec, ())
+            what = f"no column '{header}' in {', '.join(map(str, tables))}"
+            headers = dict.fromkeys(h for table in tables.values() for h in table.headers if h)
+            mend = f"Columns there are: {', '.join([*headers][:20])}"
+            raise InputError(f"--column {quantity}={spec}", what, mend)
+        for path in having:
+            if columns[path].setdefault(quantity, spec) != spec:
+                what = f"{columns[path][quantity]} is mapped to {quantity}, too"
+                mend = "Map one column of a file to each quantity"
+                raise InputError(f"{path}, --column {quantity}={spec}", what, mend)
+    return [_read(tables[path], path, columns[path]) for path in paths]
+
+
+def _has(table: Table, spec: str) -> bool:
+    return header_and_unit(spec, table.headers)[0] in table.headers
+
+
+def _read(
+    table: Table, path: Path, columns: Mapping[str, str] | None, to_simulate: bool = False
+) -> Recording:
     matched = match_columns(table.headers, columns, str(path))
+    if "time" not in matched:
+        matched = _time_of_dates(table) | matched
     _refuse_too_little(matched, table, str(path), to_simulate)
     numbers = table.read([column.header for column in matched.values()])
+    matched = _with_dates_in_seconds(matched, table, str(path))
     values = {q: numbers[column.header] for q, column in matched.items()}
     values = {q: _to_si(column, values[q]) for q, column in matched.items()}
     empty = [q for q, v in values.items() if q != "time" and len(v) and np.isnan(v).all()]
     present: dict[str, Any] = {q: v for q, v in values.items() if q not in empty}
-    _refuse_too_little(present, table, str(path), to_simulate)
+    nothing_in = [matched[quantity].header for quantity in empty]
+    _refuse_too_little(present, table, str(path), to_simulate, nothing_in)
     for fault in faults(present):
         raise _in_file(fault, matched, table, str(path))
     used = {column.header for column in matched.values()}
@@ -78,6 +131,35 @@ def recordings_of(runs: Runs, to_simulate: bool = False) -> list[Recording]:
     ]
 
 
+def named_apart(recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings, those with the same name renamed after as much of the paths of their files as tells them apart.
+
+    **Raises**: `InputError` if a file is listed twice, or if recordings without files have the same name.
+    """
+    count = Counter(run.name for run in recordings)
+    paths: list[Path] = []
+    for run in recordings:
+        if count[run.name] == 1:
+            continue
+        if run.source is None:
+            what, mend = "two runs have this name", "Rename one, or list it only once"
+            raise InputError(run.name, what, mend)
+        path = Path(run.source).resolve()
+        if path in paths:
+            raise InputError(run.source, "this file is listed twice", "List it only once")
+        paths.append(path)
+    return [run if count[run.name] == 1 else _named_after_path(run, paths) for run in recordings]
+
+
+def _named_after_path(run: Recording, paths: Sequence[Path]) -> Recording:
+    """The run, named after the fewest last parts of the path of its file that no other path ends with."""
+    parts = Path(run.source or "").resolve().parts
+    ends = (parts[-count:] for count in range(1, len(parts) + 1))
+    own = next(end for end in ends if sum(path.parts[-len(end) :] == end for path in paths) == 1)
+    name = "/".join(own)
+    return evolve(run, name=name, notes=tuple(evolve(note, run=name) for note in run.notes))
+
+
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Write a run as CSV or Parquet, by suffix, with canonical headers and in full precision.
 
@@ -98,8 +180,35 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
         frame.write_csv(file) if suffix == ".csv" else frame.write_parquet(file)
 
 
+def _time_of_dates(table: Table) -> dict[str, Column]:
+    """The time, if a column has the name and the cells of dates with times."""
+    for header in filter(may_be_dates, table.headers):
+        table.read([header])
+        if header in table.dates:
+            return {"time": Column(header, "time", "s", "s")}
+    return {}
+
+
+def _with_dates_in_seconds(
+    matched: Mapping[str, Column], table: Table, where: str
+) -> dict[str, Column]:
+    """The columns; a time that was read from dates is in seconds, whatever its header says."""
+    for quantity, column in matched.items():
+        if column.header in table.dates and quantity != "time":
+            what = "it contains dates or times of the day, not numbers"
+            raise InputError(f"{where}, column {column.header}", what, NUMBERS_ONLY)
+    return {
+        quantity: evolve(column, unit="s", scale=1.0) if column.header in table.dates else column
+        for quantity, column in matched.items()
+    }
+
+
 def _refuse_too_little(
-    matched: Mapping[str, object], table: Table, where: str, to_simulate: bool
+    matched: Mapping[str, object],
+    table: Table,
+    where: str,
+    to_simulate: bool,
+    empty: Sequence[str] = (),
 ) -> None:
     headers = ", ".join(filter(None, table.headers[:20])) or "none"
     content = f"columns in the file: {headers}"
@@ -114,14 +223,17 @@ def _refuse_too_little(
         what, needed, lacking = (
             "too few columns to identify a motor, only",
             NEEDED_TO_IDENTIFY,
-            "speed",
+            "voltage" if "speed" in matched else "speed",
         )
     else:
         return
+    what = f"{what} {', '.join(matched)}"
+    if empty:
+        what += f"; nothing is in {', '.join(empty)}"
     mend = (
         f"Needed besides time: {needed}. Map columns with --column {lacking}=HEADER:UNIT; {content}"
     )
-    raise InputError(where, f"{what} {', '.join(matched)}", mend)
+    raise InputError(where, what, mend)
 
 
 def _to_si(column: Column, values: np.ndarray) -> np.ndarray:
@@ -143,8 +255,13 @@ def _notes(
     run: str, headers: tuple[str, ...], matched: Mapping[str, Column], empty: list[str]
 ) -> Iterator[Finding]:
     def note(column: str, what: str, mend: str) -> Finding:
-        return Finding(run, column, "note", what, "header", mend)
+        return Finding(run, column, "note", what, "", mend)
 
+    used = {column.header for column in matched.values()}
+    # a position of the shaft stands in for its speed
+    lacking = [q for q in ("voltage", "current", "speed") if q not in matched]
+    if "angle" in matched and "speed" in lacking:
+        lacking.remove("speed")
     for quantity, column in matched.items():
         if quantity in empty:
             yield note(column.header, "the column is empty", "It is ignored")
@@ -158,9 +275,17 @@ def _notes(
         shaft, axis = mixed
         what = f"{shaft.base} is a unit of a rotating shaft, but the {axis.base} of {axis.header} is not"
         mend = "Give all columns in shaft units (rad, N m) or all in linear-axis units (m, N)"
-        yield Finding(run, shaft.header, "warning", what, "header", mend)
+        yield Finding(run, shaft.header, "warning", what, "", mend)
+    not_understood: list[str] = []
     for header in headers:
         quantity = likely_quantity(header)
         if quantity and quantity not in matched:
             what = f"not used, although it looks like {quantity}"
-            yield note(header, what, f"Map it with --column {quantity}={header}:UNIT")
+            yield note(header, what, f"Map it with {column_option(quantity, header, 'UNIT')}")
+        elif header and header not in used:
+            not_understood.append(header)
+    if not_understood and lacking:
+        what = f"not understood, and not used: {', '.join(not_understood[:20])}"
+        example = column_option(lacking[0], not_understood[0], "UNIT")
+        mend = f"If this includes the {' or the '.join(lacking)}, map it, as in {example}"
+        yield Finding(run, None, "note", what, "", mend)

@@ -30,7 +30,12 @@ degree_Celsius = kelvin; offset: 273.15 = degC = degreeC = celsius = C
 degree_Fahrenheit = 5 / 9 * kelvin; offset: 233.15 + 200 / 9 = degF = degreeF = fahrenheit
 newton = kilogram * meter / second ** 2 = N
 newton_meter = newton * meter = Nm
-newton_centimeter = 0.01 * newton_meter = Ncm
+newton_centimeter = 0.01 * newton_meter = Ncm = cNm
+inch = 0.0254 * meter
+foot = 12 * inch
+gram_force = 9.80665e-3 * newton = gf
+pound_force = 453.59237 * gram_force = lbf
+ounce_force = pound_force / 16 = ozf
 volt = newton * meter / ampere / second = V
 radian = [angle] = rad
 degree = 0.017453292519943295 * radian = deg
@@ -38,8 +43,17 @@ turn = 6.283185307179586 * radian = rev = revolution
 rpm = turn / minute
 rps = turn / second
 """
-# Further spellings of rpm, most of which omit the turn
-RPM = {"1/min", "min^-1", "min-1", "min⁻¹", "/min", "u/min", "upm", "r/min"}
+# Further spellings of rpm, most of which omit the turn, and of turns per second; 1/s and Hz may mean rad/s, too
+RPM = ("1/min", "min^-1", "min-1", "min⁻¹", "/min", "u/min", "upm", "r/min", "r.p.m.", "r.p.m")
+TURNS: dict[str, str] = {**dict.fromkeys(RPM, "rpm"), "r/s": "rps", "u/s": "rps"}
+# Torques as weights by lengths, such as oz-in and kgf.cm, and the other way round, as in ft-lb
+WEIGHT, LENGTH = r"(?P<weight>oz|lb|kg|g)f?s?", r"(?P<length>in|ft|cm)"
+WEIGHT_BY_LENGTH = tuple(
+    re.compile(rf"{one}[\s_.·*\-]*{other}", re.I)
+    for one, other in ((WEIGHT, LENGTH), (LENGTH, WEIGHT))
+)
+# Between the factors of a unit, as in N_m; not the minus of a sign or an exponent
+SEPARATOR = r"(?<=\w)[_.\-](?=[^\W\d])"
 
 
 class UnitError(ValueError):
@@ -60,7 +74,8 @@ def conversion(unit: str, quantity: str, bases: Sequence[str]) -> tuple[str, flo
 
     **Raises**: `UnitError` if `unit` is unknown or converts to none of `bases`.
     """
-    if fraction := re.fullmatch(r"(.*\w)\s*/\s*(\d+(?:\.\d+)?)", unit):
+    fraction = re.fullmatch(r"(.*\w)\s*/\s*(\d+(?:\.\d+)?)", unit)
+    if fraction and float(fraction[2]):
         base, scale, offset = conversion(fraction[1], quantity, bases)
         return base, scale / float(fraction[2]), offset
     unknown = True
@@ -81,12 +96,16 @@ def conversion(unit: str, quantity: str, bases: Sequence[str]) -> tuple[str, flo
 def _spellings(unit: str) -> Iterator[str]:
     """The unit as written, then other readings: rad_s as rad/s, N_m as N m, RPM as rpm."""
     unit = unit.strip()
-    if unit.casefold() in RPM:
-        yield "rpm"
+    if unit.casefold() in TURNS:
+        yield TURNS[unit.casefold()]
+    for pattern in WEIGHT_BY_LENGTH:
+        if torque := pattern.fullmatch(unit):
+            length = torque["length"].lower().replace("in", "inch").replace("ft", "foot")
+            yield f"{torque['weight'].lower()}f * {length}"
     for text in dict.fromkeys((unit, unit.lower())):
         yield text
-        if re.search(r"[_.\-]", text):
-            yield re.sub(r"[_.\-]", " ", text)
+        if re.search(SEPARATOR, text):
+            yield re.sub(SEPARATOR, " ", text)
             yield text.replace("_", "/", 1)
 
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from ..errors import InputError
 from ..recordings.angle import unwrapped
 from ..recordings.clock import GAP, is_even
 from ..recordings.recording import OVER_LAST, Recording
 
-# More ticks of the even clock per recorded sample mean that the record has long gaps
-MAX_TICKS_PER_SAMPLE = 20
 # An even clock is good enough if this share of the samples has ticks of their own, relative to the best clock
 MIN_TICK_SHARE = 0.98
 
@@ -24,8 +21,6 @@ def uniform(recording: Recording) -> Recording:
     so that no volt-second is lost. Current and speed are interpolated linearly; inside gaps, and past the end, they are
     missing (NaN). The record is kept as `resampled_from`. A rotor that stands still throughout is taken as held,
     because its speed tells nothing.
-
-    **Raises**: `InputError` if gaps are so long that the grid has more than `MAX_TICKS_PER_SAMPLE` ticks per sample.
     """
     if recording.stands_still:
         recording = attrs.evolve(recording, speed=None, angle=None, held=True)
@@ -42,14 +37,6 @@ def uniform(recording: Recording) -> Recording:
     grid = _resampling_clock(time)
     driving = {"voltage": recording.voltage, "load": recording.load, "torque": recording.torque}
     simulated = {"current": recording.current, "speed": recording.speed}
-    if len(grid) > MAX_TICKS_PER_SAMPLE * len(time):
-        steps = np.diff(time)
-        longest = int(np.argmax(steps))
-        raise InputError(
-            f"{recording.source or recording.name}, sample {longest + 1}",
-            f"a gap of {steps[longest]:.4g} s in time, where most steps are {np.median(steps):.4g} s",
-            "Split the run at its gaps",
-        )
     return attrs.evolve(
         recording,
         time=grid,

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from ...errors import InputError
+from .cells import NUMBERS_ONLY as NUMBERS_ONLY
 from .csv import CsvTable
 from .mat import MatTable
 from .parquet import ParquetTable
@@ -16,9 +17,14 @@ from .parquet import ParquetTable
 
 @runtime_checkable
 class Table(Protocol):
-    """A file with named columns."""
+    """A file with named columns.
+
+    **Fields**: `headers`; `dates`, those of the columns read so far that hold dates with times, read as seconds since
+    the first.
+    """
 
     headers: tuple[str, ...]
+    dates: set[str]
 
     def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
         """The columns with these headers as float64 of shape (rows,), NaN where a cell is empty."""

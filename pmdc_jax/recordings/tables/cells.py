@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import polars as pl
 
-# Of dates with times: ISO 8601, and as in German
+# Of dates with times: ISO 8601, and as in German; with a number and a slash first, which may be day or month
 DATE_LAYOUTS = (None, "%d.%m.%Y %H:%M:%S%.f")
+SLASHED_LAYOUTS = ("%d/%m/%Y %H:%M:%S%.f", "%m/%d/%Y %H:%M:%S%.f")
+SLASHED_DATE = r"^(\d{1,2})[/-](\d{1,2})[/-](\d{4})"
 DAY = 86400.0  # s
 NUMBERS_ONLY = "Recordings hold plain numbers; leave a cell empty where a sample is missing"
 # By thousands separator: numbers with it and with a decimal separator, without which they would be ambiguous
@@ -38,20 +40,34 @@ def seconds_since_first(dates: pl.Series) -> pl.Series:
     return (dates - first).dt.cast_time_unit("ns").dt.total_nanoseconds() / 1e9
 
 
-def seconds_of_dates(text: pl.Series) -> pl.Series | None:
-    """Texts of dates with times, or of times of the day, as seconds since the first; None if one is neither."""
+def seconds_of_dates(text: pl.Series) -> list[pl.Series]:
+    """Texts of dates with times, or of times of the day, as seconds since the first.
+
+    **Returns**: every different reading: two if day and month cannot be told apart and this matters, none if a text is
+    neither.
+    """
     import polars as pl
 
     text = text.str.replace(",", ".", literal=True)
-    for layout in DATE_LAYOUTS:
+    slashed = text.str.replace(SLASHED_DATE, "$1/$2/$3")
+    readings: list[pl.Series] = []
+    for layout in SLASHED_LAYOUTS if text.str.contains(SLASHED_DATE).any() else DATE_LAYOUTS:
         try:
-            dates = text.str.to_datetime(layout, time_unit="ns")
+            dates = slashed.str.to_datetime(layout, time_unit="ns")
         except pl.exceptions.PolarsError:
             continue
-        return seconds_since_first(dates)
+        seconds = seconds_since_first(dates)
+        if not any(seconds.equals(reading) for reading in readings):
+            readings.append(seconds)
+    return readings or _seconds_of_day(text)
+
+
+def _seconds_of_day(text: pl.Series) -> list[pl.Series]:
+    import polars as pl
+
     try:
         seconds = text.str.to_time("%H:%M:%S%.f").cast(pl.Int64) / 1e9
     except pl.exceptions.PolarsError:
-        return None
+        return []
     midnights = (seconds.diff().fill_null(0.0) < -DAY / 2).cum_sum()
-    return seconds + DAY * midnights - seconds.drop_nulls().first()
+    return [seconds + DAY * midnights - seconds.drop_nulls().first()]

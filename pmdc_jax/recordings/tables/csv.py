@@ -33,6 +33,7 @@ class CsvTable:
         self._raw = _text(path)
         self._header = find_header(self._raw, path)
         self.headers = self._header.names
+        self.dates: set[str] = set()
         self._kept_rows: np.ndarray | None = None
 
     def read(self, headers: Sequence[str]) -> dict[str, np.ndarray]:
@@ -60,7 +61,11 @@ class CsvTable:
 
     @cached_property
     def _body(self) -> bytes:
-        return self._raw[self._header.end :].rstrip(b"\r\n")
+        """The rows, without line ends and comments after the last: polars would miss a row in such a comment."""
+        body = self._raw[self._header.end :].rstrip(b"\r\n")
+        while (last := body[body.rfind(b"\n") + 1 :]).startswith(b"#"):
+            body = body.removesuffix(last).rstrip(b"\r\n")
+        return body
 
     def _frame(self, wanted: Sequence[str]) -> pl.DataFrame:
         """The wanted columns as numbers, and the last column, of any type, to detect short lines; null if empty."""
@@ -75,8 +80,8 @@ class CsvTable:
             self._refuse_unequal_lines()
         try:  # padded numbers, dates and the like: slower
             text = self._parse({}, last)
-        except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
-            what = f"it cannot be read as a table ({str(error).splitlines()[0]})"
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
+            what = "it cannot be read as a table"
             raise InputError(str(self._path), what, "Export it as plain CSV") from None
         return text.with_columns(self._numbers(text[i], self.headers[int(i)]) for i in wanted)
 
@@ -107,11 +112,14 @@ class CsvTable:
         wrong = (numbers.is_null() & text.is_not_null()).arg_true()
         if not len(wrong):
             return numbers
-        is_empty = numbers.null_count() == len(numbers)
-        if is_empty and (seconds := seconds_of_dates(text)) is not None:
-            return seconds
         row = int(wrong[0])
         where = f"{self._path}, {self.place(row)}, column {header}"
+        if numbers.null_count() == len(numbers) and (readings := seconds_of_dates(text)):
+            if len(readings) > 1:
+                what = f"'{text[row]}' may begin with the day or the month"
+                raise InputError(where, what, "Write dates as 2026-03-01 12:00:00.125")
+            self.dates.add(header)
+            return readings[0]
         raise InputError(where, f"'{text[row]}' is not a number", NUMBERS_ONLY)
 
     def _lines(self) -> Iterator[tuple[int, bytes]]:

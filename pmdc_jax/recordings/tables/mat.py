@@ -23,6 +23,7 @@ class MatTable:
         from scipy.io import loadmat
 
         self._path = path
+        self.dates: set[str] = set()
         try:
             content = loadmat(path, squeeze_me=True, simplify_cells=True)
         except NotImplementedError:

@@ -18,6 +18,7 @@ class ParquetTable:
         import polars as pl
 
         self._path = path
+        self.dates: set[str] = set()
         try:
             self.headers = tuple(pl.read_parquet_schema(path))
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
@@ -34,6 +35,7 @@ class ParquetTable:
         for header in headers:
             kind = frame.schema[header]
             if isinstance(kind, pl.Datetime):
+                self.dates.add(header)
                 frame = frame.with_columns(seconds_since_first(frame[header]))
             elif not kind.is_numeric() and kind != pl.Null:
                 where = f"{self._path}, column {header}"
