@@ -96,7 +96,7 @@ def identify(
     unloaded: Unloaded = False,
     effect: Effect = [],
     search: Search = "cma_es",
-) -> None:
+) -> int:
     """Identify the parameters of a motor from recordings.
 
     Estimates R, L, Kb, Kt, J and f from voltage, current and speed, each with its standard error,
@@ -120,6 +120,7 @@ def identify(
 
         write_identification_report(identification, report)
     _write_and_print(identification, json, identification_json, identification_tables)
+    return _status(identification)
 
 
 @app.command(
@@ -139,7 +140,7 @@ def diagnose(
     known: Known = [],
     unloaded: Unloaded = False,
     search: Search = "cma_es",
-) -> None:
+) -> int:
     """Find physical effects that are missing from the motor model.
 
     Shows where simulation and measurement disagree, names the missing effect, adds it to the model,
@@ -170,6 +171,7 @@ def diagnose(
 
         write_diagnosis_report(diagnosis, report)
     _write_and_print(diagnosis, json, diagnosis_json, diagnosis_tables)
+    return _status(diagnosis.final)
 
 
 @app.command(epilog="Example: pmdc simulate motor.json --input drive.csv --out simulated.csv")
@@ -182,12 +184,11 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
 
     check_outputs({"--out": out}, [motor, input])
     columns = dict(pairs("--column", column))
-    from .motor_file import load_motor
     from .recordings.recording_file import read_recording, write_recording
     from .simulate import simulate
 
     driven = read_recording(input, columns, to_simulate=True)
-    write_recording(simulate(load_motor(motor), driven), out)
+    write_recording(simulate(motor, driven), out)
 
 
 @app.command(
@@ -222,13 +223,11 @@ def tune(
 
     check_outputs({"--save": save, "--json": json, "--report": report}, [motor])
     from .control.tuning import tune
-    from .motor_file import load_motor, load_speed_noise, load_uncertainty
     from .report.terminal import print_messages, progress
 
-    subject, uncertainty = load_motor(motor), load_uncertainty(motor)
     with progress() as on_progress:
         tuning = tune(
-            subject,
+            motor,
             controller,
             setpoint=setpoint,
             voltage_limit=voltage_limit,
@@ -240,10 +239,8 @@ def tune(
             delay=delay,
             speed_step=speed_step,
             speed_noise=speed_noise,
-            recorded_noise=load_speed_noise(motor),
             measures_current=current_sensor,
             spread=None if spread is None else spread / 100,
-            uncertainty=uncertainty,
             seed=seed,
             progress=on_progress,
         )
@@ -293,9 +290,10 @@ def paper(out: Folder = Path("paper_out")) -> None:
 
 @app.command(epilog="Example: pmdc demo --out tour")
 def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
-    """Run a demonstration: identify and diagnose the packaged sample, and tune a controller.
+    """Run a demonstration on a packaged sample.
 
-    Fits four runs, validates on a fifth, and writes results and reports to a folder.
+    Identifies and diagnoses four runs, validates on a fifth, tunes a controller, and writes results and
+    reports to a folder.
     """
     from .demo import FILES, demo
     from .report.diagnosis_tables import diagnosis_tables
@@ -327,6 +325,11 @@ def _read_and_fit(
         recordings = read_recordings([*runs, *holdout], columns)
         train, held_out = recordings[: len(runs)], recordings[len(runs) :]
         return fit(train, holdout=held_out, progress=on_progress, **options)
+
+
+def _status(identification: Identification) -> int:
+    """The exit status: results of a search that was interrupted are written, but count as interrupted."""
+    return INTERRUPTED if identification.search.interrupted else DONE
 
 
 def _print_findings_and_save(identification: Identification, path: Path | None) -> None:

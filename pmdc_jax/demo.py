@@ -38,7 +38,7 @@ def demo(
     from .control.controller_file import save_controller
     from .control.tuning import tune
     from .diagnose import diagnose
-    from .motor_file import load_motor, load_speed_noise, load_uncertainty, save_motor
+    from .motor_file import save_motor
     from .report.diagnosis import write_diagnosis_report
     from .report.json import diagnosis_json, write_json
     from .report.tuning import write_tuning_report
@@ -52,13 +52,11 @@ def demo(
     write_json(diagnosis_json(diagnosis), content)
     write_diagnosis_report(diagnosis, report)
     tuning = tune(
-        load_motor(motor),
+        motor,
         "pid",
         setpoint=200.0,
         voltage_limit=18.0,
         current_limit=20.0,
-        recorded_noise=load_speed_noise(motor),
-        uncertainty=load_uncertainty(motor),
         seed=seed,
         progress=progress,
     )

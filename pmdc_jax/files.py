@@ -10,6 +10,9 @@ from pathlib import Path
 
 from .errors import InputError
 
+# what the file of an option may end in, if it ends in anything
+SUFFIXES = {"--save": (".json",), "--report": (".html", ".htm"), "--experiment": (".csv",)}
+
 
 def check_outputs(outputs: dict[str, Path | str | None], inputs: list[Path]) -> None:
     """Check before a computation that its results can be written; `outputs` maps each option to its path.
@@ -33,8 +36,14 @@ def check_writable(option: str, path: Path) -> None:
     """**Raises**: `InputError` if a file cannot be written at `path`, the value of `option`."""
     if str(path) == "-":
         raise InputError(option, "only --json can write to standard output", "Give a file name")
+    if path == Path():
+        raise InputError(option, "the name is empty, or a folder", "Give a file name")
     if path.is_dir():
         raise InputError(option, f"{path} is a folder", "Give a file name")
+    wanted = SUFFIXES.get(option, ())
+    if wanted and path.suffix and path.suffix.lower() not in wanted:
+        mend = f"Give a name that ends in {' or '.join(wanted)}"
+        raise InputError(option, f"{path} would not be a {path.suffix} file", mend)
     folder = path.parent
     if not folder.is_dir():
         raise InputError(
@@ -54,6 +63,9 @@ def result_folder(path: Path, first: str) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise InputError("--out", f"{path} is not a folder", "Give another folder") from None
+    except OSError as error:
+        what = f"the folder {path} cannot be made ({error.strerror})"
+        raise InputError("--out", what, "Choose another location") from None
     check_writable("--out", path / first)
     return path
 
@@ -83,16 +95,17 @@ def replacing(path: str | Path) -> Iterator[Path]:
     **Raises**: `InputError` if it cannot be written.
     """
     path = Path(path).resolve()  # resolves a link, which then stays a link
-    if path.exists() and not path.is_file():  # a device such as /dev/stdout cannot be replaced
-        yield path
-        return
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    if path.exists() and not path.is_file():
+        part = path  # a device such as /dev/stdout cannot be replaced
     try:
         yield part
-        part.replace(path)
+        if part != path:
+            part.replace(path)
     except OSError as error:
         what = f"it cannot be written ({error.strerror or error})"
         mend = "Choose an existing folder with free space and write permission"
         raise InputError(str(path), what, mend) from None
     finally:
-        part.unlink(missing_ok=True)
+        if part != path:
+            part.unlink(missing_ok=True)

@@ -30,10 +30,20 @@ def read_object(path: str | Path, form: str, mend: str) -> dict[str, Any]:
         raise InputError(where, f"is not JSON ({error})", mend) from None
     if not isinstance(content, dict):
         raise InputError(where, "is not a JSON object", mend)
-    if content.get("format", form) != form:
-        what = f'"format" is {content["format"]!r}, not {form!r}'
-        raise InputError(where, what, "Update pmdc_jax, or write the file again with this version")
+    if "seconds" in content:  # every result has it, and no file that is read
+        raise InputError(where, "looks like the result of --json", mend)
+    given = content.get("format", form)
+    if given != form:
+        what = f'"format" is {given!r}, not {form!r}'
+        if _kind(given) == _kind(form):
+            mend = "Update pmdc_jax, or write the file again with this version"
+        raise InputError(where, what, mend)
     return content
+
+
+def _kind(form: object) -> str:
+    """A format without its version."""
+    return str(form).rpartition(" ")[0]
 
 
 def finite_number(where: str, name: str, value: object, mend: str) -> float:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .identify.identification import Identification
 
 FORMAT = "pmdc motor 1"
-MEND = "Write it with pmdc identify --save"
+MEND = "Give the motor file that pmdc identify --save wrote"
 UNDETERMINED = ("not_identifiable", "at_bound")
 
 

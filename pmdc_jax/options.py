@@ -84,9 +84,20 @@ Controller = Annotated[
     str,
     typer.Option(metavar="NAME", help="pi, pid, state-feedback or state-feedback-integral."),
 ]
-Setpoint = Annotated[float | None, typer.Option(metavar="RAD_S", help="Set point of the speed.")]
+Setpoint = Annotated[
+    float | None,
+    typer.Option(
+        metavar="RAD_S",
+        help="Set point of the speed; by default 80 % of what the voltage limit reaches.",
+    ),
+]
 VoltageLimit = Annotated[
-    float | None, typer.Option(metavar="V", help="Largest voltage, in either direction.")
+    float | None,
+    typer.Option(
+        metavar="V",
+        help="Largest voltage, in either direction; by default 1.25 times what holds the set point,"
+        " or 24 V without one.",
+    ),
 ]
 CurrentLimit = Annotated[
     float | None, typer.Option(metavar="A", help="Largest current; unlimited if not given.")
@@ -98,7 +109,13 @@ MaxOvershoot = Annotated[
     float, typer.Option(min=0, metavar="PCT", help="Largest overshoot, % of the step.")
 ]
 MaxSettling = Annotated[float | None, typer.Option(metavar="S", help="Largest settling time.")]
-LoadTorque = Annotated[float | None, typer.Option(metavar="NM", help="Load torque step to reject.")]
+LoadTorque = Annotated[
+    float | None,
+    typer.Option(
+        metavar="NM",
+        help="Load torque step to reject; by default half of what can be held at the set point.",
+    ),
+]
 Delay = Annotated[
     int, typer.Option(metavar="SAMPLES", help="Delay from measurement to voltage: 0 or 1.")
 ]

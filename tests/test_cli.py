@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import attrs
 import pytest
 from attrs import evolve
 from test_diagnose_report import ambiguous, named
@@ -230,6 +231,9 @@ def test_diagnose_reports_bad_input_in_one_message(faked, capsys):
         ("identify a.csv --known R=nan", ["--known R=nan", "not a number"]),
         ("identify a.csv --report nowhere/x.html", ["--report", "nowhere", "does not exist"]),
         ("identify a.csv --save .", ["--save", "folder"]),
+        ("identify a.csv --report=", ["--report", "the name is empty"]),
+        ("identify a.csv --report x.pdf", ["--report", "x.pdf", ".html"]),
+        ("identify a.csv --save x.html", ["--save", "x.html", ".json"]),
         ("identify a.csv --report -", ["--report", "--json"]),
         ("identify a.csv --json a.csv", ["--json", "a.csv", "an input"]),
         ("identify a.csv --json x --report x", ["--report", "the output of --json"]),
@@ -271,6 +275,14 @@ def test_an_interrupt_exits_with_130(faked, capsys):
     assert capsys.readouterr() == ("", "pmdc: interrupted\n")
 
 
+def test_an_interrupted_search_writes_its_results_and_exits_with_130(faked, capsys):
+    search = attrs.evolve(faked.result.search, interrupted=True)
+    faked.result = attrs.evolve(faked.result, search=search)
+    assert cli.main(["identify", "a.csv", "--json", "result.json"]) == 130
+    assert "pmdc: interrupted" in capsys.readouterr().err
+    assert Path("result.json").exists()
+
+
 def test_a_defect_of_the_program_is_not_hidden(faked):
     faked.result = ZeroDivisionError("a bug")
     with pytest.raises(ZeroDivisionError):
@@ -279,7 +291,6 @@ def test_a_defect_of_the_program_is_not_hidden(faked):
 
 def test_simulate_reads_simulates_and_writes(faked, monkeypatch, capsys):
     written = []
-    replace_function(monkeypatch, "pmdc_jax.motor_file", "load_motor", lambda path: f"motor {path}")
     replace_function(monkeypatch, "pmdc_jax.simulate", "simulate", lambda motor, run: (motor, run))
     replace_function(
         monkeypatch,
@@ -288,7 +299,7 @@ def test_simulate_reads_simulates_and_writes(faked, monkeypatch, capsys):
         lambda run, path: written.append((run, path)),
     )
     assert cli.main(["simulate", "motor.json", "--input", "drive.csv", "--out", "out.csv"]) == 0
-    assert written == [(("motor motor.json", "drive"), Path("out.csv"))]
+    assert written == [((Path("motor.json"), "drive"), Path("out.csv"))]
 
 
 @pytest.fixture
@@ -304,9 +315,6 @@ def faked_tuning(monkeypatch):
         Path(path).write_text("")
 
     replace_function(monkeypatch, "pmdc_jax.control.tuning", "tune", tune)
-    replace_function(monkeypatch, "pmdc_jax.motor_file", "load_motor", lambda path: "motor")
-    replace_function(monkeypatch, "pmdc_jax.motor_file", "load_uncertainty", lambda path: "spread")
-    replace_function(monkeypatch, "pmdc_jax.motor_file", "load_speed_noise", lambda path: "noise")
     replace_function(monkeypatch, "pmdc_jax.control.controller_file", "save_controller", write)
     report = "pmdc_jax.report.tuning"
     replace_function(monkeypatch, report, "write_tuning_report", lambda tuning, path: write(path))
@@ -320,8 +328,7 @@ def test_demo_writes_into_its_folder(faked, faked_tuning, capsys, tmp_path):
     reports = {"report.html", "diagnosis.json", "motor.json", "tuning.html", "controller.json"}
     assert names == reports
     motor, controller, options = faked_tuning.tune
-    assert (motor, controller, options["uncertainty"]) == ("motor", "pid", "spread")
-    assert options["recorded_noise"] == "noise"
+    assert (motor, controller) == (Path("deep/tour/motor.json"), "pid")
     recordings, options = faked.identify
     assert [path.stem for path in recordings] == ["staircase", "prbs", "triangle", "loaded"]
     assert [path.stem for path in options["holdout"]] == ["drive"]
@@ -332,6 +339,15 @@ def test_demo_refuses_a_file_as_folder(faked, capsys, tmp_path):
     (tmp_path / "taken").write_text("")
     assert "taken" in refused(capsys, "demo", "--out", "taken")
     assert faked.identify is None
+
+
+def test_demo_refuses_a_folder_that_cannot_be_made(faked, capsys, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied", "tour")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    message = refused(capsys, "demo", "--out", "tour")
+    assert "--out: the folder tour cannot be made (Permission denied). Choose" in message
 
 
 def test_no_progress_is_printed_without_a_terminal(faked, capsys):

@@ -87,7 +87,7 @@ def test_an_interpolated_voltage_keeps_its_mean_and_first_moment_in_every_even_s
     rng = np.random.default_rng(23)
     run = record(stamps("walk", 60, rng), rng, 0 * NOISE)
     even = uniform(run)
-    mean, rise = mean_and_rise(even, pieces_of(even, straight=True))
+    mean, rise = mean_and_rise(even, pieces_of(even, first_order_hold=True))
     share = (np.arange(2000) + 0.5) / 2000
     for k, begin in enumerate(even.time):
         drive = np.interp(begin + even.sample_time * share, run.time, run.voltage)
@@ -105,7 +105,7 @@ def test_an_interpolated_voltage_keeps_its_mean_and_first_moment_in_every_even_s
         for states in (straight, true):
             states[k + 1, :2] = (transition @ states[k])[:2]
     seen = straight[:-1:fine, :2]
-    then = simulated_at_stamps(Motor(**MOTOR), Drive(), unloaded, seen, straight=True)
+    then = simulated_at_stamps(Motor(**MOTOR), Drive(), unloaded, seen, first_order_hold=True)
     times = even.time[0] + even.sample_time / fine * np.arange(len(true))
     for c in range(2):
         want = np.interp(run.time, times, true[:, c])
@@ -116,7 +116,7 @@ def test_an_interpolated_voltage_keeps_its_mean_and_first_moment_in_every_even_s
 def test_pieces_cover_every_even_sample_once():
     rng = np.random.default_rng(24)
     even = uniform(record(stamps("walk", 200, rng), rng))
-    pieces = pieces_of(even, straight=False)
+    pieces = pieces_of(even, first_order_hold=False)
     of_sample = np.bincount(pieces.even, pieces.length)
     np.testing.assert_allclose(of_sample, even.sample_time, rtol=1e-9)
 

@@ -12,24 +12,23 @@ import numpy as np
 import pytest
 from attrs import evolve
 from linear_motor import PAPER
-from pmdc_jax.diagnose.evidence.regression.assessment import Assessment
-from pmdc_jax.diagnose.evidence.regression.periodic import common_line, spectrum
-from pmdc_jax.diagnose.evidence.regression.quantisation import ROUNDING_DRAWS, rounding_errors
-from pmdc_jax.diagnose.evidence.regression.regression import Block, gather_evidence
-from pmdc_jax.diagnose.evidence.regression.rows import _batches
-from pmdc_jax.diagnose.evidence.regression.signals import (
-    Screen,
-    Signal,
-    gain_common_to_waves,
-    log_p_value,
-)
-from pmdc_jax.identify.noise.sensor_noise.noise_model import Series, whitener
 from scipy import stats
 from scipy.linalg import block_diag
 
 from benchmarks import virtual_bench as vb
 from experiments.bench import recording
 from pmdc_jax import Recording
+from pmdc_jax.diagnose.evidence.assessment import Assessment
+from pmdc_jax.diagnose.evidence.periodic import common_line, spectrum
+from pmdc_jax.diagnose.evidence.quantisation import ROUNDING_DRAWS, rounding_errors
+from pmdc_jax.diagnose.evidence.regression import Block, gather_evidence
+from pmdc_jax.diagnose.evidence.rows import _batches
+from pmdc_jax.diagnose.evidence.signals import (
+    Screen,
+    Signal,
+    gain_common_to_waves,
+    log_p_value,
+)
 from pmdc_jax.diagnose.experiment import difference_between
 from pmdc_jax.diagnose.hypotheses.candidates import Scales
 from pmdc_jax.diagnose.hypotheses.effect_relations import FULLER, are_rivals, is_simpler_form
@@ -49,6 +48,7 @@ from pmdc_jax.effects import EFFECTS, ShaftCompliance
 from pmdc_jax.identify.fit.polish import fit_at
 from pmdc_jax.identify.fit.refine import Optimum
 from pmdc_jax.identify.identification import Estimate, Identification
+from pmdc_jax.identify.noise.noise_model import Series, fit_whitener
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Unknowns
 from pmdc_jax.motor import PARAMETERS, Motor
@@ -534,7 +534,7 @@ def coloured(seed: int, samples: int, scale: float) -> np.ndarray:
 def test_filtered_residuals_are_white():
     known = np.ones(6000, bool)
     series = [Series(coloured(k, 6000, s), known, (1e-3, (0, 1))) for k, s in enumerate((1.0, 5.0))]
-    white = whitener(series)
+    white = fit_whitener(series)
     for k, s in enumerate(series):
         rows = white(k, s).reshape(-1, 2)
         np.testing.assert_allclose(np.cov(rows.T), np.eye(2), atol=0.05)
@@ -551,7 +551,7 @@ def test_the_filter_omits_rows_that_need_missing_samples():
     damaged = values.copy()
     damaged[~known] = 1e9
     clean = Series(values, known, (1e-3, (0, 1)))
-    white = whitener([clean])
+    white = fit_whitener([clean])
     np.testing.assert_array_equal(white(0, clean), white(0, clean._replace(values=damaged)))
 
 

@@ -33,6 +33,7 @@ from pmdc_jax.report.diagnosis_sentences import drifts, intervals_in_words, verd
 from pmdc_jax.report.diagnosis_tables import diagnosis_tables
 from pmdc_jax.report.experiment import write_experiment
 from pmdc_jax.report.json import diagnosis_json
+from pmdc_jax.report.notation import formula_text
 
 STRIBECK = {
     "coulomb_Nm": Estimate(0.0612, 4e-4, (0.0604, 0.0620), "N m", "identified"),
@@ -312,7 +313,8 @@ def test_json_contains_the_values():
     assert found["where"][0]["region"] == [-20.0, 0.0]
     assert found["effects"][0]["parameters"]["static_Nm"]["ci95"] == [0.1462, 0.1498]
     assert found["before"]["parameters"]["f"]["value"] > found["parameters"]["f"]["value"]
-    assert diagnosis_json(none_detected())["gap"]["holdout"] is None
+    unknown = {"before": None, "after": None, "floor": None}
+    assert diagnosis_json(none_detected())["gap"]["holdout"] == unknown
     assert found["next_experiment"] is None
     assert set(diagnosis_json(ambiguous())["next_experiment"]) == {"why", "description", "power"}
     assert diagnosis_json(not_in_library())["curves"][0]["value"] == [0.0, 0.001, -0.03, 0.0]
@@ -361,8 +363,9 @@ def test_the_page_is_complete_and_self_contained(case, tmp_path):
     assert not re.search(r"\b(nan|NaN|inf|Infinity|None)\b", page.text)
     for sentence in verdict_sentences(diagnosis):
         assert sentence in page.text
+    assert "if nothing were missing" in page.text
     for effect in diagnosis.effects:
-        assert EFFECTS[effect.name].formula in page.text
+        assert formula_text(effect.name) in page.text
     expected_figures = 1 + len(diagnosis.curves) + (diagnosis.next_experiment is not None)
     expected_figures += len(diagnosis.base.fit) * (2 if diagnosis.effects else 1)
     expected_figures += bool(diagnosis.where)

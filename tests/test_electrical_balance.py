@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from linear_motor import PAPER
-from pmdc_jax.diagnose.evidence.regression.electrical_balance import electrical_misfit
 from scipy.signal import cont2discrete, dlsim, lfilter
 
 from benchmarks import virtual_bench as vb
@@ -13,6 +12,7 @@ from benchmarks.naming.cases import Bench, record
 from benchmarks.naming.plant import Plant
 from experiments.bench import recording
 from pmdc_jax.diagnose.diagnosis import MAX_ELECTRICAL
+from pmdc_jax.diagnose.evidence.electrical_balance import electrical_misfit
 from pmdc_jax.diagnose.model import Model, model_of
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.prepare import prepare

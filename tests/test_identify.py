@@ -14,19 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pmdc_jax.identify.noise.sensor_noise.noise_model import whitener
-from pmdc_jax.identify.noise.sensor_noise.sensor_noise import (
-    common_divisor,
-    is_coarse,
-    quantum,
-    white_noise,
-)
-from pmdc_jax.identify.noise.sensor_noise.whitening import Whitening
-from pmdc_jax.identify.search.evolution.binary_ga import BinaryGA
-from pmdc_jax.identify.search.evolution.bounds import effect_bounds
-from pmdc_jax.identify.search.evolution.evolution import METHODS, SearchResult, search
-from pmdc_jax.identify.search.evolution.nearby import best_nearby
-from pmdc_jax.identify.uncertainty.covariance.covariance import information, long_run_variance
 from scipy.integrate import cumulative_simpson
 from scipy.signal import lfilter, lsim
 
@@ -42,16 +29,29 @@ from pmdc_jax.identify.fit.polish import fit_at, polish
 from pmdc_jax.identify.fit.refine import Optimum, refine
 from pmdc_jax.identify.fit.run_unknowns import fit_run_unknowns
 from pmdc_jax.identify.identification import CONVERGED_DISTANCE, Identification
+from pmdc_jax.identify.noise.noise_model import fit_whitener
+from pmdc_jax.identify.noise.sensor_noise import (
+    common_divisor,
+    is_coarse,
+    quantum,
+    white_noise,
+)
+from pmdc_jax.identify.noise.whitening import Whitening
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Problem, Unknowns, _evaluated, evaluate, normal_matrix
 from pmdc_jax.identify.results import results_of
 from pmdc_jax.identify.rotor_angle import with_rotor_angle
+from pmdc_jax.identify.search.binary_ga import BinaryGA
+from pmdc_jax.identify.search.bounds import effect_bounds
+from pmdc_jax.identify.search.evolution import METHODS, SearchResult, search
+from pmdc_jax.identify.search.nearby import best_nearby
 from pmdc_jax.identify.solve import _distinct, solve
+from pmdc_jax.identify.uncertainty.covariance import information, long_run_variance
 from pmdc_jax.motor import PARAMETERS
 from pmdc_jax.motor_file import Uncertainty
 from pmdc_jax.recordings.recording import Recording
-from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, sensitivities
+from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, free_run, sensitivities
 
 PAPER = vb.paper_motor()
 NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
@@ -224,6 +224,38 @@ def test_without_a_known_load_only_ratios_are_identified(declared):
     assert float(motor.Kt) == pytest.approx(float(motor.Kb), rel=1e-6)
 
 
+def test_without_a_known_load_the_scale_of_all_torques_changes_nothing(x64):
+    """Scaled with Kt, J and f are the torques of all effects, of either sign."""
+    names = ("stribeck_friction", "quadratic_drag", "constant_load", "cogging_torque")
+    effects = tuple(EFFECTS[name] for name in names)
+    tape = Tape.from_recordings(unloaded(5), unloaded=True)
+    bounds = {n: (getattr(PAPER, n) / 2, getattr(PAPER, n) * 2) for n in PARAMETERS}
+    parameters = Parameters.of(bounds | effect_bounds(effects, unloaded(5)), effects)
+    coordinates = np.array((parameters.lower + parameters.upper) / 2)
+    coordinates[parameters.names.index("constant_load.torque_Nm")] = -0.01
+    scaled = parameters.with_torques_scaled(coordinates, 1.7)
+    assert parameters.value("Kt", scaled) == pytest.approx(
+        1.7 * parameters.value("Kt", coordinates)
+    )
+    before, after = (np.asarray(free_run(parameters(x), tape)) for x in (coordinates, scaled))
+    np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(("both_ways", "noted"), [(False, "friction"), (True, None)])
+def test_friction_hidden_in_the_unknown_load_is_pointed_out(both_ways, noted):
+    """In one direction friction is a constant load; in both, it is no load."""
+    rng, runs = np.random.default_rng(12), []
+    for name in ("first", "second"):
+        excitation = vb.prbs(rng, 1.0, amplitude=8.0, offset=0.0 if both_ways else 14.0)
+        columns = vb.record(
+            replace(PAPER, coulomb_Nm=0.1), excitation, rng, NOISE, load_known=False
+        )
+        runs.append(recording(name, {q: values[300:] for q, values in columns.items()}))
+    notes = [note for note in identify(runs).messages if "unknown load" in note]
+    assert len(notes) == (noted is not None)
+    assert all(noted in note and "--unloaded" in note for note in notes)
+
+
 def test_a_tie_makes_an_unloaded_motor_identifiable():
     truth = replace(PAPER, Kt=PAPER.Kb)
     result = identify(unloaded(6, truth), tie=(("Kt", "Kb"),), unloaded=True)
@@ -346,6 +378,9 @@ def test_current_and_speed_identify_the_mechanical_half():
     for name in ("R", "L", "Kb"):
         estimate = result.parameters[name]
         assert (estimate.value, estimate.status) == (None, "not_identifiable")
+    (direction,) = result.unidentified_directions
+    assert direction.parameters == ("R", "L", "Kb")
+    assert "voltage" in direction.why
     assert result.fit["a"].current_rmse is None
 
 
@@ -500,7 +535,7 @@ def test_whitening_matches_its_formula_sample_by_sample():
 
 
 def _last_fit(given, plain_fit):
-    return last_fit(given, plain_fit, plain_fit, whitener(residuals_of(given, plain_fit)))
+    return last_fit(given, plain_fit, plain_fit, fit_whitener(residuals_of(given, plain_fit)))
 
 
 def test_whitening_of_torque_noise_reduces_standard_errors():
@@ -816,6 +851,7 @@ def test_an_interrupted_search_still_gives_a_result(runs):
     result = identify(runs, progress=progress)
     assert_accurate(result, PAPER)
     assert any("interrupted" in message for message in result.messages)
+    assert result.search.interrupted
 
 
 def test_progress_is_reported(runs):

@@ -20,7 +20,7 @@ from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recordings.recording import OVER_LAST, Recording
 from pmdc_jax.simulate import (
-    STRAIGHT,
+    FIRST_ORDER_HOLD,
     UNKNOWNS_PER_RUN,
     RunUnknowns,
     Tape,
@@ -46,7 +46,7 @@ def run_by_sines(seed: int, samples: int, load: float = 0.0, step: float = STEP)
     return Recording(f"run{seed}", time, voltage, speed=np.zeros(samples), load=load + 0 * time)
 
 
-def simulated(run: Recording, motor: Motor, timing: Timing = STRAIGHT) -> np.ndarray:
+def simulated(run: Recording, motor: Motor, timing: Timing = FIRST_ORDER_HOLD) -> np.ndarray:
     """The package's free run from rest, (samples, 2)."""
     tape = Tape.from_recordings([run], timing=timing)
     return tape.samples_of(0, free_run(motor, tape, FROM_REST), len(run))
@@ -105,7 +105,7 @@ def test_a_smooth_voltage_is_followed_between_its_samples(x64):
     by_lines = largest_error(simulated(run, motor_with()), exact)
     rate = TRUE["R"] / TRUE["L"]
     assert (
-        largest_error(simulated(run, motor_with(), STRAIGHT._replace(smooth=rate)), exact)
+        largest_error(simulated(run, motor_with(), FIRST_ORDER_HOLD._replace(smooth=rate)), exact)
         < 0.04 * by_lines
     )
 
@@ -168,8 +168,8 @@ def test_effects_match_an_independent_integrator(x64, name):
 @pytest.mark.parametrize(
     ("names", "timing"),
     [
-        (("coulomb_friction",), STRAIGHT),
-        (("speed_sensor_delay",), STRAIGHT),
+        (("coulomb_friction",), FIRST_ORDER_HOLD),
+        (("speed_sensor_delay",), FIRST_ORDER_HOLD),
         (("speed_sensor_delay",), Timing(0.3)),
         pytest.param(("coulomb_friction",), Timing(0.3), marks=pytest.mark.slow),
     ],

@@ -25,7 +25,7 @@ ALLOWED_IMPORTS = {
     "effects": set(),
     "motor": {"effects"},
     "motor_file": {"effects", "errors", "files", "json_file", "motor"},
-    "simulate": {"effects", "errors", "motor", "recordings", "runtime"},
+    "simulate": {"effects", "errors", "motor", "motor_file", "recordings", "runtime"},
     "control": {
         "effects",
         "errors",

@@ -135,7 +135,12 @@ INVALID = {
     "effects not in a list": (file_with("effects", to={"coulomb_friction": 0.1}), "effect"),
     "effects null": (file_with("effects", to=None), "effects"),
     "effects a number": (file_with("effects", to=5), "effects"),
-    "of a later version": (json.dumps(VALID | {"format": "pmdc motor 2"}), "format"),
+    "of a later version": (json.dumps(VALID | {"format": "pmdc motor 2"}), "Update pmdc_jax"),
+    "a result": (json.dumps(VALID | {"seconds": {}}), "result of --json. .* identify --save wrote"),
+    "a controller": (
+        json.dumps(VALID | {"format": "pmdc controller 1"}),
+        "Give the motor file that pmdc identify --save wrote",
+    ),
     "status a text": (json.dumps(VALID | {"status": "identified"}), "status"),
 }
 

@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 
 from pmdc_jax.paper import paper
-from pmdc_jax.wheelchair import FILTER_RATIO, SETPOINT, TABLE_1, TABLE_2, simulated_as_printed
+from pmdc_jax.report.paper import table_1
+from pmdc_jax.wheelchair import (
+    FILTER_RATIO,
+    PRINTED,
+    SETPOINT,
+    TABLE_1,
+    TABLE_2,
+    Paper,
+    Recovered,
+    simulated_as_printed,
+)
 
 
 @pytest.mark.parametrize("kind", ["pi", "pid"])
@@ -24,6 +34,12 @@ def test_response_with_printed_gains_matches_python_control(kind):
     assert found.settling == pytest.approx(expected["SettlingTime"], abs=1e-4)
     voltage = control.step_response(control.feedback(law, motor), np.arange(0, 0.2, 1e-5))
     assert found.peak_voltage == pytest.approx(SETPOINT * voltage.outputs.max(), rel=1e-3)
+
+
+def test_table_1_states_the_units():
+    found = Recovered("ours", PRINTED, evaluations=9, seconds=1.0, best=np.ones(3))
+    made_up = Paper((found,), 0.0, *4 * ({},))
+    assert [row[0] for row in table_1(made_up)[1]][:3] == ["R [Ω]", "L [H]", "Kb [V·s/rad]"]
 
 
 @pytest.mark.slow

@@ -422,6 +422,12 @@ def test_a_link_or_a_device_is_written_through(tmp_path):
     assert Path("/dev/null").is_char_device()
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
+def test_a_full_device_is_named():
+    with pytest.raises(InputError, match="/dev/full: it cannot be written"):
+        write_json({}, "/dev/full")
+
+
 def test_an_output_that_is_an_input_is_refused(tmp_path):
     (tmp_path / "a").mkdir()
     with pytest.raises(InputError, match="an input"):
@@ -446,11 +452,30 @@ def test_an_output_that_is_an_input_is_refused(tmp_path):
             ("0.000000", "0.000001", "N·m·s/rad"),
         ),
         (Estimate(-0.002, 4e-5, None, "A", "identified"), ("−2.000", "0.040", "mA")),
+        (Estimate(1.0, 0.0, (1.0, 1.0), "ohm", "known"), ("1.000", "–", "Ω")),
     ],
 )
 def test_engineering_notation(estimate, expected):
     written = notation.write_estimate(estimate)
     assert (written.value, written.stderr, written.unit) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(2.1e-6, "2.10×10⁻⁶"), (-8.64e7, "−8.64×10⁷"), (0.0123, "0.0123"), (0.0, "0.00")],
+)
+def test_powers_of_ten(value, text):
+    assert notation.significant(value) == text
+
+
+def test_searches_have_their_names():
+    assert notation.search_name("cma_es") == "CMA-ES"
+    assert notation.search_name("another_one") == "Another one"
+
+
+def test_formulas_are_written_in_greek():
+    assert notation.formula_text("coulomb_friction") == "T_f = T_c sign(ω)"
+    assert "exp(−(ω / ω_s)^2)" in notation.formula_text("stribeck_friction")
 
 
 @pytest.mark.parametrize(

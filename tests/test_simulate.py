@@ -531,6 +531,14 @@ def test_simulate_accepts_a_motor_of_plain_numbers():
     np.testing.assert_array_equal(plain.speed, pmdc_jax.simulate(motor(), run).speed)
 
 
+def test_simulate_accepts_a_motor_file(tmp_path):
+    run, path = recording(), tmp_path / "motor.json"
+    pmdc_jax.save_motor(path, motor())
+    np.testing.assert_array_equal(
+        pmdc_jax.simulate(path, run).speed, pmdc_jax.simulate(motor(), run).speed
+    )
+
+
 def test_a_simulation_that_diverges_blames_the_motor():
     run = recording(voltage=10 * np.ones(SAMPLES))
     with pytest.raises(InputError, match="motor: its simulation of run diverges at"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import attrs
 import numpy as np
 import pytest
-from pmdc_jax.identify.noise.sensor_noise.sensor_noise import quantum
 from scipy import ndimage, signal
 from scipy.interpolate import CubicSpline
 
@@ -17,6 +16,7 @@ from pmdc_jax.identify.corrections.speed_averaging import (
     averaging_of_counts,
     averaging_of_differences,
 )
+from pmdc_jax.identify.noise.sensor_noise import quantum
 from pmdc_jax.recordings.recording import OVER_BOTH, OVER_LAST, Recording
 
 # a motor that speeds up within a few samples

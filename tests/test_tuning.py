@@ -17,7 +17,9 @@ from pmdc_jax import InputError, cli, load_controller, load_uncertainty, save_mo
 from pmdc_jax.control.specification import LoopRequirements
 from pmdc_jax.control.tuning import Tuning, robustness
 from pmdc_jax.motor import Motor
-from pmdc_jax.report.tuning import summary, tuning_json, write_tuning_report
+from pmdc_jax.report.notation import NARROW_SPACE
+from pmdc_jax.report.tuning import _current_sentence, summary, tuning_json, write_tuning_report
+from pmdc_jax.report.tuning_figures import _range, loop_figure
 
 MOTOR = Motor(**{name: np.asarray(value) for name, value in PAPER.items()})
 
@@ -100,6 +102,9 @@ def test_report_and_summary_state_the_result(tmp_path):
     page = path.read_text(encoding="utf-8")
     assert "http" not in page.split("<script>")[0].replace("http-equiv", "")
     assert page.count('class="plot"') == 2
+    assert "Settling time" in page
+    limits = [line.y[0] for line in loop_figure(found).data if line.name == "limit"]
+    assert limits == [30, -30, 150, -150]
     text = " ".join(summary(found))
     assert "times the fastest possible with 30 V and 150 A (" in text
     assert "256 motors" in text
@@ -140,11 +145,11 @@ def test_slow_sampling_is_noted(sample_time, noted):
 IMPOSSIBLE = {
     "voltage": (
         {"setpoint": 481.0, "voltage_limit": 24.0},
-        "481 rad/s cannot be reached with 24 V (at most 480.0)",
+        "481 rad/s cannot be reached with 24 V (at most 480.0 rad/s)",
     ),
     "load": (
         {"setpoint": 481.0, "voltage_limit": 25.0, "load_torque": 1.0},
-        "481 rad/s against 1 N m cannot be reached with 25 V",
+        "481 rad/s against 1 N·m cannot be reached with 25 V",
     ),
     "current": (
         {"setpoint": 481.0, "voltage_limit": 30.0, "current_limit": 2.0},
@@ -190,7 +195,43 @@ def test_the_command_refuses_an_impossible_specification_in_one_line(motor_file,
     assert cli.main(arguments.split()) == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
-    assert "481 rad/s cannot be reached with 24 V (at most 480.0)" in err
+    assert (
+        "481 rad/s cannot be reached with 24 V (at most 480.0 rad/s). Raise --voltage-limit" in err
+    )
+
+
+@pytest.mark.parametrize(
+    ("limit", "peak", "text"),
+    [
+        (8.0, 8.016, "The current reaches 8.016 A, 0.20 % above its limit"),
+        (8.0, 8.001, ""),
+        (8.0, 8.2, ""),  # a message says so
+        (None, 8.0, ""),
+    ],
+)
+def test_a_current_above_its_limit_is_stated(limit, peak, text):
+    sentence = _current_sentence(peak, limit)
+    assert sentence.replace(NARROW_SPACE, " ").startswith(text)
+    assert bool(sentence) == bool(text)
+
+
+def test_motors_that_hardly_differ_are_drawn_on_readable_axes():
+    assert _range(np.full(9, 0.65), smallest=0.2) == pytest.approx([0.55, 0.75])
+    assert _range(np.array([1.0, 2.0]), smallest=0.2) == pytest.approx([0.9, 2.1])
+    assert _range(np.zeros(9), smallest=0.2) == pytest.approx([0.0, 0.1])
+    assert _range(np.zeros(0), smallest=0.2) is None
+
+
+def test_a_motor_file_is_accepted_with_its_noise(motor_file, monkeypatch):
+    content = json.loads((motor_file / "motor.json").read_text()) | {"noise": {"speed_rad_s": 0.5}}
+    (motor_file / "motor.json").write_text(json.dumps(content))
+
+    def completed(requirements, motor):
+        raise InputError("asked", f"{requirements.recorded_noise} {motor.R}", "")
+
+    monkeypatch.setattr(LoopRequirements, "completed", completed)
+    with pytest.raises(InputError, match=f"asked: 0.5 {PAPER['R']}"):
+        tune("motor.json", "pi")
 
 
 @pytest.mark.slow
@@ -208,8 +249,8 @@ def test_the_command_writes_the_requested_files(motor_file, capsys, monkeypatch)
         " --no-current-sensor --save controller.json --json out.json --report report.html --seed 3"
     )
     assert cli.main(arguments.split()) == 0
-    assert PAPER["R"] == given["motor"].R
-    assert (given["uncertainty"], given["seed"]) == (None, 3)
+    assert given["motor"].name == "motor.json"
+    assert given["seed"] == 3
     assert given["controller"] == "pid"
     assert given["spread"] == pytest.approx(0.1)
     assert not given["measures_current"]

@@ -16,7 +16,7 @@ from .hardware import Hardware
 from .law import Law, SampledMotor
 
 FORMAT = "pmdc controller 1"
-MEND = "Write it with pmdc tune --save"
+MEND = "Give the controller file that pmdc tune --save wrote"
 
 
 def gains_of(controller: AbstractController) -> dict[str, float]:

@@ -20,20 +20,21 @@ def check_reachable(
     """Raise an `InputError` where the set point cannot be held against the load within the limits."""
     state, voltage = steady_state(motor, setpoint, load)
     current, voltage = abs(float(state.current)), abs(float(voltage))
-    against = f" against {load:g} N m" if load else ""
+    against = f" against {load:g} N·m" if load else ""
+    lower = "--setpoint or --load-torque" if load else "--setpoint"
     if voltage > voltage_limit:
         highest = _highest_speed(motor, setpoint, voltage_limit, load)
         raise InputError(
             option,
-            f"{setpoint:g} rad/s{against} cannot be reached with {voltage_limit:g} V (at most {highest:.1f})",
-            f"Holding it takes {voltage:.2f} V, and reaching it in time takes more",
+            f"{setpoint:g} rad/s{against} cannot be reached with {voltage_limit:g} V (at most {highest:.1f} rad/s)",
+            f"Raise --voltage-limit to more than the {voltage:.2f} V that hold it, or lower {lower}",
         )
     if current_limit is not None and current > current_limit:
         raise InputError(
             option,
             f"holding {setpoint:g} rad/s{against} takes {current:.2f} A,"
             f" more than the limit of {current_limit:g} A",
-            "Raise --current-limit, or lower the set point or the load",
+            f"Raise --current-limit, or lower {lower}",
         )
 
 

@@ -14,8 +14,8 @@ from .controllers import Number
 def steady_state(motor: Motor, speed: Number, load: Number = 0.0) -> tuple[State, Number]:
     """The state in which a speed is held against a load, and the voltage (V) that holds it.
 
-    Linear motor: `Motor.steady_current`, v = R i + Kb w. With effects, Newton's method starts from there and also solves
-    for the states that they add, so that a winding is at its final temperature.
+    Linear motor: i from `Motor.steady_current`, v = R i + Kb w. With effects, Newton's method starts from there and
+    also solves for the states that they add, so that a winding is at its final temperature.
 
     **Arguments**: `speed`, rad/s; `load`, N m, opposes positive motion.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import attrs
 import equinox as eqx
@@ -13,7 +14,7 @@ import numpy as np
 from attrs import field, frozen
 
 from ..motor import Motor
-from ..motor_file import Uncertainty
+from ..motor_file import Uncertainty, load_motor, load_speed_noise, load_uncertainty
 from ..progress import ReportProgress, silent
 from ..runtime.compiled import free_memory_maps
 from ..runtime.precision import double_precision
@@ -134,7 +135,7 @@ class Tuning:
 
 @double_precision
 def tune(
-    motor: Motor,
+    motor: Motor | str | Path,
     controller: str = "pid",
     *,
     setpoint: float | None = None,
@@ -162,8 +163,9 @@ def tune(
     the voltage actually applied. Gains are drawn at random and screened; from the best, gradient descent minimises the
     settling time; exact metrics, resolved between the samples, select the result.
 
-    **Arguments**: `motor`, with scalar fields; `controller`, a key of `CONTROLLERS`; `setpoint`, rad/s, by default 80 %
-    of the speed that the voltage limit reaches; `voltage_limit`, V, by default 1.25 times the voltage that holds the
+    **Arguments**: `motor`, with scalar fields, or its file, which gives `uncertainty` and `recorded_noise`, too, where
+    they are left out; `controller`, a key of `CONTROLLERS`; `setpoint`, rad/s, by default 80 % of the speed that the
+    voltage limit reaches; `voltage_limit`, V, by default 1.25 times the voltage that holds the
     set point, or 24 V if neither is given; `current_limit`, A; `sample_time`, s, by default at most 1 ms and at most a
     fortieth of the motor's transients; `max_overshoot`, %; `max_settling`, s; `load_torque`, N m, a load step to
     withstand, by default half of the torque that can still be held at the set point; `delay`, 0 or 1 samples from
@@ -178,6 +180,10 @@ def tune(
     **Raises**: `InputError`, stating the limit, for a specification that no controller can meet.
     """
     begin = time.perf_counter()
+    if not isinstance(motor, Motor):
+        uncertainty = uncertainty or load_uncertainty(motor)
+        recorded_noise = load_speed_noise(motor) if recorded_noise is None else recorded_noise
+        motor = load_motor(motor)
     requirements = LoopRequirements(
         controller=controller,
         setpoint=setpoint,
@@ -197,18 +203,18 @@ def tune(
     )
     free_memory_maps()
     report = progress or silent
-    motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
-    specification = requirements.completed(motor)
+    subject: Motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
+    specification = requirements.completed(subject)
     variation = uncertainty if spread is None else even_spread(spread)
     report("tuning from many starts")
     task_samples = PART_COUNT * specification.part_samples
     unit_noise = np.random.default_rng(seed).standard_normal(task_samples)
-    task = _task(specification, motor, unit_noise)
-    tuning_motors = _tuning_motors(motor, variation, seed)
+    task = _task(specification, subject, unit_noise)
+    tuning_motors = _tuning_motors(subject, variation, seed)
     best = _best_controller(specification, task, tuning_motors, unit_noise, seed, starts)
     report("evaluating the loop", fraction=0.8)
-    validation_motors = None if variation is None else _validation_motors(motor, variation, seed)
-    result = _evaluated(specification, task, motor, best, validation_motors, seed)
+    validation_motors = None if variation is None else _validation_motors(subject, variation, seed)
+    result = _evaluated(specification, task, subject, best, validation_motors, seed)
     return attrs.evolve(
         result,
         messages=(*specification.notes, *_undetermined_remark(uncertainty), *_remarks(result)),

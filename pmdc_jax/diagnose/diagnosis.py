@@ -13,13 +13,14 @@ from ..identify.identification import Estimate, Identification, Role, RunFit
 Verdict = Literal["none_detected", "named", "ambiguous", "not_in_library"]
 
 
-# Electrical misfit (`balance.electrical_misfit`) that no torque and no effect of the library explains. Peculiarities of
-# sensors and model-form error leave up to 1.4; what is not in the library, such as a current that is the mean of many
-# samples, leaves 3 and more.
+# Electrical misfit (`electrical_misfit`) that no torque and no effect of the library explains. Peculiarities of sensors
+# and model-form error leave up to 1.4; what is not in the library, such as a current that is the mean of many samples,
+# leaves 3 and more.
 MAX_ELECTRICAL = 3.0
-# The effects added are not what is missing if they leave an electrical misfit above the first value whose excess over
-# the noise, in squares, is more than the second share of that of the motor without effects
-MAX_EXPLAINED_ELECTRICAL, MAX_ELECTRICAL_SHARE = 1.5, 0.5
+# The effects added are not what is missing if they leave an electrical misfit above this,
+MAX_EXPLAINED_ELECTRICAL = 1.5
+# whose excess over the noise, in squares, is more than this share of that of the motor without effects
+MAX_ELECTRICAL_SHARE = 0.5
 # Misfit of hold-outs over that of the fitted runs above which the hold-outs show something that the fitted runs do not
 MAX_HOLDOUT_RATIO = 2.5
 # Misfit of hold-outs after effects were added, over that before, above which these made them worse
@@ -129,7 +130,7 @@ class Diagnosis:
     base: Identification  # without effects
     final: Identification  # with the effects that were found
     p_nothing: float  # p-value of the data if nothing were missing
-    # residual of the electrical equation over the sensors' white noise; see `balance.electrical_misfit`
+    # residual of the electrical equation over the sensors' white noise; see `electrical_misfit`
     electrical_misfit: float
     electrical_misfit_before: float  # the same without effects
     seconds: Mapping[str, float]  # time taken: "identify", "name", "total"

@@ -22,7 +22,7 @@ from ..simulate import UNKNOWNS_PER_RUN, Tape
 from .fit.generalised_least_squares import residuals_of, series_of, training_indices
 from .fit.polish import Fit
 from .identification import Identification
-from .noise.noise_model import Series, Whitener, scaling_whitener, whitener
+from .noise.noise_model import Series, Whitener, fit_whitener, scaling_whitener
 from .prepare import Prepared
 
 # Standard errors above zero from which friction is significant
@@ -60,7 +60,7 @@ def missing_friction(prepared: Prepared, fit: Fit) -> MissingFriction | None:
         regression.z_score(count) <= MIN_Z_SCORE
     ):  # too large rather than too small where the noise is coloured
         return None
-    regression = _regress(rows, whitener(regression.residuals), count)
+    regression = _regress(rows, fit_whitener(regression.residuals), count)
     z_score = regression.z_score(count)
     friction, bias = float(regression.coefficients[count]), regression.coefficients[:count]
     return MissingFriction(friction, z_score, bias) if z_score > MIN_Z_SCORE else None

@@ -82,6 +82,7 @@ class Search:
     median: np.ndarray  # (generations,)
     refined: np.ndarray  # (starts,) fitness after refinement, ascending
     times_found: int  # how many of the starts ended in the best optimum
+    interrupted: bool = False  # whether the keyboard ended it early
 
 
 @frozen

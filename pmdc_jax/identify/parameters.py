@@ -15,6 +15,9 @@ from ..motor import PARAMETERS, Motor
 
 Coordinates = Float[Array, "*population parameters"]
 
+# What the units of the parameters begin with that are proportional to torque
+TORQUE_UNITS = ("N m", "kg m^2")
+
 
 class Parameters(eqx.Module):
     """The free parameters with their bounds, and those that are known or tied.
@@ -78,6 +81,16 @@ class Parameters(eqx.Module):
             for effect in self.effects
         )
         return Motor(**{name: values[name] for name in PARAMETERS}, effects=effects)
+
+    def with_torques_scaled(
+        self, coordinates: Float[np.ndarray, "*motors parameters"], factor: float
+    ) -> Float[np.ndarray, "*motors parameters"]:
+        """The coordinates with all torques, and Kt, J and f with them, multiplied by a factor: without a known load
+        the motor moves the same."""
+        torques = np.array([unit_of(name).startswith(TORQUE_UNITS) for name in self.names])
+        logarithmic = np.array(self.logarithmic)
+        scaled = np.where(torques & ~logarithmic, coordinates * factor, coordinates)
+        return scaled + np.where(torques & logarithmic, np.log(factor), 0.0)
 
     def value(self, name: str, coordinates: np.ndarray) -> float:
         """One parameter in SI."""

@@ -14,7 +14,7 @@ from ..runtime.precision import double_precision
 from .fit.generalised_least_squares import last_fit, residuals_of
 from .friction_test import friction_messages, missing_friction
 from .identification import Identification
-from .noise.noise_model import whitener
+from .noise.noise_model import fit_whitener
 from .parameters import effects_named
 from .prepare import prepare
 from .results import results_of
@@ -57,12 +57,12 @@ def identify(
     report("estimating the uncertainty", solved.fit.fitness)
     plain_fit = solved.fit
     friction = missing_friction(prepared, plain_fit)
-    white = whitener(residuals_of(prepared, plain_fit))
+    white = fit_whitener(residuals_of(prepared, plain_fit))
     prepared, polished = last_fit(prepared, plain_fit, plain_fit, white)
     result = results_of(prepared, solved._replace(fit=polished))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
     residual_messages = (
-        f"the residual of the {name} is {times:.2g} times its white noise: run `pmdc diagnose` to find out whether the "
+        f"the residual of the {name} is {times:.3g} times its white noise: run `pmdc diagnose` to find out whether the "
         "model lacks an effect, or the motor or a sensor was disturbed"
         for name, times in result.missed.items()
     )

@@ -20,7 +20,7 @@ from ..motor import PARAMETERS
 from ..recordings.clock import evenly_stamped
 from ..recordings.recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
 from ..recordings.recording_file import Runs, named_apart, recordings_of
-from ..simulate import HELD, Tape, Timing, uniform
+from ..simulate import ZERO_ORDER_HOLD, Tape, Timing, uniform
 from .identification import Role
 from .noise.sensor_noise import white_noise
 from .parameters import Parameters, check_names
@@ -45,7 +45,7 @@ class Prepared(NamedTuple):
     input_noise: Mapping[str, float] = MappingProxyType({})
     # how the recorded speeds are averaged, None if they are instantaneous
     averaging: Averaging | None = None
-    timing: Timing = HELD
+    timing: Timing = ZERO_ORDER_HOLD
     # whether steps of the voltages were placed between samples
     stepped: bool = False
 

@@ -15,7 +15,7 @@ from ..simulate import RunUnknowns, Tape
 from .fit.polish import Fit, fit_at, polish
 from .fit.refine import Optimum
 from .fit.run_unknowns import fit_run_unknowns
-from .identification import Estimate, Identification, Role, RunFit, Status
+from .identification import Direction, Estimate, Identification, Role, RunFit, Status
 from .noise.sensor_noise import ratio_to_noise, rms, white_noise
 from .parameters import Parameters, unit_of
 from .prepare import Prepared
@@ -24,15 +24,18 @@ from .solve import FITNESS_TOLERANCE, Solved
 from .uncertainty.covariance import MIN_UNSEEN_STDERR, Information, information_of
 from .uncertainty.identifiability import (
     MIN_SHARE,
+    enumerate_names,
     explain_directions,
-    step_to_equal_constants,
-    torque_scale,
+    sees_torque_scale,
 )
 from .uncertainty.profile import QUADRATIC_STDERR, profile_interval
 
-TIE_ITERATIONS = 3
 # Residuals this many times their white noise are reported
 MAX_RESIDUAL_RATIO = 2.0
+# An unknown load is worth a message from this share of the motor's torque on (root mean square),
+MIN_LOAD_SHARE = 0.02
+# if it differs by less than this share of itself between the runs
+MAX_LOAD_SPREAD = 0.2
 # Units of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
 # Spans over which a speed may be averaged
@@ -73,7 +76,10 @@ def results_of(prepared: Prepared, solved: Solved) -> Identification:
     return Identification(
         motor=motor,
         parameters=_estimates(parameters, best, info, prepared, _intervals(problem, best, info)),
-        unidentified_directions=explain_directions(info.unseen, parameters, training),
+        unidentified_directions=(
+            *_without_effect(prepared),
+            *explain_directions(info.unseen, parameters, training),
+        ),
         fit=fit,
         noise={"current_A": noise["current"], "speed_rad_s": noise["speed"]},
         distance=best.distance,
@@ -83,7 +89,10 @@ def results_of(prepared: Prepared, solved: Solved) -> Identification:
         findings=prepared.findings,
         covariance=covariance,
         covariance_names=names,
-        messages=_messages(prepared, solved, Kt_set_to_Kb=chosen is not released),
+        messages=(
+            *_messages(prepared, solved, Kt_set_to_Kb=chosen is not released),
+            *_unknown_load(motor, [one for one in fit.values() if one.role == "train"]),
+        ),
         missed=_large_residuals(fit),
     )
 
@@ -155,24 +164,18 @@ def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
 
 
 def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit:
-    """The fit moved along an unseen direction in which Kt is arbitrary, to Kt = Kb, which are equal in SI.
-
-    The direction is straight only locally, so all other free parameters are refined again; a fit that is worse then is
-    rejected.
-    """
-    names = problem.parameters.names
-    along = torque_scale(info.unseen, names)
-    if along is None:
+    """The fit with all torques scaled so that Kt = Kb, which are equal in SI, where the runs do not show that scale."""
+    parameters, unknowns = problem.parameters, polished.unknowns
+    if sees_torque_scale(info.unseen, parameters.names):
         return polished
-    k, b = names.index("Kt"), names.index("Kb")
-    with_Kt_fixed = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
-    moved = polished
-    for _ in range(TIE_ITERATIONS):  # Kb moves a little as well
-        coordinates = np.array(moved.coordinates)
-        coordinates += step_to_equal_constants(along, coordinates, names)
-        coordinates[k] = coordinates[b]
-        unknowns = moved.unknowns._replace(coordinates=jnp.asarray(coordinates))
-        moved = polish(with_Kt_fixed, moved.optimum._replace(unknowns=unknowns))
+    coordinates = np.asarray(polished.coordinates)
+    factor = parameters.value("Kb", coordinates) / parameters.value("Kt", coordinates)
+    runs = unknowns.runs
+    scaled = unknowns._replace(
+        coordinates=jnp.asarray(parameters.with_torques_scaled(coordinates, factor)),
+        runs=runs._replace(load_offset=runs.load_offset * factor),
+    )
+    moved = fit_at(problem, polished.optimum._replace(unknowns=scaled))
     return moved if moved.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE) else polished
 
 
@@ -299,6 +302,39 @@ def _large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:
     return {name: ratio for name, ratio in ratios.items() if ratio > MAX_RESIDUAL_RATIO}
 
 
+def _without_effect(prepared: Prepared) -> list[Direction]:
+    """The parameters that affect no run, as of the electrical half where only a torque is recorded."""
+    names = tuple(name for name in prepared.irrelevant if name not in prepared.known)
+    if not names:
+        return []
+    lacking = "a voltage" if {"R", "L"} & set(names) else "a turning rotor"
+    why = f"No run has {lacking}, so {enumerate_names(names)} affect none of them"
+    return [Direction(names, why, "Add a run with a voltage, a current and a speed")]
+
+
+def _unknown_load(motor: Motor, training: Sequence[RunFit]) -> list[str]:
+    """What the unknown load of the runs may be, where it is considerable and the same in all of them."""
+    loads = [fit.load_offset for fit in training if fit.load_offset is not None]
+    currents = [fit.current for fit in training if fit.current is not None]
+    if not loads or not currents:
+        return []
+    least, largest = sorted((min(loads), max(loads)), key=abs)
+    motor_torque = float(motor.Kt) * rms(np.concatenate(currents))
+    differ = abs(largest - least) > MAX_LOAD_SPREAD * abs(least)
+    if differ or abs(least) < MIN_LOAD_SHARE * motor_torque:
+        return []
+    one_way = all(np.ptp(np.sign(fit.speed_simulated)) < 2 for fit in training)
+    return [
+        f"the unknown load is {largest:.3g} N m in all runs: a constant load"
+        + (
+            ", or friction, which looks the same while the motor turns one way only"
+            if one_way
+            else ""
+        )
+        + ". If nothing was attached, give --unloaded"
+    ]
+
+
 def _messages(prepared: Prepared, solved: Solved, Kt_set_to_Kb: bool) -> tuple[str, ...]:
     messages = [
         f"{run.name}: the recorded {run.drive} has {prepared.input_noise[run.name]:.3g} {UNITS[run.drive]} of sensor "
@@ -316,7 +352,7 @@ def _messages(prepared: Prepared, solved: Solved, Kt_set_to_Kb: bool) -> tuple[s
             f"the speed is a mean over {AVERAGING_SPANS[prepared.averaging]}, as differences of an angle are:"
             " this is modelled"
         )
-    if solved.interrupted:
+    if solved.search.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
     if Kt_set_to_Kb:
         messages.append("Kt was set equal to Kb, as holds in SI units, and J and f scale with it")

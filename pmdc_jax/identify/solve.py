@@ -50,7 +50,6 @@ class Solved(NamedTuple):
     fit: Fit
     search: Search
     seed: int
-    interrupted: bool
     seconds: Mapping[str, float]
 
 
@@ -138,7 +137,7 @@ def search_and_refine(
     prepared, polished = polish_with_angle(prepared, ends[0])
     seconds = {"search": search_ended - began, "refine": time.perf_counter() - search_ended}
     record = _search_record(search, search_result, ends)
-    return prepared, Solved(polished, record, seed, search_result.interrupted, seconds)
+    return prepared, Solved(polished, record, seed, seconds)
 
 
 def _continued(before: SearchResult, search: SearchResult) -> SearchResult:
@@ -231,4 +230,5 @@ def _search_record(method: str, search_result: SearchResult, ends: Sequence[Opti
         median=search_result.median,
         refined=np.array([end.fitness for end in ends]),
         times_found=_times_found(ends),
+        interrupted=search_result.interrupted,
     )

@@ -44,8 +44,8 @@ from .notation import (
     enumerate_words,
     field_words,
     fixed,
+    formula_text,
     p_value_words,
-    parameter_words,
     percent,
     significant,
     value_with_unit,
@@ -90,10 +90,10 @@ def _tiles(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     error = significant(gap.before)
     if diagnosis.effects:
         error += f" → {significant(gap.after)}"
-    chance = f"no missing effect: {p_value_words(diagnosis.p_nothing)}"
+    chance = f"{p_value_words(diagnosis.p_nothing)} if nothing were missing"
     if diagnosis.varies and not diagnosis.effects:
         varies = diagnosis.varies
-        chance = f"{varies.name} the same in all runs: {p_value_words(varies.p_value)}"
+        chance = f"{p_value_words(varies.p_value)} if {varies.name} were the same in all runs"
     tiles = [("Verdict", VERDICTS[diagnosis.verdict], chance)]
     tiles.append((f"{role_word(role).capitalize()} error", error, "times the noise"))
     if diagnosis.effects and diagnosis.closed_fraction is not None:
@@ -107,10 +107,9 @@ def _effect(effect: EffectFound) -> dict[str, Any]:
         (field_words(effect.name, field), write_estimate(estimate))
         for field, estimate in effect.parameters.items()
     ]
-    kind = EFFECTS[effect.name]
     return {
-        "label": kind.label,
-        "formula": kind.formula,
+        "label": EFFECTS[effect.name].label,
+        "formula": formula_text(effect.name),
         "equation": effect.equation,
         "parameters": parameters,
         "chance": p_value_words(effect.p_value),
@@ -138,7 +137,9 @@ def _region(region: Region) -> dict[str, str]:
     return {
         "equation": region.equation,
         "variable": region.variable,
-        "where": intervals_in_words(region.variable, [region.region]),
+        "where": intervals_in_words(region.variable, [region.region]).removeprefix(
+            f"at a {region.variable} "
+        ),
         "z": fixed(region.z, 1),
     }
 
@@ -260,8 +261,12 @@ def _varies(diagnosis: Diagnosis) -> dict[str, Any] | None:
     }
 
 
-def _detectable(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+def _detectable(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     return [
-        (parameter_words(one.effect, one.parameter), value_with_unit(one.amplitude, one.unit, 2))
+        (
+            EFFECTS[one.effect].label,
+            field_words(one.effect, one.parameter),
+            value_with_unit(one.amplitude, one.unit, 2),
+        )
         for one in detectable_others(diagnosis)
     ]

@@ -7,10 +7,10 @@ from rich.table import Table
 from rich.text import Text
 
 from ..diagnose.diagnosis import Diagnosis
+from ..effects import EFFECTS
 from .diagnosis_sentences import detectable_others, drift_words, drifts, verdict_sentences
 from .identification_sentences import role_word, runs_in_order
 from .notation import (
-    effect_words,
     field_words,
     p_value_words,
     significant,
@@ -37,7 +37,7 @@ def _effects(diagnosis: Diagnosis) -> Table:
         for number, (field, estimate) in enumerate(effect.parameters.items()):
             first = number == 0
             written = write_estimate(estimate)
-            name = effect_words(effect.name) if first else ""
+            name = EFFECTS[effect.name].label if first else ""
             numbers = (written.value, written.unit, written.stderr, written.interval)
             probability = p_value_words(effect.p_value).removeprefix("p ").removeprefix("= ")
             end = probability if first else ""
@@ -72,7 +72,7 @@ def _gaps(diagnosis: Diagnosis) -> Table:
 def _detectable(diagnosis: Diagnosis) -> Table:
     rows = []
     for one in detectable_others(diagnosis):
-        names = (effect_words(one.effect), field_words(one.effect, one.parameter))
+        names = (EFFECTS[one.effect].label, field_words(one.effect, one.parameter))
         rows.append((*names, value_with_unit(one.amplitude, one.unit, 2)))
     headings = ("Effect", "Parameter", "From")
     return plain_table(

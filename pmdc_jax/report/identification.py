@@ -24,6 +24,7 @@ from .notation import (
     fixed,
     parameter_words,
     percent,
+    search_name,
     significant,
     thousands,
     write_estimate,
@@ -156,7 +157,7 @@ def _search(identification: Identification) -> dict[str, Any]:
     search = identification.search
     drawn = len(search.best) + len(search.refined) > 0
     return {
-        "method": search.method.replace("_", " "),
+        "method": search_name(search.method),
         "evaluations": thousands(search.evaluations),
         "starts": len(search.refined),
         "times_found": search.times_found,

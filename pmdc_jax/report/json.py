@@ -115,8 +115,8 @@ def _varying(diagnosis: Diagnosis) -> dict[str, Any] | None:
     }
 
 
-def _gap(gap: Gap | None) -> dict[str, Any] | None:
-    return None if gap is None else asdict(gap)
+def _gap(gap: Gap | None) -> dict[str, Any]:
+    return {name: getattr(gap, name, None) for name in ("before", "after", "floor")}
 
 
 def _experiment(experiment: NextExperiment | None) -> dict[str, Any] | None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from math import floor, isfinite, log10
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from ..effects import EFFECTS
 from ..identify.identification import Estimate
@@ -20,6 +21,12 @@ PARAMETER_NAMES = {
     "Kt": "torque constant",
     "J": "inertia",
     "f": "viscous friction",
+}
+SEARCH_NAMES = {
+    "cma_es": "CMA-ES",
+    "paper_ga": "Genetic algorithm of the wheelchair paper",
+    "differential_evolution": "Differential evolution",
+    "particle_swarm": "Particle swarm",
 }
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -36,7 +43,10 @@ class EstimateText:
 
 
 def write_estimate(estimate: Estimate) -> EstimateText:
-    """Write an estimate with as many decimals as give its standard error two significant digits."""
+    """Write an estimate with as many decimals as give its standard error two significant digits; a known value has no
+    error."""
+    if estimate.status == "known":
+        estimate = evolve(estimate, stderr=None, ci95=None)
     exponent = engineering_exponent(estimate.value or 0.0, estimate.unit)
     scale = 10.0**exponent
     decimals = _decimals((estimate.value or 0.0) / scale, (estimate.stderr or 0.0) / scale)
@@ -59,7 +69,8 @@ def significant(value: float | None, digits: int = 3) -> str:
     if value is None or not isfinite(value):
         return UNKNOWN
     if value and not -5 < _magnitude(value) < 6:
-        return f"{value:.{digits - 1}e}".replace("-", "−")
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa.replace('-', '−')}×10{str(int(exponent)).translate(_SUPERSCRIPT)}"
     return fixed(value, max(0, digits - 1 - _magnitude(value)))
 
 
@@ -114,6 +125,16 @@ def fixed(value: float | None, decimals: int) -> str:
     if value is None or not isfinite(value):
         return UNKNOWN
     return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def search_name(method: str) -> str:
+    """A global search as printed in reports."""
+    return SEARCH_NAMES.get(method, method.replace("_", " ").capitalize())
+
+
+def formula_text(effect: str) -> str:
+    """The formula of an effect, in which the speed is ω."""
+    return re.sub(r"\bw(?![a-zA-Z0-9])", "ω", EFFECTS[effect].formula).replace("-", "−")
 
 
 def effect_words(effect: str) -> str:

@@ -27,7 +27,7 @@ from ..wheelchair import (
     load_errors,
 )
 from .figures import INPUT, MEASURED, RESIDUAL, SIMULATED, style
-from .notation import significant, thousands
+from .notation import pretty_unit, significant, thousands
 from .page import figure_json, write_page
 from .terminal import plain_table
 
@@ -41,7 +41,8 @@ def table_1(paper: Paper) -> tuple[list[str], list[list[str]]]:
         headings += [one.method, "error [%]"]
     rows = []
     for name in PARAMETERS:
-        row = [name, significant(float(getattr(PRINTED, name)), 4)]
+        printed = significant(float(getattr(PRINTED, name)), 4)
+        row = [f"{name} [{pretty_unit(PARAMETERS[name])}]", printed]
         for one in paper.recovered:
             row += [
                 significant(float(getattr(one.motor, name)), 4),
@@ -49,7 +50,7 @@ def table_1(paper: Paper) -> tuple[list[str], list[list[str]]]:
             ]
         rows.append(row)
     rows.append(_effort_row("evaluations", paper, lambda one: thousands(one.evaluations)))
-    rows.append(_effort_row("seconds", paper, lambda one: f"{one.seconds:.1f}"))
+    rows.append(_effort_row("time [s]", paper, lambda one: f"{one.seconds:.1f}"))
     return headings, rows
 
 
@@ -103,7 +104,7 @@ def remarks(paper: Paper) -> list[str]:
         f"From rest at full voltage, {VOLTAGE:g} V enters the 2 % band after {paper.fastest[VOLTAGE]:.4f} s; the"
         f" printed 0.08 s takes {SUFFICIENT_VOLTAGE:g} V ({paper.fastest[SUFFICIENT_VOLTAGE]:.4f} s).",
         *_printed_remarks(paper),
-        "Equation (8) prints +R/L where equation (5) gives -R/L, and multiplies the load column by u.",
+        "Equation (8) prints +R/L where equation (5) gives −R/L, and multiplies the load column by u.",
         "Kt and Kb are one constant in SI; the paper has 0.0501 and 0.0492.",
         "A motor with two poles does not oscillate at any gain, so the Ziegler-Nichols rule cannot be applied to the"
         " ideal loop.",
@@ -214,7 +215,7 @@ def errors_figure(paper: Paper, quantity: str) -> go.Figure:
             go.Scatter(x=LOADS, y=errors, name=one.method, line_color=colour, mode="lines+markers")
         )
     figure.update_yaxes(title_text=f"error of {quantity} [%]")
-    figure.update_xaxes(title_text="load torque [N m]")
+    figure.update_xaxes(title_text="load torque [N·m]")
     style(figure, height=300)
     return figure
 

@@ -12,11 +12,21 @@ from rich.text import Text
 from ..control.controller_file import gains_of, law_content
 from ..control.evaluation import SMALL_STEP, EvaluatedController, Robustness
 from ..control.objective import SECOND_SETPOINT
-from ..control.tuning import Tuning
+from ..control.tuning import CURRENT_TO_REPORT, Tuning
 from .notation import NARROW_SPACE, UNKNOWN, percent, pretty_unit, significant
 from .terminal import plain_table
 
 GAIN_HEADINGS = ("Gain", "Value", "Unit")
+VISIBLE_EXCESS = 5e-4  # of the current over its limit
+METRICS = {
+    "RiseTime": ("Rise time, 10 to 90 %", "s"),
+    "SettlingTime": ("Settling time", "s"),
+    "Overshoot": ("Overshoot", "% of the step"),
+    "Undershoot": ("Undershoot", "% of the step"),
+    "Peak": ("Peak speed", "rad/s"),
+    "PeakTime": ("Time of the peak", "s"),
+    "SteadyStateError": ("Steady-state error", "rad/s"),
+}
 COMPARISON_HEADINGS = (
     "Settling\n[ms]",
     "Relative to\nfastest",
@@ -87,6 +97,7 @@ def summary(tuning: Tuning) -> list[str]:
         _robust_sentence(tuning.robust),
         _margin_sentence(tuning),
         _noise_sentence(tuning),
+        _current_sentence(tuning.peak_current, tuning.requirements.current_limit),
     )
     return [one for one in sentences if one]
 
@@ -122,9 +133,10 @@ def _load_sentence(tuning: Tuning) -> str:
             if recovery
             else "stays within 2 %"
         )
+    torque, deviation = significant(tuning.load_torque), significant(tuning.load["Deviation"])
     return (
-        f"A load step of {tuning.load_torque:.3g} N m changes the speed by {significant(tuning.load['Deviation'])}"
-        f" rad/s; it {back}, with a steady-state error of {significant(steady_state_error, 2)} rad/s."
+        f"A load step of {torque} N·m changes the speed by {deviation} rad/s; it {back},"
+        f" with a steady-state error of {significant(steady_state_error, 2)} rad/s."
     )
 
 
@@ -163,6 +175,23 @@ def _noise_sentence(tuning: Tuning) -> str:
         f"Noise of {significant(noise)} rad/s of the speed sensor{source} moves the voltage by"
         f" {significant(voltage, 2)} V RMS."
     )
+
+
+def _current_sentence(peak: float, limit: float | None) -> str:
+    """By how much the current exceeds its limit, where no message says so."""
+    excess = _current_excess(peak, limit)
+    if not excess or excess > CURRENT_TO_REPORT - 1:
+        return ""
+    return (
+        f"The current reaches {significant(peak, 4)} A, {percent(100 * excess)} above its limit: the law"
+        " limits what it predicts for one instant of each sample."
+    )
+
+
+def _current_excess(peak: float, limit: float | None) -> float:
+    """The largest current over its limit, less one; 0 without a limit, or where both look the same as printed."""
+    excess = peak / limit - 1 if limit else 0.0
+    return excess if excess > VISIBLE_EXCESS else 0.0
 
 
 def _time_text(seconds: float | None) -> str:
@@ -209,6 +238,16 @@ def _candidate_row(one: EvaluatedController, fastest: float) -> tuple[str, ...]:
     )
 
 
+def _current_note(tuning: Tuning) -> str:
+    limit = tuning.requirements.current_limit
+    excess = _current_excess(tuning.peak_current, limit)
+    return (
+        f"{percent(100 * excess)} above the limit of {limit:g} A"
+        if excess
+        else _limits_text(tuning)
+    )
+
+
 def _milli(value: float | None) -> float | None:
     return None if value is None else 1e3 * value
 
@@ -228,7 +267,10 @@ def write_tuning_report(tuning: Tuning, path: str | Path) -> None:
         gains=gain_rows(tuning),
         headings=[heading.replace("\n", " ") for heading in COMPARISON_HEADINGS],
         comparison=comparison(tuning),
-        metrics=[(name, significant(value, 4)) for name, value in tuning.metrics.items()],
+        metrics=[
+            (METRICS[name][0], significant(value, 4), METRICS[name][1])
+            for name, value in tuning.metrics.items()
+        ],
         figure=figure_json(loop_figure(tuning)),
         robust=figure_json(robust_figure(tuning)) if tuning.robust else None,
         seed=tuning.seed,
@@ -244,7 +286,7 @@ def _tiles(tuning: Tuning) -> list[tuple[str, str, str]]:
     tiles = [
         ("Settling", _time_text(settling), f"{significant(ratio)} times the fastest possible"),
         ("Overshoot", percent(overshoot), f"at most {max_overshoot:g} % allowed"),
-        ("Largest current", f"{significant(tuning.peak_current)} A", _limits_text(tuning)),
+        ("Largest current", f"{significant(tuning.peak_current, 4)} A", _current_note(tuning)),
     ]
     if tuning.robust is not None:
         slow = _time_text(tuning.robust.SettlingTime_p95)

@@ -82,11 +82,13 @@ def _response_traces(tuning: Tuning) -> Traces:
 
 
 def _limit_traces(tuning: Tuning) -> Traces:
-    """The voltage limit, and the current limit if there is one."""
+    """The limits of the voltage, and of the current if it has one, in both directions."""
     ends, hardware = np.array([0.0, _milliseconds(tuning)[-1]]), tuning.hardware
     for row, limit in ((VOLTAGE, hardware.voltage_limit), (CURRENT, hardware.current_limit)):
-        if limit is not None:
-            yield row, _line("limit", ends, np.full(2, float(limit)), LIMIT_LINE)
+        if limit is None:
+            continue
+        for level in (float(limit), -float(limit)):
+            yield row, _line("limit", ends, np.full(2, level), LIMIT_LINE)
 
 
 def _mark_event(figure: go.Figure, moment: float, label: str) -> None:
@@ -123,21 +125,38 @@ def _line(
 
 
 def robust_figure(tuning: Tuning) -> go.Figure:
-    """Overshoot against settling time of every drawn motor that settles, for the tuned and the textbook controller."""
-    figure = go.Figure()
-    for one, colour in zip(tuning.candidates, (SIMULATED, RESIDUAL), strict=False):
-        if one.robust is None:
-            continue
-        settles = np.isfinite(one.robust.settling)
+    """Overshoot against settling time of every drawn motor that settles: a panel for each controller, because their
+    clouds may be small and far apart."""
+    names, clouds = [], []
+    for one in tuning.candidates:
+        if one.robust is not None:
+            settles = np.isfinite(one.robust.settling)
+            names.append(one.name)
+            clouds.append((1e3 * one.robust.settling[settles], one.robust.overshoot[settles]))
+    figure = make_subplots(cols=len(names), subplot_titles=names)
+    for column, (settling, overshoot) in enumerate(clouds, start=1):
+        marker = {"color": (SIMULATED, RESIDUAL)[column - 1], "size": 5, "opacity": 0.6}
         trace = go.Scatter(
-            x=1e3 * one.robust.settling[settles],
-            y=one.robust.overshoot[settles],
+            x=settling,
+            y=overshoot,
             mode="markers",
-            name=one.name,
-            marker={"color": colour, "size": 5, "opacity": 0.6},
+            marker=marker,
+            showlegend=False,
+            cliponaxis=False,
         )
-        figure.add_trace(trace)
-    figure.update_xaxes(title_text="settling [ms]")
-    figure.update_yaxes(title_text="overshoot [%]", rangemode="tozero")
+        figure.add_trace(trace, row=1, col=column)
+        around = _range(settling, 0.02 * max(settling, default=0.0))
+        figure.update_xaxes(title_text="settling [ms]", range=around, row=1, col=column)
+        figure.update_yaxes(range=_range(overshoot, 0.2), row=1, col=column)
+    figure.update_yaxes(title_text="overshoot [%]", row=1, col=1)
     style(figure, height=340)
     return figure
+
+
+def _range(values: np.ndarray, smallest: float) -> list[float] | None:
+    """The range of an axis with a margin around values of at least 0, no narrower than `smallest`; None without any."""
+    if not len(values):
+        return None
+    low, high = float(values.min()), float(values.max())
+    margin = max(0.1 * (high - low), (smallest - (high - low)) / 2)
+    return [max(0.0, low - margin), high + margin]

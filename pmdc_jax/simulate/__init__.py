@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import attrs
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..motor import Motor
+from ..motor_file import load_motor
 from ..recordings.recording import Recording
 from ..recordings.recording_file import Run, recordings_of
 from ..runtime.precision import double_precision
@@ -16,17 +19,17 @@ from .population import squared_errors
 from .reference import reference_solution
 from .shooting import UNKNOWNS_PER_RUN, RunUnknowns, free_run, sensitivities
 from .tape import Tape
-from .timing import EARLY, HELD, LATE, SMOOTH, STRAIGHT, Timing
+from .timing import FIRST_ORDER_HOLD, RECORDED_EARLY, RECORDED_LATE, SMOOTH, ZERO_ORDER_HOLD, Timing
 from .uneven import simulated_at_stamps
 from .uniform import uniform
 
 __all__ = [
-    "EARLY",
-    "HELD",
-    "LATE",
+    "FIRST_ORDER_HOLD",
+    "RECORDED_EARLY",
+    "RECORDED_LATE",
     "SMOOTH",
-    "STRAIGHT",
     "UNKNOWNS_PER_RUN",
+    "ZERO_ORDER_HOLD",
     "RunUnknowns",
     "Tape",
     "Timing",
@@ -40,26 +43,28 @@ __all__ = [
 
 
 @double_precision
-def simulate(motor: Motor, recording: Run) -> Recording:
+def simulate(motor: Motor | str | Path, recording: Run) -> Recording:
     """Simulate a motor with the inputs of a recording, from its recorded initial state.
 
-    **Arguments**: `motor`, of scalars; `recording` or its file, whose voltage (or current, or torque), load and time
-    stamps are used; its first current and speed, where recorded, are the initial state, otherwise the motor
-    starts at rest. An unknown load is taken as zero, and a rotor that stood still throughout as held.
+    **Arguments**: `motor`, of scalars, or its file; `recording` or its file, whose voltage (or current, or torque),
+    load and time stamps are used; its first current and speed, where recorded, are the initial state, otherwise the
+    motor starts at rest. An unknown load is taken as zero, and a rotor that stood still throughout as held.
 
     **Returns**: the recording with current (A) and speed (rad/s) simulated at the same time stamps. A run that
     is not driven by voltage has no simulated current.
 
     **Raises**: `InputError` if the simulation diverges.
     """
-    motor = jax.tree.map(jnp.asarray, motor)
+    if not isinstance(motor, Motor):
+        motor = load_motor(motor)
+    subject: Motor = jax.tree.map(jnp.asarray, motor)
     (recording,) = recordings_of(recording, to_simulate=True)
     # the instantaneous speed is simulated, even if the recorded one is a mean
     even = attrs.evolve(uniform(recording), averaging=None)
     tape = Tape.from_recordings([even], unloaded=True)
-    simulated = tape.samples_of(0, free_run(motor, tape), len(even))
+    simulated = tape.samples_of(0, free_run(subject, tape), len(even))
     if even.resampled_from is not None:
-        simulated = simulated_at_stamps(motor, tape.drive_of(0), even, simulated)
+        simulated = simulated_at_stamps(subject, tape.drive_of(0), even, simulated)
     finite = np.isfinite(simulated).all(1)
     if not finite.all():
         raise InputError(

@@ -93,22 +93,22 @@ class Propagator(NamedTuple):
 
 @eqx.filter_jit  # one trace serves all grids
 def make_propagator(
-    motor: Motor, step: StepLength, drive: Drive, straight: bool = False, averaged: bool = False
+    motor: Motor, step: StepLength, drive: Drive, linear_drive: bool = False, averaged: bool = False
 ) -> Propagator:
     """Exact step of the linear part over `step` seconds, and the weights for what the effects add.
 
-    With teeth it is made for teeth that touch, and its `without_contact` for those that do not. `straight` asks for the
-    matrices of a drive that varies linearly instead of being held, `averaged` for those of the mean of the state.
+    With teeth it is made for teeth that touch, and its `without_contact` for those that do not. `linear_drive` asks for
+    the matrices of a drive that varies linearly instead of being held, `averaged` for those of the mean of the state.
     """
     A, B = _linear_part(motor, drive)
-    propagator = _by_linear_part(motor, step, A, B, straight, averaged)
+    propagator = _by_linear_part(motor, step, A, B, linear_drive, averaged)
     teeth = motor.toothed
     if teeth is None:
         return propagator
     assert teeth.contact_state is not None
     open_teeth = motor.with_effects(e.without_contact() for e in motor.effects)
     A_without, _ = _linear_part(open_teeth, drive)
-    without_contact = _by_linear_part(motor, step, A_without, B, straight, averaged)
+    without_contact = _by_linear_part(motor, step, A_without, B, linear_drive, averaged)
     push = (A - A_without)[:, 2 + linear_states(motor).index(teeth.contact_state)]
     without_contact = _with_contact_response(without_contact, contact_response(A, push, step))
     return _with_contact_response(propagator, contact_response(A_without, push, step))._replace(
@@ -128,7 +128,7 @@ def _by_linear_part(
     step: StepLength,
     A: Matrix,
     B: Float[Array, "n 2 *#batch"],
-    straight: bool,
+    linear_drive: bool,
     averaged: bool,
 ) -> Propagator:
     """The propagator of a motor whose linear part is A and B.
@@ -137,7 +137,7 @@ def _by_linear_part(
     doi:10.1006/jcph.2002.6995.
     """
     staged = not motor.affine
-    ramps = straight and not staged  # stages evaluate the drive as it rises
+    ramps = linear_drive and not staged  # stages evaluate the drive as it rises
     (half0, half1, *_), phi = phi_functions(A * step, (3 if staged else 1 + ramps) + averaged)
     stages = weights = None
     if staged:

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from ..motor import Drive
 from ..recordings.recording import OVER_LAST, jumps_of
-from .timing import HELD, Timing
+from .timing import ZERO_ORDER_HOLD, Timing
 from .uneven import mean_and_rise, pieces_of, varies_linearly
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class Tape(eqx.Module):
         recordings: Sequence[Recording],
         unloaded: bool = False,
         follow: bool = False,
-        timing: Timing = HELD,
+        timing: Timing = ZERO_ORDER_HOLD,
     ) -> Tape:
         """Lay recordings end to end.
 
@@ -87,7 +87,7 @@ class Tape(eqx.Module):
         from one sample to the next, and when the outputs are read; its `lead` in whole samples is not applied.
         """
         runs = [_Run(recording, timing) for recording in recordings]
-        rises = timing.straight or any(
+        rises = timing.first_order_hold or any(
             recording.resampled_from is not None for recording in recordings
         )
         averaged = any(r.averaging is not None or r.current_averaged for r in recordings)
@@ -208,9 +208,11 @@ class _Run:
             if recording.current_averaged:
                 self.current = OVER_LAST.with_ends_missing(self.current)
         value = getattr(recording, drive)
-        linear = timing.straight or varies_linearly(recording)
+        linear = timing.first_order_hold or varies_linearly(recording)
         if recording.resampled_from is not None:
-            self.value, self.rise = mean_and_rise(recording, pieces_of(recording, timing.straight))
+            self.value, self.rise = mean_and_rise(
+                recording, pieces_of(recording, timing.first_order_hold)
+            )
         elif timing.smooth is not None:
             decay = timing.smooth * recording.sample_time
             self.value, self.rise = smooth_mean_and_rise(value, decay)

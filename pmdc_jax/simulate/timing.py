@@ -12,8 +12,8 @@ class Timing(NamedTuple):
     were read."""
 
     lead: float  # by how many samples they act before the sample beside which they were recorded, at least -1
-    straight: bool = False  # linear from sample to sample instead of held
-    # with `straight`, R / L in 1/s, or zero if it is unknown, if they are on smooth curves between jumps
+    first_order_hold: bool = False  # linear from sample to sample
+    # with a first-order hold, R / L in 1/s, or zero if it is unknown, if they are on smooth curves between jumps
     smooth: float | None = None
     load: bool = False  # whether the recorded loads have the same timing
     current_mean: bool = False  # whether the recorded currents are means over the last sample
@@ -32,11 +32,11 @@ class Timing(NamedTuple):
     @property
     def what(self) -> str | None:
         """What the voltages do, in words, if they are not held from their sample on."""
-        if self.lead == 0 and not self.straight:
+        if self.lead == 0 and not self.first_order_hold:
             return None
         if self.smooth is not None:
             return "changes smoothly between its samples, except at jumps, instead of being held"
-        if self.straight:
+        if self.first_order_hold:
             return "is linear between samples instead of held"
         if self.reading is not None:
             sooner = "earlier" if self.lead > 0 else "later"
@@ -46,5 +46,8 @@ class Timing(NamedTuple):
         return "acts one sample later than it was recorded"
 
 
-HELD, LATE, EARLY = Timing(0), Timing(1), Timing(-1)
-STRAIGHT, SMOOTH = Timing(0, straight=True), Timing(0, straight=True, smooth=0.0)
+ZERO_ORDER_HOLD = Timing(0)
+RECORDED_LATE = Timing(1)
+RECORDED_EARLY = Timing(-1)
+FIRST_ORDER_HOLD = Timing(0, first_order_hold=True)
+SMOOTH = Timing(0, first_order_hold=True, smooth=0.0)

@@ -38,15 +38,15 @@ def varies_linearly(run: Recording) -> bool:
     return run.drive == "current"
 
 
-def pieces_of(run: Recording, straight: bool) -> Pieces:
-    """The pieces of a run on an even clock, with the recorded drive held, or linear between samples if `straight`."""
+def pieces_of(run: Recording, first_order_hold: bool) -> Pieces:
+    """The pieces of a run on an even clock, with a zero-order hold of the recorded drive, or a first-order one."""
     record, step = run.recorded, run.sample_time
     drive = np.asarray(getattr(record, record.drive))
     edges = np.union1d(np.append(run.time, run.time[-1] + step), record.time)
     begins, length = edges[:-1], np.diff(edges)
     even = np.searchsorted(run.time, begins, "right") - 1
     recorded = np.searchsorted(record.time, begins, "right") - 1
-    linear = straight or varies_linearly(run)
+    linear = first_order_hold or varies_linearly(run)
     slopes = np.append(np.diff(drive) / np.diff(record.time), 0.0) * linear
     slope = slopes[recorded]
     value = drive[recorded] + slope * (begins - record.time[recorded])
@@ -71,14 +71,14 @@ def simulated_at_stamps(
     drive: Drive,
     even: Recording,
     simulated: Float[np.ndarray, "samples 2"],
-    straight: bool = False,
+    first_order_hold: bool = False,
 ) -> Float[np.ndarray, "recorded 2"]:
     """Current A and speed rad/s at the time stamps of a record, from those at the samples of its `even` clock.
 
     Exact for the linear motor, including the difference between the recorded drive and the straight line in its place.
     The contribution of effects is taken to grow in proportion to time within an even sample.
     """
-    pieces = pieces_of(even, straight)
+    pieces = pieces_of(even, first_order_hold)
     time, begins, length, index, value, slope, loads = pieces
     mean, rise = mean_and_rise(even, pieces)
     step, line_start, line_slope = even.sample_time, mean - rise / 2, rise / even.sample_time

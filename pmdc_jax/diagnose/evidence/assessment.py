@@ -20,17 +20,22 @@ from .signals import Screen, Signal
 # False-alarm probability: that anything is called missing from a motor that lacks nothing, or, once effects were
 # added, that anything more is in all later looks together
 FALSE_ALARM = 0.01
-# Model-form error: the share of the squares explained by effects that imperfect formulas of them may leave; the larger
-# one if the rest is a curve over an effect's own variable
-MODEL_FORM_SHARE, OWN_MODEL_FORM_SHARE = 0.1, 0.5
-# Gain of a candidate or curve over that of the clearest signal: from the first share on a candidate is worth a trial,
-# from the second on a curve describes what is left, from the third on what is left is clearly a candidate's effect
-TRIAL_SHARE, CURVE_SHARE, EFFECT_SHARE = 0.3, 0.5, 0.7
+# Model-form error: the share of the squares explained by effects that imperfect formulas of them may leave,
+MODEL_FORM_SHARE = 0.1
+# and the same if the rest is a curve over an effect's own variable
+OWN_MODEL_FORM_SHARE = 0.5
+# Shares of the gain of the clearest signal: from this one on a candidate is worth a trial,
+TRIAL_SHARE = 0.3
+# from this one on a curve describes what is left,
+CURVE_SHARE = 0.5
+# and from this one on what is left is clearly a candidate's effect
+EFFECT_SHARE = 0.7
 # By simple effect, its fuller form if that has no regression column: only a refit can test it, such as backlash
 REFIT_ONLY = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}
-# The clearest gain left, over what the effects explain, below which nothing more is worth a trial; the larger one for
-# models with a refit-only form, whose fit is never exact because when teeth meet is unpredictable
-NEGLIGIBLE, NEGLIGIBLE_REFIT_ONLY = 2e-3, 1e-2
+# The clearest gain left, over what the effects explain, below which nothing more is worth a trial
+NEGLIGIBLE = 2e-3
+# The same for models with a refit-only form, whose fit is never exact because when teeth meet is unpredictable
+NEGLIGIBLE_REFIT_ONLY = 1e-2
 
 
 def familywise_p_value(

@@ -23,7 +23,7 @@ from ...identify.identification import Estimate
 from ...identify.parameters import unit_of
 from ...identify.results import run_fits
 from ...identify.uncertainty.covariance import information_of
-from ...identify.uncertainty.identifiability import step_to_equal_constants, torque_scale
+from ...identify.uncertainty.identifiability import sees_torque_scale
 from ...motor import PARAMETERS
 from ...simulate import RunUnknowns
 from ..diagnosis import VaryingParameter
@@ -156,13 +156,13 @@ def _squares(
 def _estimates_by_run(model: Model, variation: _Variation, fit: FitByRun) -> dict[str, Estimate]:
     """The parameter in each run that determines it."""
     prepared, place, fixed = model.prepared, _place(model, variation.name), [*model.fit.at_bound]
-    own, names = fit.coordinates[model.training, place], prepared.problem.parameters.names
-    along = torque_scale(information_of(prepared.problem, model.fit).unseen, names)
-    if (
-        along is not None
-    ):  # with Kt = Kb, as in the identified motor: the ratios between runs do not depend on it
-        own = own + step_to_equal_constants(along, fit.coordinates[0], names)[place]
-        fixed.append(names.index("Kt"))
+    parameters, coordinates = prepared.problem.parameters, fit.coordinates
+    unseen = information_of(prepared.problem, model.fit).unseen
+    if not sees_torque_scale(unseen, parameters.names):  # Kt = Kb, as in the identified motor
+        Kb, Kt = (parameters.value(name, coordinates[0]) for name in ("Kb", "Kt"))
+        coordinates = parameters.with_torques_scaled(coordinates, Kb / Kt)
+        fixed.append(parameters.names.index("Kt"))
+    own = coordinates[model.training, place]
     errors, reaches = errors_by_run(prepared.problem, fit, place, fixed)
     return {
         run.name: _estimate(variation.name, *of_run)

@@ -34,9 +34,10 @@ CHANCE_ERRORS = 3.0
 # The drop of the brushes may set in gradually: currents, over their root mean square, at which it is within 1/e of its
 # final value
 ONSETS = (0.02, 0.06, 0.2)
-# Bounds of the natural logarithms of R, Kb and L over those of the model, and the first guess of L, if it is less, as a
-# share of R times the sample time: a smaller one is not felt, and no gradient leads back
-MAX_LOGARITHM, MIN_GUESS = 7.0, 0.1
+# Bounds of the natural logarithms of R, Kb and L over those of the model
+MAX_LOGARITHM = 7.0
+# Least first guess of L over R times the sample time: a smaller one is not felt, and no gradient leads back
+MIN_GUESS = 0.1
 
 
 class _Electrical(NamedTuple):
@@ -54,7 +55,7 @@ class _Electrical(NamedTuple):
         return _Electrical(R, Kb, L, by[3:])
 
 
-class _Steps(NamedTuple):
+class _SampleIntervals(NamedTuple):
     """What acts in the steps of one run from sample to sample, at the start and at the end of each."""
 
     seconds: float
@@ -74,7 +75,7 @@ class _Steps(NamedTuple):
 class _Balance(NamedTuple):
     """The electrical equation in the measured steps of one run."""
 
-    measured: _Steps
+    measured: _SampleIntervals
     # current at the end less what the model has there beside its electrical equation, A
     reached: Float[np.ndarray, " steps"]
     noise: float  # of the sensors, in a residual, A
@@ -170,10 +171,10 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     shapes = brushes * _shapes(measured[:, 0])
     opposing = np.stack([shapes[:-1], shapes[1:]], 1)[pairs]
 
-    def steps(signals: Float[np.ndarray, "samples 2"]) -> _Steps:
+    def steps(signals: Float[np.ndarray, "samples 2"]) -> _SampleIntervals:
         i, w = signals[:-1, 0][pairs], signals[:, 1]
         speed = np.stack([w[1:] if is_mean else w[:-1], w[1:]], 1)[pairs]
-        return _Steps(seconds, i, speed, voltage, opposing)
+        return _SampleIntervals(seconds, i, speed, voltage, opposing)
 
     reached = residuals[1:, 0][pairs] + steps(simulated).predicted(motor)
     decay, weights = _weights(motor, seconds)

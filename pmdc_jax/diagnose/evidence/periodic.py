@@ -17,18 +17,21 @@ from ..model import Model, series_of_runs
 
 # Frequencies (bins) whose median power is the level around a line
 LEVEL_BINS = 41
-# Below the bin SLOW_BINS, where noise rises steeply, the level is taken from bins NEAREST to FARTHEST away; the bins up
-# to NEAREST are not searched
-SLOW_BINS, NEAREST, FARTHEST = 12, 3, 6
+# Below this bin, where noise rises steeply, the level is taken from bins `NEAREST` to `FARTHEST` away
+SLOW_BINS = 12
+NEAREST = 3  # bins up to this one are not searched
+FARTHEST = 6
 # Least height of a line, power over the level around it. Measured on six runs each of motors that lack nothing: in
 # single runs with quantised speed up to 180, but at one frequency of three runs no more than 7 in any noise; a periodic
 # torque 200 and more in every run.
 MIN_HEIGHT = 50.0
 # With fewer than three runs, the geometric mean of the heights must be so many times as large
 FEW_RUNS_FACTOR = 10.0
-# A line that the drive has as well, higher than the first value, counts only if it is so many times as high as the
-# drive's: a controller reacts to an external torque
-MIN_DRIVE_HEIGHT, MIN_HEIGHT_OVER_DRIVE = 10.0, 10.0
+# Height from which a line of the drive counts
+MIN_DRIVE_HEIGHT = 10.0
+# A line that the drive has as well must be so many times as high as the drive's: a controller reacts to an external
+# torque
+MIN_HEIGHT_OVER_DRIVE = 10.0
 # A drive whose autocorrelation reaches this is periodic: any misfit then has lines at its harmonics
 PERIODIC_CORRELATION = 0.95
 # Highest lines of each run that are looked for in the other runs

@@ -14,9 +14,9 @@ from ..model import RunSeries
 # Simulated readings, each with the converter's steps at another offset
 ROUNDING_DRAWS = 8
 # Rounding errors are white, as noise blurs the steps, if the residuals are at least this many steps (root mean square),
-# or if the measured signal is this many times as rough as the simulated readings, as differences of an encoder's counts
-# are
-BLURRING_RESIDUAL, BLURRING_ROUGHNESS = 0.6, 1.5
+BLURRING_RESIDUAL = 0.6
+# or if the measured signal is so many times as rough as the simulated readings, as differences of encoder counts are
+BLURRING_ROUGHNESS = 1.5
 
 
 def rounding_errors(fit: RunSeries, run: int) -> Float[np.ndarray, "samples outputs draws"]:

@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from ...identify.noise.noise_model import Series, Whitener, scaling_whitener, whitener
+from ...identify.noise.noise_model import Series, Whitener, fit_whitener, scaling_whitener
 from ...simulate import UNKNOWNS_PER_RUN
 from ..hypotheses.library import Curve, Library, curves_along
 from ..model import Model
@@ -44,7 +44,7 @@ def screen(model: Model, library: Library) -> Screen:
         coulomb_torque=model.coulomb_torque,
         sensor_floors=library.sensor_floors,
     )
-    white = whitener(_without_clearest(plain, rows))
+    white = fit_whitener(_without_clearest(plain, rows))
     return plain._replace(evidence=_evidence(rows, white), white=white)
 
 

@@ -29,18 +29,23 @@ CURVE_VARIABLES = {
     "electrical": ("current", "speed", "voltage", "time"),
 }
 CURVE_UNITS = {"mechanical": "N m", "electrical": "V"}
-# Knots of a curve over speed, current or voltage, and over the time of each run
-KNOTS, KNOTS_IN_TIME = 9, 7
+# Knots of a curve over speed, current or voltage
+KNOTS = 9
+# Knots of a curve over the time of each run
+KNOTS_IN_TIME = 7
 # Periods per turn of the rotor of a torque that is periodic behind a gear; so dense that neighbours differ by half a
 # period over about 500 rad
 PERIODS_BEHIND_GEAR = np.arange(0.02, 0.25, 0.006)
 KNOTS_IN_PERIOD = 25
-# A motor counts as moving above this share of `Scales.speed`; `Scales.slow_speed` is this quantile of its speeds then
-MOVING_SHARE, SLOW_QUANTILE = 0.02, 0.05
+# A motor counts as moving above this share of `Scales.speed`
+MOVING_SHARE = 0.02
+# `Scales.slow_speed` is this quantile of its speeds while it moves
+SLOW_QUANTILE = 0.05
 # A step of the voltage counts as the resolution of a converter below this share of the largest voltage (seven bits)
 MAX_CONVERTER_STEP = 0.01
-# Most columns that are simulated together, and most numbers in all of them, to limit the memory
-MAX_COLUMNS, MAX_NUMBERS = 32, 2**23
+# Most columns that are simulated together, and most numbers in all of them: they limit the memory
+MAX_COLUMNS = 32
+MAX_NUMBERS = 2**23
 
 
 class Change(NamedTuple):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...identify.fit.generalised_least_squares import fit_whitened, residuals_of, sum_of_squares
-from ...identify.noise.noise_model import Whitener, whitener
+from ...identify.noise.noise_model import Whitener, fit_whitener
 from ..hypotheses.effect_relations import is_simpler_form
 from ..model import Model
 
@@ -65,7 +65,7 @@ class Comparison:
     def filter_of(self, model: Model) -> Whitener:
         """The filter that whitens the residuals of a model."""
         if model not in self._filters:
-            self._filters[model] = whitener(residuals_of(model.prepared, model.fit))
+            self._filters[model] = fit_whitener(residuals_of(model.prepared, model.fit))
         return self._filters[model]
 
 

@@ -32,9 +32,10 @@ from .proposals import Proposals, Proposed
 from .refits import Refits
 from .rivals import p_values_without, rivals_of
 
-# What a better model may still leave, as a share of the squares that it takes away (`_leaves_little`). The larger limit
-# applies where an effect was replaced by another form, or where the effects before cannot have left the misfit.
-STRICT_REST, LENIENT_REST = 0.1, 0.5
+# What a better model may still leave, as a share of the squares that it takes away (`_leaves_little`)
+STRICT_REST = 0.1
+# The same where an effect was replaced by another form, or where the effects before cannot have left the misfit
+LENIENT_REST = 0.5
 # Where the clearest signal gains a smaller share of what the model explains, the whitening filter may have absorbed an
 # effect: the unfiltered misfit is examined first
 ABSORBED_SHARE = 1e-2

@@ -13,7 +13,7 @@ from ...identify.fit.generalised_least_squares import residuals_of, with_whiteni
 from ...identify.fit.polish import fit_at, polish
 from ...identify.fit.refine import Optimum
 from ...identify.fit.run_unknowns import best_backlash_start
-from ...identify.noise.noise_model import Whitener, whitener
+from ...identify.noise.noise_model import Whitener, fit_whitener
 from ...identify.prepare import Prepared
 from ...identify.search.nearby import best_nearby
 from ...identify.solve import POOR_FIT, Solved, search_and_refine
@@ -270,7 +270,7 @@ def _refit_with_population(
 ) -> Model:
     """A refit; or a second one from the best of a population around where the first ended, if that point is better and
     so is the refit, by the whitening filter of the residuals at the start."""
-    white = whitener(residuals_of(prepared, fit_at(prepared.problem, start)))
+    white = fit_whitener(residuals_of(prepared, fit_at(prepared.problem, start)))
     whitened = with_whitening(prepared, white).problem
 
     def whitened_misfit(model: Model) -> float:

@@ -16,7 +16,7 @@ from ...identify.fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN
 from ...identify.prepare import Prepared
 from ...identify.solve import Solved, polish_with_angle, solve
 from ...progress import ReportProgress
-from ...simulate import HELD, Timing
+from ...simulate import ZERO_ORDER_HOLD, Timing
 from ..model import Model, model_of
 from .naming import Naming, StepwiseSelection
 
@@ -38,7 +38,7 @@ def likeliest_attempt(
     prepared: Prepared, search: str, seed: int, report: ReportProgress
 ) -> Attempt:
     """The effects named, and then once more if these reveal another timing of the voltages: the likelier ones of both,
-    or those with held voltages if nothing speaks against these any more."""
+    or those with a zero-order hold if nothing speaks against it any more."""
 
     @cache
     def identified(timing: Timing | None) -> tuple[Prepared, Solved, float]:
@@ -53,21 +53,21 @@ def likeliest_attempt(
         return Attempt(prepared, solved, selection, selection.name(), identifying)
 
     first = attempt()
-    held, timing = first.naming.chosen, first.prepared.timing
-    if not held.effects:
+    zero_order, timing = first.naming.chosen, first.prepared.timing
+    if not zero_order.effects:
         return first
-    if timing != HELD:
-        chosen = held
+    if timing != ZERO_ORDER_HOLD:
+        chosen = zero_order
         if only_current_is_late(chosen.prepared, chosen.fit):
-            return attempt(HELD)
-        held = _with_effects_of(chosen, identified(HELD)[0])
-        gain = _negative_log_likelihood(held) - _negative_log_likelihood(chosen)
+            return attempt(ZERO_ORDER_HOLD)
+        zero_order = _with_effects_of(chosen, identified(ZERO_ORDER_HOLD)[0])
+        gain = _negative_log_likelihood(zero_order) - _negative_log_likelihood(chosen)
         if not gain > MIN_LOG_LIKELIHOOD_GAIN:
-            return attempt(HELD)
-    others = [t for t in other_timings(held.prepared, held.fit)[:1] if not _is_tried(t, timing)]
-    if not others:
+            return attempt(ZERO_ORDER_HOLD)
+    likelier = other_timings(zero_order.prepared, zero_order.fit)[:1]
+    if not likelier or _is_tried(likelier[0], timing):
         return first
-    attempts = (first, attempt(others[0]))
+    attempts = (first, attempt(likelier[0]))
     return min(attempts, key=lambda a: _negative_log_likelihood(a.naming.chosen))
 
 
@@ -83,7 +83,11 @@ def _negative_log_likelihood(model: Model) -> float:
 
 def _is_tried(other: Timing, timing: Timing) -> bool:
     """Whether another timing is of the same kind as the one assumed, and nearly the same; smooth voltages are found
-    from straight ones."""
-    alike = (other.straight, other.current_mean) == (timing.straight, timing.current_mean)
-    smoother = other.smooth is not None and timing.smooth is None
-    return alike and not smoother and abs(other.lead - timing.lead) < SAME_LEAD
+    from a first-order hold."""
+    if other.smooth is not None and timing.smooth is None:
+        return False
+    return (
+        other.first_order_hold == timing.first_order_hold
+        and other.current_mean == timing.current_mean
+        and abs(other.lead - timing.lead) < SAME_LEAD
+    )

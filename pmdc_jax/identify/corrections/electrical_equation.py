@@ -17,20 +17,27 @@ from ...simulate.exponential import scalar_phi
 from ..fit.polish import Fit
 from ..prepare import Prepared
 
-# How many standard errors from zero the coefficient of the second voltage must be, and the share of the squared
-# residuals of the electrical equation that it must explain
-MIN_Z, MIN_EXPLAINED = 10.0, 0.05
-# ... and the share of what it explains together with one on the other side, or the largest effect of that relative to
-# its own: a noisy voltage seems to have both
-MIN_OF_THREE, MAX_OTHER_SIDE = 0.95, 0.3
-# A current settles from one sample to the next if this share of it is left at most, and very soon if this; the least
-# differences that count of the share of the later speed, if it is larger and if it is smaller
-MAX_REMAINING, MAX_HIDDEN, MIN_LATER, MIN_EARLIER = 0.4, 0.02, 0.02, 0.1
-# Range of the share of a current that is left after a sample
+# A second voltage counts if its coefficient is so many standard errors from zero,
+MIN_Z = 10.0
+# if it explains this share of the squared residuals of the electrical equation,
+MIN_EXPLAINED = 0.05
+# and this share of what it explains together with a third voltage on the other side; a noisy voltage seems to have both
+MIN_OF_THREE = 0.95
+# Largest coefficient of that third voltage, relative to the voltage's own
+MAX_OTHER_SIDE = 0.3
+# Share of a current that remains after a sample, at most, if it settles from one sample to the next
+MAX_REMAINING = 0.4
+# The same for a current that settles so soon that it does not show when the voltage acts
+MAX_HIDDEN = 0.02
+# Least difference of the share of the later speed that counts, if it is larger than expected, and if it is smaller
+MIN_LATER = 0.02
+MIN_EARLIER = 0.1
+# Range of the share of a current that remains after a sample
 REMAINING = (1e-9, 0.999)
-# Standard errors by which the share of the later voltage, and that of a current that remains, may be off, and how much
-# the instant of reading may differ between these, in samples
-SHARE_ERRORS, MAX_SPREAD = 4.0, 0.05
+# Standard errors by which the share of the later voltage, and that of a current that remains, may be off
+SHARE_ERRORS = 4.0
+# How much the instant of reading may differ between those, in samples
+MAX_SPREAD = 0.05
 SIDES = np.array([-1.0, 0.0, 1.0])
 # Standard deviations of its noise from which a current flows for certain
 MIN_FLOW = 4.0

@@ -21,7 +21,7 @@ from ...simulate import Tape, uniform
 from ..fit.generalised_least_squares import series_of
 from ..fit.likelihood import negative_log_likelihood
 from ..fit.polish import Fit, fit_at, polish
-from ..noise.noise_model import whitener
+from ..noise.noise_model import fit_whitener
 from ..prepare import Prepared
 from ..problem import Problem
 
@@ -34,9 +34,11 @@ WINDOWS = ((-1, 0), (0, 0), (1, 0), (-1, 1), (0, 2), (1, 1))
 # Half width, in standard errors, of the confidence intervals of the estimates by wider and wider windows, which must
 # intersect. For voltages of motors a larger value leaves less noise, but rounds corners: like a missing effect.
 CONFIDENCE_HALF_WIDTH = 1.25
-# A rough part is noise if the motor felt less than this share of it, and so many standard errors less than all of it
-MAX_FELT_SHARE, MIN_Z_SCORE = 0.5, 5.0
-# ... unless its removal raises the squared residuals of the run by this factor: the whitening filter then mistook its
+# A rough part is noise if the motor felt less than this share of it,
+MAX_FELT_SHARE = 0.5
+# and so many standard errors less than all of it,
+MIN_Z_SCORE = 5.0
+# unless its removal raises the squared residuals of the run by this factor: the whitening filter then mistook its
 # effect for noise
 MAX_SQUARES_RATIO = 1.1
 
@@ -90,7 +92,7 @@ def _felt_shares(prepared: Prepared, rough: Fit, smooth: Fit) -> list[float]:
     )
     for run in range(len(prepared.runs)):
         both = series_of(tape, run, np.stack([whole, smoothed - whole], -1))
-        white = whitener([series_of(tape, run, smoothed)])(0, both)
+        white = fit_whitener([series_of(tape, run, smoothed)])(0, both)
         rest, response = white[:, 0], white[:, 1]
         power = response @ response
         share = 1 + rest @ response / power if power > 0 else 1.0

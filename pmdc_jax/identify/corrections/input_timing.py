@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
-from ...simulate import EARLY, LATE, SMOOTH, STRAIGHT, Timing
+from ...simulate import FIRST_ORDER_HOLD, RECORDED_EARLY, RECORDED_LATE, SMOOTH, Timing
 from ..fit.generalised_least_squares import training_indices
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
 from ..fit.polish import Fit, fit_at
@@ -46,8 +46,10 @@ from .uneven_sampling import with_even_clock
 LEAD_TOLERANCE = 3e-3
 # Least distance from a sample, in samples, of a voltage that acts between two
 MIN_DISTANCE = 0.01
-# Share of the apparent lateness of the voltage, and standard errors, from which it is the current that is late
-MIN_LATE_SHARE, MIN_LATE_ERRORS = 0.3, 5.0
+# Lateness of the current alone, over the apparent lateness of the voltage, from which it is the current that is late
+MIN_LATE_SHARE = 0.3
+# and in standard errors
+MIN_LATE_ERRORS = 5.0
 # Largest difference, in samples, between the lateness of a current and that of a mean for which it may be one
 MAX_FROM_MEAN = 0.2
 # No other timing is tried where the residuals show a shift of less than this share of half a sample
@@ -141,8 +143,10 @@ def _likelier(trials: _Trials, proposed: Sequence[Timing]) -> list[Timing]:
     than straight ones, too."""
     prepared, fit = trials.prepared, trials.fit
     likely = trials.likelier(proposed, negative_log_likelihood_within(prepared, fit))
-    straight = trials.negative_log_likelihood(STRAIGHT) if STRAIGHT in likely else np.inf
-    if SMOOTH in likely and not trials.likelier([SMOOTH], straight):
+    first_order = (
+        trials.negative_log_likelihood(FIRST_ORDER_HOLD) if FIRST_ORDER_HOLD in likely else np.inf
+    )
+    if SMOOTH in likely and not trials.likelier([SMOOTH], first_order):
         likely.remove(SMOOTH)
     # of a slow difference the whitening filter takes most for noise
     if SMOOTH in proposed and not likely and not leaves_only_noise(prepared, fit):
@@ -157,10 +161,11 @@ def _at_samples(prepared: Prepared, fit: Fit) -> list[Timing]:
     hidden = prepared.averaging is None and seems_averaged(prepared)
     likely = []
     if abs(lead) > MIN_LEAD or hidden:
-        likely = [t for t in (STRAIGHT, LATE, EARLY) if hidden or (t.ahead < 0) == (lead < 0)]
+        simple = (FIRST_ORDER_HOLD, RECORDED_LATE, RECORDED_EARLY)
+        likely = [t for t in simple if hidden or (t.ahead < 0) == (lead < 0)]
     # voltages that step at samples in some runs and are smooth in others seem early in these alone
     even = all(run.resampled_from is None for run in prepared.runs)
-    if even and (STRAIGHT in likely or largest > MIN_LEAD):
+    if even and (FIRST_ORDER_HOLD in likely or largest > MIN_LEAD):
         likely.append(SMOOTH)
     return likely
 
@@ -252,7 +257,7 @@ def _apparent_leads(prepared: Prepared, fit: Fit) -> tuple[float, float]:
 
     Half a sample earlier is a held mean of the voltages at a sample and the next, which reuses compiled programs.
     """
-    means = with_timing(prepared, STRAIGHT).problem
+    means = with_timing(prepared, FIRST_ORDER_HOLD).problem
     means = replace(means, tape=replace(means.tape, rise=None))
     change = fit_at(means, fit.optimum).evaluation.simulated - fit.evaluation.simulated
     (lead,), _ = _amplitudes(prepared.problem, fit, [change])

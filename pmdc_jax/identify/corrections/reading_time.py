@@ -16,11 +16,13 @@ from ..fit.polish import Fit, polish
 from ..prepare import Prepared
 from ..problem import Nuisance, Problem, evaluate
 
-# Refits to the fitted instant, the change of it, in samples, by which the outputs are differentiated, and its least
-# distance from a sample
-MAX_REFITS, DIFFERENCE, MARGIN = 12, 1e-4, 0.005
-# Refits end when the instant moves by less than this, in samples
+# Refits end when the instant of reading moves by less than this, in samples
 TOLERANCE = 2e-4
+MAX_REFITS = 12
+# Change of the instant by which the outputs are differentiated, in samples
+DIFFERENCE = 1e-4
+# Least distance of the instant from a sample, in samples
+MARGIN = 0.005
 
 
 def with_fitted_reading(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:

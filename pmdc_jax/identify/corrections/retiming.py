@@ -54,5 +54,5 @@ def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
     if not timing.load or run.load is None:
         return run
     # a load varies slowly enough to be held at its means instead of going straight
-    ahead = np.minimum(rows + 1, last) if timing.straight else rows
+    ahead = np.minimum(rows + 1, last) if timing.first_order_hold else rows
     return attrs.evolve(run, load=(run.load[rows] + run.load[ahead]) / 2)

@@ -22,8 +22,10 @@ from ..fit.polish import Fit, polish
 from ..noise.sensor_noise import quantum
 from ..prepare import Prepared
 
-# Most lines of an encoder, and by how much a computed number of lines may differ from a whole one
-MAX_LINES, LINES_TOLERANCE = 2e4, 0.02
+# Most lines of an encoder
+MAX_LINES = 2e4
+# By how much a computed number of lines may differ from a whole one
+LINES_TOLERANCE = 0.02
 # Noise power in counts squared next to the Nyquist frequency: 1/12 for a speed rounded to counts, 1/3 for a mean over
 # the last sample
 COUNTED_AT_NYQUIST = 1 / 6
@@ -35,8 +37,9 @@ MIN_SAMPLES = 200
 BANDS = ((0.4, 0.6), (0.9, 0.95), (0.98, 1.0), (0.4, 1.0))
 # How much smaller an inductance is tried, in natural logarithms
 L_REDUCTION = 3.0
-# Which outputs: current and speed, or speed alone
-BOTH, SPEED = slice(None), slice(1, None)
+# The outputs in question: current and speed, or speed alone
+BOTH = slice(None)
+SPEED = slice(1, None)
 # Power next to the Nyquist frequency over that near it, at most, for a mean over two samples: in theory 1/40
 MAX_NYQUIST_RATIO = 1 / 8
 

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import expm
 
 from ...recordings.recording import Averaging, Recording, jumps_of
-from ...simulate import SMOOTH, STRAIGHT
+from ...simulate import FIRST_ORDER_HOLD, SMOOTH
 from ...simulate.tape import BLOCK, rise_like_step
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..fit.polish import Fit, polish
@@ -25,25 +25,32 @@ from ..prepare import Prepared
 from ..problem import Nuisance, Problem
 from .retiming import electrical_rate, with_timing
 
-# A step is this many times the change of the voltage in the samples beside it, and this share of the voltage's range
-MIN_STEP_RATIO, MIN_STEP_SHARE = 10.0, 0.05
-# With fewer steps in all it cannot be told whether they share one delay; a run with more than one step in this many
-# samples is not switched
-MIN_STEPS, MIN_SAMPLES_PER_STEP = 4, 20
+# Height of a step over the change of the voltage in the samples beside it, at least
+MIN_STEP_RATIO = 10.0
+# Height of a step over the range of the voltage, at least
+MIN_STEP_SHARE = 0.05
+# With fewer steps in all it cannot be told whether they share one delay
+MIN_STEPS = 4
+# A run with more than one step in this many samples is not switched
+MIN_SAMPLES_PER_STEP = 20
 # Most numbers in the array of step responses
 MAX_ELEMENTS = 2e7
-# Steps without a clock come anywhere within a sample: least standard deviation of their places in it, how far outside
-# it an estimate may lie, both in samples, and the share of the estimates that may lie farther outside
-MIN_SPREAD, MARGIN, MAX_OUTLIERS = 0.15, 0.2, 0.2
+# Steps without a clock come anywhere within a sample: least standard deviation of their places in it, in samples
+MIN_SPREAD = 0.15
+# How far outside its sample an estimate of such a place may lie, in samples
+MARGIN = 0.2
+# Share of the estimates that may lie farther outside
+MAX_OUTLIERS = 0.2
 # Gain in log-likelihood that each step must bring
 MIN_GAIN_PER_STEP = 5.0
 # Refits end when no step moves by more than this within its sample, in samples
-MAX_REFITS, TOLERANCE = 30, 5e-4
+TOLERANCE = 5e-4
+MAX_REFITS = 30
 # A combination of steps with less than this share of the largest eigenvalue of the normal matrix is not felt
 RANK_TOLERANCE = 1e-8
 
 
-class Steps(NamedTuple):
+class VoltageSteps(NamedTuple):
     """The voltage steps of a run."""
 
     at: Int[np.ndarray, " steps"]  # the first samples after them
@@ -66,7 +73,8 @@ def with_step_times(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     if predicted_gain < min_gain or not _are_unsynchronised(steps):
         return prepared, fit
     placed = _refitted(prepared, fit, steps)
-    if prepared.timing == STRAIGHT:  # so do smooth voltages look beside steps anywhere in a sample
+    # smooth voltages look like that too, beside steps anywhere in a sample
+    if prepared.timing == FIRST_ORDER_HOLD:
         placed = min(placed, _refitted_smooth(prepared, placed), key=_negative_log_likelihood)
     gain = negative_log_likelihood(prepared, fit) - _negative_log_likelihood(placed)
     return (placed.prepared, placed.fit) if gain > min_gain else (prepared, fit)
@@ -77,10 +85,10 @@ class _Placed(NamedTuple):
 
     prepared: Prepared
     fit: Fit
-    steps: Sequence[Steps]
+    steps: Sequence[VoltageSteps]
 
 
-def _refitted(prepared: Prepared, fit: Fit, steps: Sequence[Steps]) -> _Placed:
+def _refitted(prepared: Prepared, fit: Fit, steps: Sequence[VoltageSteps]) -> _Placed:
     """The steps at the times that fit best, from the times and the fit given."""
     placed = _placed(prepared, fit, steps)
     for _ in range(MAX_REFITS):
@@ -92,28 +100,28 @@ def _refitted(prepared: Prepared, fit: Fit, steps: Sequence[Steps]) -> _Placed:
     return placed
 
 
-def _placed(prepared: Prepared, fit: Fit, steps: Sequence[Steps]) -> _Placed:
+def _placed(prepared: Prepared, fit: Fit, steps: Sequence[VoltageSteps]) -> _Placed:
     """The steps at these times, and the fit to the runs with them, from another fit."""
     with_steps = _with_steps(prepared, fit, steps)
     return _Placed(with_steps, polish(with_steps.problem, fit.optimum), steps)
 
 
-def _refitted_smooth(prepared: Prepared, straight: _Placed) -> _Placed:
+def _refitted_smooth(prepared: Prepared, first_order: _Placed) -> _Placed:
     """The steps at the times that fit best if the voltages are on smooth curves between them, from the fit for straight
     voltages."""
-    rate = electrical_rate(prepared.problem, straight.fit)
+    rate = electrical_rate(prepared.problem, first_order.fit)
     smooth = with_timing(prepared, SMOOTH._replace(smooth=rate))
     steps = [
-        _as_laid_out(smooth, run)._replace(share=s.share) for run, s in enumerate(straight.steps)
+        _as_laid_out(smooth, run)._replace(share=s.share) for run, s in enumerate(first_order.steps)
     ]
-    return _refitted(smooth, straight.fit, steps)
+    return _refitted(smooth, first_order.fit, steps)
 
 
 def _negative_log_likelihood(placed: _Placed) -> float:
     return negative_log_likelihood(placed.prepared, placed.fit)
 
 
-def steps_of(run: Recording) -> Steps:
+def steps_of(run: Recording) -> VoltageSteps:
     """The voltage steps of a run that stand out, placed at samples."""
     at, height = np.zeros(0, int), np.zeros(0)
     if (
@@ -125,22 +133,22 @@ def steps_of(run: Recording) -> Steps:
         jumps = jumps_of(run.voltage, MIN_STEP_RATIO, MIN_STEP_SHARE)
         if len(jumps) <= len(run) / MIN_SAMPLES_PER_STEP:
             at, height = jumps, np.diff(run.voltage)[jumps - 1]
-    return Steps(at, height, np.zeros(len(at)))
+    return VoltageSteps(at, height, np.zeros(len(at)))
 
 
-def _as_laid_out(prepared: Prepared, k: int) -> Steps:
+def _as_laid_out(prepared: Prepared, k: int) -> VoltageSteps:
     """The steps of a run as they are on its tape."""
     steps, timing, tape = steps_of(prepared.runs[k]), prepared.timing, prepared.problem.tape
     if timing.smooth is not None:  # the curve before a step goes on until it
         run = prepared.runs[k]
         before = tape.samples_of(k, tape.drive_at(1.0), len(run))[steps.at - 1]
         return steps._replace(height=np.asarray(run.voltage)[steps.at] - before)
-    if timing.straight:  # a straight rise between two samples is a step in their middle
+    if timing.first_order_hold:  # a straight rise between two samples is a step in their middle
         return steps._replace(share=steps.share + 0.5)
     return steps
 
 
-def _are_unsynchronised(steps: Sequence[Steps]) -> bool:
+def _are_unsynchronised(steps: Sequence[VoltageSteps]) -> bool:
     """Whether the steps are spread over a sample interval, instead of all at the same place in it or outside."""
     share = _shares(steps)
     inside = (share > -MARGIN) & (share < 1 + MARGIN)
@@ -148,12 +156,14 @@ def _are_unsynchronised(steps: Sequence[Steps]) -> bool:
     return bool(np.mean(inside) > 1 - MAX_OUTLIERS and spread > MIN_SPREAD)
 
 
-def _shares(steps: Sequence[Steps]) -> Float[np.ndarray, " steps"]:
+def _shares(steps: Sequence[VoltageSteps]) -> Float[np.ndarray, " steps"]:
     """The shares of the steps of all runs."""
     return np.concatenate([s.share for s in steps])
 
 
-def _fit_times(problem: Problem, fit: Fit, steps: Sequence[Steps]) -> tuple[list[Steps], float]:
+def _fit_times(
+    problem: Problem, fit: Fit, steps: Sequence[VoltageSteps]
+) -> tuple[list[VoltageSteps], float]:
     """The steps at the times that minimise the residuals of a fit, and the gain in log-likelihood for white noise."""
     tape = problem.tape
     scale = np.asarray(tape.weight) / fit.noise[:, None]
@@ -171,7 +181,7 @@ def _fit_times(problem: Problem, fit: Fit, steps: Sequence[Steps]) -> tuple[list
     return fitted, squares / 2
 
 
-def _with_steps(prepared: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepared:
+def _with_steps(prepared: Prepared, fit: Fit, steps: Sequence[VoltageSteps]) -> Prepared:
     """The runs with the steps at their times, which become nuisance parameters of the problem."""
     problem, tape = prepared.problem, prepared.problem.tape
     value = np.array(tape.value)
@@ -196,7 +206,7 @@ def _with_steps(prepared: Prepared, fit: Fit, steps: Sequence[Steps]) -> Prepare
 
 
 def _responses(
-    problem: Problem, fit: Fit, run: int, steps: Steps
+    problem: Problem, fit: Fit, run: int, steps: VoltageSteps
 ) -> Float[np.ndarray, "blocks 2 samples steps"]:
     """Derivatives of the outputs of a run, A and rad/s, by how much earlier each of its steps comes, in samples; of the
     linear motor, at the present time of the step."""

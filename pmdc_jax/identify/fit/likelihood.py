@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..noise.noise_model import Series, whitener
+from ..noise.noise_model import Series, fit_whitener
 from ..noise.sensor_noise import ratio_to_noise
 from ..prepare import Prepared
 from .by_run import FitByRun
@@ -32,7 +32,7 @@ def negative_log_likelihood(prepared: Prepared, fit: Fit | FitByRun) -> float:
         if not np.isfinite(expected).all():
             return np.inf  # it diverges
         residual = Series(measured.values - expected, measured.known, measured.kind)
-        white = whitener([residual])
+        white = fit_whitener([residual])
         rest = white(0, residual).reshape(-1, expected.shape[1])
         spread = np.linalg.slogdet(rest.T @ rest / len(rest))[1]
         total += len(rest) * (spread / 2 - np.linalg.slogdet(white.scales[0])[1])

@@ -62,7 +62,7 @@ class Whitener:
         return rest.reshape(-1, *rest.shape[2:])
 
 
-def whitener(residuals: Sequence[Series]) -> Whitener:
+def fit_whitener(residuals: Sequence[Series]) -> Whitener:
     """Fit the filters to the residuals of all runs.
 
     **Arguments**: `residuals`, one `Series` per run, `values` (samples, outputs).

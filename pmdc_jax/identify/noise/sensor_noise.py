@@ -9,14 +9,16 @@ from jaxtyping import Float
 
 from ...recordings.white_noise import noise_by_differences
 
-# Least noise of an output, as a share of its root mean square: a simulation without noise needs some scale, too. For an
-# output that is zero throughout, the least in its unit.
-MIN_RELATIVE_NOISE, MIN_NOISE = 1e-5, 1e-12
+# Least noise of an output, as a share of its root mean square: a simulation without noise needs some scale, too
+MIN_RELATIVE_NOISE = 1e-5
+# Least noise of an output that is zero throughout, in its unit
+MIN_NOISE = 1e-12
 # Steps below this share of the largest one are rounding errors
 ROUNDING_ERROR = 1e-9
-# Euclid's algorithm, as shares of the largest number: remainders below this are zero, and a common divisor below this
-# (20 bits) is none
-ZERO_REMAINDER, MIN_DIVISOR = 1e-8, 1e-6
+# Euclid's algorithm: a remainder below this share of the largest number is zero,
+ZERO_REMAINDER = 1e-8
+# and a common divisor below this share, 20 bits, is none
+MIN_DIVISOR = 1e-6
 
 
 def rms(signal: Float[np.ndarray, " samples"]) -> float:

@@ -19,21 +19,15 @@ def moved_by(direction: np.ndarray, parameters: Parameters) -> tuple[str, ...]:
     return tuple(n for n, x in zip(parameters.names, direction, strict=True) if abs(x) > MIN_SHARE)
 
 
-def torque_scale(unseen: Sequence[np.ndarray], names: Sequence[str]) -> np.ndarray | None:
-    """The unseen direction along which all torques, Kt, J and f change in proportion, while Kb stays; None if the runs
-    show the scale."""
+def sees_torque_scale(unseen: Sequence[np.ndarray], names: Sequence[str]) -> bool:
+    """Whether the runs show the scale of the torques.
+
+    If not, an unseen direction changes Kt, J and f in proportion, while Kb stays.
+    """
     if not {"Kt", "Kb"} <= set(names):
-        return None
+        return True
     k, b = names.index("Kt"), names.index("Kb")
-    return next((d for d in unseen if abs(d[k]) > 0.1 and abs(d[b]) < 1e-2), None)
-
-
-def step_to_equal_constants(
-    along: np.ndarray, coordinates: np.ndarray, names: Sequence[str]
-) -> np.ndarray:
-    """The step along the `torque_scale` that makes Kt equal Kb, as they are in SI."""
-    k, b = names.index("Kt"), names.index("Kb")
-    return along * (coordinates[b] - coordinates[k]) / along[k]
+    return not any(abs(d[k]) > 0.1 and abs(d[b]) < 1e-2 for d in unseen)
 
 
 def explain_directions(
@@ -55,7 +49,7 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
     driven = any(r.drive == "torque" for r in recordings)
     measured = any(r.voltage is not None and r.current is not None for r in recordings)
     turning = any(r.speed is not None or r.angle is not None for r in recordings if not r.held)
-    listed = _listed(sorted(names))
+    listed = enumerate_names(sorted(names))
     if electrical and not measured and names & {"R", "L", "Kb", "Kt"}:
         return (
             f"No run has both voltage and current, so {listed} trade off against each other",
@@ -102,5 +96,5 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
     )
 
 
-def _listed(names: Sequence[str]) -> str:
+def enumerate_names(names: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
