@@ -208,6 +208,7 @@ def test_a_constant_load_is_not_identifiable_where_the_scale_of_torques_is_not()
 @pytest.mark.parametrize("declared", [True, False], ids=["declared", "unknown constant load"])
 def test_without_a_known_load_only_ratios_are_identified(declared):
     result = identify(unloaded(5), unloaded=declared)
+    assert result.converged
     assert_accurate(result, PAPER, ("R", "L", "Kb"))
     for name in ("Kt", "J", "f"):
         estimate = result.parameters[name]

@@ -175,7 +175,10 @@ def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit
         coordinates=jnp.asarray(parameters.with_torques_scaled(coordinates, factor)),
         runs=runs._replace(load_offset=runs.load_offset * factor),
     )
-    moved = fit_at(problem, polished.optimum._replace(unknowns=scaled))
+    # with Kt fixed, as along the unseen direction no refinement ends
+    free = problem.free.at[parameters.names.index("Kt")].set(False)
+    with_Kt_fixed = eqx.tree_at(lambda p: p.free, problem, free)
+    moved = polish(with_Kt_fixed, polished.optimum._replace(unknowns=scaled))
     return moved if moved.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE) else polished
 
 
