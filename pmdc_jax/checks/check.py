@@ -1,4 +1,4 @@
-"""What is wrong with the data, said before anything is fitted. In doubt it is silent."""
+"""Checks of recordings before a fit: only clear faults are reported."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def unused_torque(run: Recording) -> Iterator[Finding]:
 
 
 def current_jumps(run: Recording) -> Iterator[Finding]:
-    """A current that drives, and leaps from one sample to the next: half way between is but a guess."""
+    """Jumps of a current that drives the model: its course between two samples is unknown."""
     if run.drive != "current" or run.current is None:
         return
     steps = np.abs(np.diff(run.current))

@@ -1,4 +1,4 @@
-"""Recordings held against the motor's equations: signs and units that cannot be right.
+"""Checks of signs and units against the motor's equations.
 
 Integrated over a window of the record, the linear motor's equations hold exactly and need no
 derivative of noisy data:
@@ -63,7 +63,7 @@ def reversed_signs(run: Recording) -> Iterator[Finding]:
 
 
 def lost_signs(run: Recording) -> Iterator[Finding]:
-    """Channels that tell how much and not which way, as many sensors do."""
+    """Unsigned channels: many sensors report a magnitude without a sign."""
     w = _windows(run)
     if run.drive != "voltage" or not {"current", "speed"} <= set(w):
         return

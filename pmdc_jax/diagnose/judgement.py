@@ -34,9 +34,13 @@ def implausible_effect(motor: Motor) -> str | None:
 def unneeded_effect(
     naming: Naming, base: Identification, final: Identification, library: Library
 ) -> str | None:
-    """The effect that the runs need least, if they do not need it: one of several by its p-value, as its amplitude may
-    be zero, or as they determine none of its parameters and its p-value is not below `CERTAIN_P_VALUE`; any as the
-    effects leave what nothing explains and close hardly any of the gap, where no p-value says much.
+    """The effect that the runs need least, if there is one that they do not need; else None.
+
+    One of several effects is not needed if
+    1. its p-value is not significant,
+    2. its amplitude may be zero, or
+    3. the runs determine none of its parameters, and its p-value is not below `CERTAIN_P_VALUE`.
+    None is needed if they close hardly any of the gap and leave what nothing explains: no p-value says much then.
 
     **Arguments**: `base` and `final`, the motor without and with the effects.
     """

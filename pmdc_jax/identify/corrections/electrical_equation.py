@@ -86,7 +86,7 @@ class Solution(NamedTuple):
 class TwoVoltages(NamedTuple):
     """A current that depends on the voltages of two samples."""
 
-    ahead: int  # as many samples at least the voltages act before the one beside which they were recorded: 0 or -1
+    ahead: int  # whole samples by which the voltages act before their record: 0 or -1
     # share of a sample after which the outputs are read, if the voltages are held; None if the current settles too soon
     # to tell
     reading: float | None
