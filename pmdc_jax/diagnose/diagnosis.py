@@ -174,13 +174,14 @@ def _largest_misfit(gap_of_run: Mapping[str, Gap], final: Identification) -> tup
 
 
 def breaks_electrical_equation(before: float, after: float) -> bool:
-    """See `Diagnosis.breaks_electrical_equation`; the misfits before and after effects were added."""
+    """Whether the electrical equation is violated by more than any torque or the effects added can explain, by its
+    misfits before and after they were added."""
     unexplained = after**2 - 1 > MAX_ELECTRICAL_SHARE * (before**2 - 1)
     return after > MAX_ELECTRICAL or (after > MAX_EXPLAINED_ELECTRICAL and unexplained)
 
 
 def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:
-    """See `Diagnosis.beyond_fitted`."""
+    """The misfit of the hold-outs over that of the fitted runs, if it is too large for one motor; else None."""
     if "holdout" not in gap:
         return None
     # a misfit of the fitted runs below the noise, as of a noiseless simulation, says nothing
