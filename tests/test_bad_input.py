@@ -275,6 +275,7 @@ def mapping_cases() -> Iterator[Case]:
     three = ("time=a:s", "voltage=b:V")
     yield Case("map to no column", mapped(*three, "speed=z:rpm"), "no column 'z'")
     yield Case("map no quantity", mapped(*three, "torsion=c"), "unknown quantity 'torsion'")
+    yield Case("map the wrong way round", mapped(*three, "c=speed"), "Write QUANTITY=HEADER")
     yield Case("map in a wrong unit", mapped(*three, "speed=c:kg"), "'kg' does not measure speed")
     yield Case("map in no unit", mapped(*three, "speed=c:rpn"), "unknown unit 'rpn'")
     for unit in ("A/-1", "A-", "A/0", "0*A", "--A"):

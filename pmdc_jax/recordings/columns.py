@@ -254,9 +254,7 @@ def mixed_axes(matched: Mapping[str, Column]) -> tuple[Column, Column] | None:
 
 def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column:
     option = f"{where}, --column {name}={spec}"
-    quantity = "load" if name == "load_torque" else name
-    if quantity not in QUANTITIES:
-        raise InputError(option, f"unknown quantity '{name}'", f"Known: {', '.join(QUANTITIES)}")
+    quantity = quantity_named(name, option)
     header, unit = header_and_unit(spec, headers)
     if header not in headers:
         listed = ", ".join(headers[:20]) or "none"
@@ -270,6 +268,15 @@ def _by_hand(name: str, spec: str, headers: Sequence[str], where: str) -> Column
         if quantity == "angle":
             mend += f", or {column_option(name, header, 'rev/2000')} for 2000 counts per turn"
         raise InputError(option, str(error), mend) from None
+
+
+def quantity_named(name: str, option: str) -> str:
+    """The quantity that a mapping names; an `InputError` about the `option` if there is none of that name."""
+    quantity = "load" if name == "load_torque" else name
+    if quantity not in QUANTITIES:
+        mend = f"Write QUANTITY=HEADER, with one of {', '.join(QUANTITIES)} as the quantity"
+        raise InputError(option, f"unknown quantity '{name}'", mend)
+    return quantity
 
 
 def header_and_unit(spec: str, headers: Sequence[str]) -> tuple[str, str]:

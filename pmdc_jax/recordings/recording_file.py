@@ -22,6 +22,7 @@ from .columns import (
     match_columns,
     may_be_dates,
     mixed_axes,
+    quantity_named,
 )
 from .recording import (
     NEEDED_TO_IDENTIFY,
@@ -73,6 +74,7 @@ def read_recordings(
     tables = {path: open_table(path) for path in paths}
     columns: dict[Path, dict[str, str]] = {path: {} for path in paths}
     for quantity, spec in mappings:
+        quantity_named(quantity, f"--column {quantity}={spec}")
         having = [p for p, table in tables.items() if _has(table, spec)]
         if not having:
             header, _ = header_and_unit(spec, ())
