@@ -19,7 +19,7 @@ from .identification import Direction, Estimate, Identification, Role, RunFit, S
 from .noise.sensor_noise import ratio_to_noise, rms, white_noise
 from .parameters import Parameters, unit_of
 from .prepare import Prepared
-from .problem import Problem
+from .problem import Problem, Unknowns
 from .solve import FITNESS_TOLERANCE, Solved
 from .uncertainty.covariance import MIN_UNSEEN_STDERR, Information, information_of
 from .uncertainty.identifiability import (
@@ -91,7 +91,7 @@ def results_of(prepared: Prepared, solved: Solved) -> Identification:
         covariance_names=names,
         messages=(
             *_messages(prepared, solved, Kt_set_to_Kb=chosen is not released),
-            *_unknown_load(motor, [one for one in fit.values() if one.role == "train"]),
+            *_unknown_load(motor, _of_training(fit)),
         ),
         missed=_large_residuals(fit),
     )
@@ -156,11 +156,17 @@ def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
         coordinates[k], problem.parameters.lower[k], problem.parameters.upper[k]
     )
     unknowns = polished.unknowns._replace(coordinates=jnp.asarray(coordinates))
+    refitted = _as_good_with_fixed(problem, polished, k, unknowns)
+    return fit_at(problem, refitted.optimum._replace(at_bound=())) if refitted else None
+
+
+def _as_good_with_fixed(problem: Problem, polished: Fit, k: int, start: Unknowns) -> Fit | None:
+    """The fit from other unknowns with coordinate `k` fixed as there; None if it is worse than the one before."""
     with_k_fixed = eqx.tree_at(lambda p: p.free, problem, problem.free.at[k].set(False))
-    refitted = polish(with_k_fixed, polished.optimum._replace(unknowns=unknowns))
+    refitted = polish(with_k_fixed, polished.optimum._replace(unknowns=start))
     # false where the simulation failed: its fitness is infinite
     as_good = refitted.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE)
-    return fit_at(problem, refitted.optimum._replace(at_bound=())) if as_good else None
+    return refitted if as_good else None
 
 
 def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit:
@@ -176,10 +182,8 @@ def _with_Kt_equal_Kb(problem: Problem, polished: Fit, info: Information) -> Fit
         runs=runs._replace(load_offset=runs.load_offset * factor),
     )
     # with Kt fixed, as along the unseen direction no refinement ends
-    free = problem.free.at[parameters.names.index("Kt")].set(False)
-    with_Kt_fixed = eqx.tree_at(lambda p: p.free, problem, free)
-    moved = polish(with_Kt_fixed, polished.optimum._replace(unknowns=scaled))
-    return moved if moved.fitness <= polished.fitness * (1 + FITNESS_TOLERANCE) else polished
+    Kt = parameters.names.index("Kt")
+    return _as_good_with_fixed(problem, polished, Kt, scaled) or polished
 
 
 def _with_numpy_arrays(motor: Motor) -> Motor:
@@ -287,12 +291,15 @@ def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | 
     return float(100 * (1 - error / spread)) if spread > 0 else None
 
 
+def _of_training(fit: Mapping[str, RunFit]) -> list[RunFit]:
+    return [one for one in fit.values() if one.role == "train"]
+
+
 def _measured_and_residuals(
     fit: Mapping[str, RunFit], name: str
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """An output as measured and its residuals, in every training run that has it."""
-    runs = [f for f in fit.values() if f.role == "train"]
-    pairs = [(getattr(f, name), f.residual(name)) for f in runs]
+    pairs = [(getattr(f, name), f.residual(name)) for f in _of_training(fit)]
     return [(measured, residual) for measured, residual in pairs if residual is not None]
 
 
@@ -326,15 +333,11 @@ def _unknown_load(motor: Motor, training: Sequence[RunFit]) -> list[str]:
     differ = abs(largest - least) > MAX_LOAD_SPREAD * abs(least)
     if differ or abs(least) < MIN_LOAD_SHARE * motor_torque:
         return []
-    one_way = all(np.ptp(np.sign(fit.speed_simulated)) < 2 for fit in training)
+    what = "a constant load"
+    if all(np.ptp(np.sign(fit.speed_simulated)) < 2 for fit in training):
+        what += ", or friction, which looks the same while the motor turns one way only"
     return [
-        f"the unknown load is {largest:.3g} N m in all runs: a constant load"
-        + (
-            ", or friction, which looks the same while the motor turns one way only"
-            if one_way
-            else ""
-        )
-        + ". If nothing was attached, give --unloaded"
+        f"the unknown load is {largest:.3g} N m in all runs: {what}. If nothing was attached, give --unloaded"
     ]
 
 

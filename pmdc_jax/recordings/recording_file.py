@@ -50,8 +50,7 @@ def read_recording(
 
     **Arguments**: `path`; `columns`, for headers that are not understood by themselves: a mapping from quantity (time,
     voltage, current, speed, load, angle, temperature, torque) to "header" or "header:unit", as "header:-unit" with the
-    sign reversed; `to_simulate`, whether the
-    inputs of a simulation suffice, so that no output need be recorded.
+    sign reversed; `to_simulate`, whether the inputs of a simulation suffice, so that no output need be recorded.
 
     **Returns**: the run in SI, named after the file.
 

@@ -92,7 +92,7 @@ def _means_at_sample_start(
     return moved(tape.measured), moved(tape.weight), over_last
 
 
-def _seen(
+def _outputs(
     motors: Motor,
     state: State,
     mean: State | None,
@@ -207,7 +207,7 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
             acting = Input(drive, value, load)
             after, mean = held_step_and_mean(motors, propagator, acting, state)
             read = _when_read(motors, propagator, acting, state)
-            simulated = _seen(motors, read, mean, over_last, block)
+            simulated = _outputs(motors, read, mean, over_last, block)
             errors = tuple(
                 e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )
@@ -276,7 +276,7 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
             acting = Input(drive, value, load)
             after, mean = held_step_and_mean(motors, propagator, acting, state, steps)
             read = _when_read(motors, propagator, acting, state, steps)
-            simulated = _seen(motors, read, mean, over_last, block)
+            simulated = _outputs(motors, read, mean, over_last, block)
             errors = tuple(
                 e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors)
             )

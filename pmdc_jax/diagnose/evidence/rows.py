@@ -75,9 +75,9 @@ def gather_rows(
     ]
     first = 0
     for change, width in _batches(changes, columns_at_once(tape)):
-        simulated = _seen(bare, tape, path, change)
+        response = _output_change(bare, tape, path, change)
         for run, rows in zip(model.training, rows_of_runs, strict=True):
-            in_time = series_of(tape, run, simulated).values
+            in_time = series_of(tape, run, response).values
             rows.columns[..., first : first + width] = in_time[..., :width]
         first += width
     return rows_of_runs
@@ -90,7 +90,7 @@ def _late_readings(fit: RunSeries) -> Float[np.ndarray, "samples outputs 2"]:
     return change[..., None] * np.eye(2)[list(outputs)]
 
 
-def _seen(
+def _output_change(
     bare: Motor, tape: Tape, path: Path, change: Change
 ) -> Float32[np.ndarray, "blocks 2 samples columns"]:
     """What a change makes of the recorded outputs of the motor without effects; of a setting that cannot be simulated,
