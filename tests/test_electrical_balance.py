@@ -44,6 +44,7 @@ def fitted(current_mean_samples: int = 1, voltage_noise: float = 0.0) -> Model:
     return model_of(("brush_voltage_drop",), given, solved.fit)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_brushes_that_block_the_current_cause_no_electrical_misfit():
     assert electrical_misfit(fitted()) < 1.5
@@ -76,6 +77,7 @@ def run_with_compliant_shaft(seed: int, volts: float) -> Recording:
     return Recording(f"run{seed}", step * np.arange(len(voltage)), voltage, *outputs.T)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_a_hidden_shaft_causes_no_electrical_misfit():
     """It biases R and L by a tenth, with which the misfit would be 8.5."""

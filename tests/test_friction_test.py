@@ -42,6 +42,7 @@ def friction_messages_of(messages: tuple[str, ...]) -> list[str]:
     return [m for m in messages if "dry friction" in m]
 
 
+@pytest.mark.slow
 def test_dry_friction_that_biases_viscous_friction_is_reported():
     """In noise so large that there is no other message, and with f too large by more than half."""
     runs = recorded(0.04, seed=31)

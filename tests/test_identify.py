@@ -1060,7 +1060,14 @@ def test_a_run_may_begin_anywhere_in_the_backlash(twist):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"tie": [("Kt", "Kb")], "known": {"R": PAPER.R}, "Kt": PAPER.Kb}]
+    "options",
+    [
+        {},
+        pytest.param(
+            {"tie": [("Kt", "Kb")], "known": {"R": PAPER.R}, "Kt": PAPER.Kb},
+            marks=pytest.mark.slow,
+        ),
+    ],
 )
 def test_a_population_finds_backlash_that_a_gradient_misses(options):
     factors = {"gap_rad": 10.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2}

@@ -274,10 +274,7 @@ def slow(case: str) -> object:
     return pytest.param(case, marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize(
-    "timing",
-    [k if k in ("held", "smooth") else slow(k) for k in MESSAGE_OF],
-)
+@pytest.mark.parametrize("timing", [k if k == "held" else slow(k) for k in MESSAGE_OF])
 def test_the_timing_of_a_voltage_is_found(timing):
     """Taken for held from their samples on, these voltages would bias L by up to 60 % and R by 5 %."""
     found = identify(logged(timing))

@@ -62,7 +62,7 @@ MEAN_OVER = {
 }
 
 
-SLOW = {"counts of two samples", "counts of the last sample", "tachometer"}
+SLOW = {"counts of two samples", "counts of the last sample", "tachometer", "rounded"}
 
 
 @pytest.mark.parametrize(
@@ -152,6 +152,7 @@ def test_counts_without_a_current_are_not_taken_for_means():
     assert not any("mean over" in m for m in identify(runs).messages)
 
 
+@pytest.mark.slow
 def test_counts_with_a_fractional_number_of_lines_are_not_taken_for_means():
     runs = recorded("counts of the last sample")
     scaled = [attrs.evolve(r, speed=1.0001 * r.speed) for r in runs]
