@@ -83,6 +83,29 @@ def test_hidden_friction_is_named_and_closes_the_gap(noise):
 
 
 @pytest.mark.slow
+def test_heating_is_named_although_a_run_begins_warm():
+    """With all runs cold at the start, heating would leave twice the noise in the current of one of them."""
+    truth = vb.BenchMotor(
+        **PAPER, copper_alpha_per_K=0.00393, thermal_resistance_K_per_W=0.3, thermal_time_s=2.0
+    )
+    rng = np.random.default_rng(29)
+    runs = [
+        recording(name, vb.record(truth, excitation, rng, NOISE, (0.0, 0.0, warmer_K)))
+        for (name, excitation), warmer_K in zip(
+            excitations(rng).items(), (0.0, 25.0, 5.0), strict=True
+        )
+    ]
+    found = diagnose(runs)
+    assert found.verdict == "named"
+    assert [e.name for e in found.effects] == ["resistance_heating"]
+    assert found.closed_fraction > 0.99
+    R = found.final.parameters["R"]
+    assert abs(R.value - PAPER["R"]) < 3 * R.stderr < 0.05 * PAPER["R"]
+    (message,) = [m for m in found.final.messages if "warm" in m]
+    assert "triangle by 9" in message or "triangle by 10" in message
+
+
+@pytest.mark.slow
 def test_friction_is_named_without_a_known_load():
     """Stribeck friction is ruled out as well, although the scale of all torques is not identifiable."""
     runs = recorded(vb.BenchMotor(**PAPER, coulomb_Nm=0.08), 4, NOISE)

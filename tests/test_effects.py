@@ -658,15 +658,14 @@ def test_an_effect_without_amplitude_leaves_the_linear_motor(x64, name):
 
 @each_simulated
 def test_sensitivities_match_central_differences(x64, name):
-    """By every parameter of motor and effect, and each run's initial state and load offset; of instantaneous and mean
-    speeds."""
+    """By every parameter of motor and effect, and all that a run has of its own; of instantaneous and mean speeds."""
     bounds = {n: (x / 2, x * 2) for n, x in PAPER.items()}
     parameters = Parameters.of(bounds, [EFFECTS[name]])
     truth = PAPER | {f"{name}.{n}": x for n, x in CASES[name].values.items()}
     scales = zip(parameters.names, parameters.logarithmic, strict=True)
     at = np.array([np.log(truth[n]) if log else truth[n] for n, log in scales])
     tape = Tape.from_recordings(averaged(RUNS, OVER_LAST, None, OVER_BOTH))
-    own = np.column_stack([tape.initial, np.full((tape.runs, 3), [0.01, 0.2, 0.02])])
+    own = np.column_stack([tape.initial, np.full((tape.runs, 4), [0.01, 0.2, 0.02, 0.1])])
     # away from zero, where a dry element has no derivative
     own[2:, :2] = 1.0, 5.0
     start_of_runs = RunUnknowns(*jnp.asarray(own.T))

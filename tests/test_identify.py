@@ -695,7 +695,7 @@ def test_the_rotor_angle_is_that_of_the_true_speed_not_of_a_slow_sensor(x64, sen
     }
     logs = zip(parameters.names, parameters.logarithmic, strict=True)
     coordinates = [np.log(values[n]) if log else values[n] for n, log in logs]
-    local = np.array([[truth["current_A"][0], speed[0], 0.0, 0.0, 0.0]])
+    local = np.array([[truth["current_A"][0], speed[0], 0.0, 0.0, 0.0, 0.0]])
     unknowns = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.asarray(local).T))
     fit = fit_at(given.problem, Optimum(unknowns, np.inf, ()))
     turn = np.asarray(with_rotor_angle(given.problem, fit).tape.turn).reshape(-1)
@@ -889,6 +889,32 @@ def test_bounds_are_the_ranges_of_an_effect_if_its_quantity_was_not_recorded(run
     given = EFFECTS["brush_voltage_drop"].ranges["voltage_V"]
     bounds = effect_bounds([EFFECTS["brush_voltage_drop"]], driven)
     assert bounds["brush_voltage_drop.voltage_V"] == (given.lower, given.upper)
+
+
+@pytest.mark.parametrize(
+    ("warmer_K", "message"),
+    [
+        ((30.0, 0.0), "the winding is warm, and R larger, at the start of prbs by 1"),
+        pytest.param((0.0, 0.0), None, marks=pytest.mark.slow),
+    ],
+)
+def test_a_run_may_begin_with_a_warm_winding(warmer_K, message):
+    """The bench heats by an integrator of its own; without an initial rise R would be too large by a twentieth."""
+    motor = replace(
+        PAPER, copper_alpha_per_K=0.00393, thermal_resistance_K_per_W=0.3, thermal_time_s=2.0
+    )
+    rng, runs = np.random.default_rng(23), []
+    for (name, excitation), warmer in zip(
+        (("prbs", vb.prbs(rng, 3.0)), ("loaded", vb.loaded(rng, 3.0))), warmer_K, strict=True
+    ):
+        runs.append(recording(name, vb.record(motor, excitation, rng, NOISE, (0.0, 0.0, warmer))))
+    found = identify(runs, effects=["resistance_heating"])
+    assert [m for m in found.messages if "winding" in m and not m.startswith(message or "-")] == []
+    assert any("winding" in m for m in found.messages) == (message is not None)
+    assert_accurate(found, PAPER)
+    rise = 0.00393 * 0.3
+    estimate = found.parameters["resistance_heating.rise_per_W"]
+    assert abs(estimate.value - rise) < 3.5 * estimate.stderr < 0.3 * rise
 
 
 # ----------------------------------------------------------- intervals

@@ -19,9 +19,9 @@ attributes, each of which does nothing unless the effect overrides it:
 
 A new effect is one class in this package, one row in its table `EFFECTS` and one in that of
 `diagnose/hypotheses/trials.py`. Its class attributes say what kind of effect it is: whether it is `affine` and its
-`longest_step` decide how fast it is simulated; `holds`, `contact_state` and `spring_state` belong to dry elements,
-teeth and springs; the `variable` of which it is a function, and whether it `needs_current`, decide which runs
-can show it.
+`longest_step` decide how fast it is simulated; `holds`, `contact_state`, `spring_state` and `thermal_state` belong to
+dry elements, teeth, springs and temperatures; the `variable` of which it is a function, and whether it `needs_current`,
+decide which runs can show it.
 """
 
 from __future__ import annotations
@@ -101,6 +101,8 @@ class AbstractEffect(eqx.Module):
     contact_state: ClassVar[str | None] = None
     # the state of a spring, which may have any twist at the start of a run
     spring_state: ClassVar[str | None] = None
+    # the state of a temperature, which a run may begin with where another one left it
+    thermal_state: ClassVar[str | None] = None
     # with it the motor is still a linear system with inputs, as long as no dry element changes direction and no teeth
     # touch or part
     affine: ClassVar[bool] = False

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 class ResistanceHeating(AbstractEffect):
     """Heating: R(t) = R (1 + rise(t)), d rise/dt = (rise_per_W R(t) i^2 - rise) / time_constant_s.
 
-    `rise` is the relative rise of the resistance over its value at the start of a run, alpha times the
-    temperature rise; alpha = 0.00393 / K for copper.
+    `rise` is the relative rise of the resistance over its value at the temperature of the surroundings, alpha times the
+    temperature rise; alpha = 0.00393 / K for copper. A run begins with a cold winding; a fit estimates the initial rise
+    of runs that begin with a warm one.
 
     **Fields**: `rise_per_W`, relative rise per watt of copper loss in steady state, 1/W (alpha times the
     thermal resistance), > 0; `time_constant_s`, thermal time constant of the winding in s, > 0.
@@ -30,6 +31,7 @@ class ResistanceHeating(AbstractEffect):
     equation: ClassVar = "electrical"
     needs_current: ClassVar = True
     states: ClassVar = ("resistance_rise",)
+    thermal_state: ClassVar = "resistance_rise"
     ranges: ClassVar = {
         "rise_per_W": ParameterRange("1/W", 1e-9, 1e3),
         "time_constant_s": ParameterRange("s", 0.1, 1e4),

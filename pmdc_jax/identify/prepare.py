@@ -78,6 +78,7 @@ class Prepared(NamedTuple):
             free=jnp.ones(len(parameters.names), bool),
             fitted_runs=self.problem.fitted_runs,
             nuisance=self.problem.nuisance,
+            begins_warm=self.problem.begins_warm,
         )
         return self._replace(problem=problem)
 

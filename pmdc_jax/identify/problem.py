@@ -52,6 +52,8 @@ class Problem(eqx.Module):
     fitted_runs: Bool[Array, " runs"]
     whitening: Whitening | None = None  # in place of the noise, where residuals are correlated
     nuisance: Nuisance | None = None
+    # which runs may begin with a warm winding; None: none
+    begins_warm: Bool[Array, " runs"] | None = None
 
     @property
     def outputs(self) -> int:
@@ -90,6 +92,11 @@ class Problem(eqx.Module):
         return any(effect.spring_state for effect in self.parameters.effects)
 
     @property
+    def has_temperature(self) -> bool:
+        """Whether an effect has a temperature, which may be higher at the start of a run."""
+        return any(effect.thermal_state for effect in self.parameters.effects)
+
+    @property
     def angle_unknown(self) -> Bool[Array, " runs"]:
         """Which runs have an unknown initial rotor angle."""
         tape, known = self.tape, jnp.asarray(self.tape.angle_known)
@@ -106,7 +113,9 @@ class Problem(eqx.Module):
         angle = self.angle_unknown & self.depends_on_angle
         load = jnp.asarray(tape.load_unknown)
         twist = self.has_spring & drive.free
-        own = jnp.stack([drive.voltage, drive.free, load, angle, twist], 1)
+        warm = jnp.zeros_like(load) if self.begins_warm is None else self.begins_warm
+        rise = self.has_temperature & warm & drive.voltage
+        own = jnp.stack([drive.voltage, drive.free, load, angle, twist, rise], 1)
         return jnp.concatenate([self.free[None, :] & self.fitted_runs[:, None], own], 1)
 
 

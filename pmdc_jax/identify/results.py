@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..motor import PARAMETERS, Motor
 from ..recordings.recording import OVER_BOTH, OVER_LAST, Recording
@@ -36,6 +37,8 @@ MAX_RESIDUAL_RATIO = 2.0
 MIN_LOAD_SHARE = 0.02
 # if it differs by less than this share of itself between the runs
 MAX_LOAD_SPREAD = 0.2
+# Initial rise of a winding's resistance that is worth a message
+MIN_INITIAL_RISE = 0.005
 # Units of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
 # Spans over which a speed may be averaged
@@ -92,6 +95,7 @@ def results_of(prepared: Prepared, solved: Solved) -> Identification:
         messages=(
             *_messages(prepared, solved, Kt_set_to_Kb=chosen is not released),
             *_unknown_load(motor, _of_training(fit)),
+            *_warm_windings(prepared, unknowns.runs.rise),
         ),
         missed=_large_residuals(fit),
     )
@@ -338,6 +342,24 @@ def _unknown_load(motor: Motor, training: Sequence[RunFit]) -> list[str]:
         what += ", or friction, which looks the same while the motor turns one way only"
     return [
         f"the unknown load is {largest:.3g} N m in all runs: {what}. If nothing was attached, give --unloaded"
+    ]
+
+
+def _warm_windings(prepared: Prepared, rises: Float[Array, " runs"]) -> list[str]:
+    """The runs that begin with a warmer winding than another one."""
+    begins_warm = prepared.problem.begins_warm
+    if begins_warm is None or not prepared.problem.has_temperature:
+        return []
+    warmer = [
+        f"{run.name} by {100 * rise:.2g} %"
+        # the tape is padded by runs without samples
+        for run, warm, rise in zip(prepared.runs, begins_warm, rises, strict=False)
+        if warm and rise > MIN_INITIAL_RISE
+    ]
+    if not warmer:
+        return []
+    return [
+        f"the winding is warm, and R larger, at the start of {', '.join(warmer)}: this is modelled"
     ]
 
 

@@ -43,13 +43,14 @@ class RunUnknowns(NamedTuple):
     load_offset: Float[Array, " runs"]  # N m
     angle: Float[Array, " runs"]  # of the rotor, rad; used only by effects that depend on it
     twist: Float[Array, " runs"]  # of a spring, beyond that due to the load, rad
+    rise: Float[Array, " runs"]  # of the resistance of a winding that is still warm, relative
 
     @classmethod
     def as_recorded(cls, tape: Tape) -> RunUnknowns:
-        """The values on the tape, with no load besides the recorded one and no additional twist."""
+        """The values on the tape, with no load besides the recorded one, no additional twist and a cold winding."""
         current, speed = jnp.asarray(tape.initial).T
         none = jnp.zeros_like(current)
-        return cls(current, speed, none, jnp.asarray(tape.angle), none)
+        return cls(current, speed, none, jnp.asarray(tape.angle), none, none)
 
 
 # Columns of the sensitivities for the unknowns of a run
@@ -135,8 +136,9 @@ def sensitivities(
 
 def _in_all_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "... columns"]:
     """Derivatives with respect to parameters and load offset, padded with zeros to all columns."""
-    zero = jnp.zeros((*own.shape[:-1], 2))
-    return jnp.concatenate([own[..., :count], zero, own[..., count:], zero], -1)
+    none = jnp.zeros((*own.shape[:-1], 1))
+    of_run = RunUnknowns(*[none] * UNKNOWNS_PER_RUN)._replace(load_offset=own[..., count:])
+    return jnp.concatenate([own[..., :count], *of_run], -1)
 
 
 def _initial_states(motor: Motor, own: RunUnknowns, tape: Tape) -> Starts:
@@ -144,12 +146,13 @@ def _initial_states(motor: Motor, own: RunUnknowns, tape: Tape) -> Starts:
     first = jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs))
     load = jnp.asarray(tape.load)[first, 0] + own.load_offset
     state = motor.initial_state(own.current, own.speed, load, own.angle)
-    twisted = {
-        e.spring_state: state.extra[e.spring_state] + own.twist
-        for e in motor.effects
-        if e.spring_state
-    }
-    return pack(state._replace(extra=state.extra | twisted)).T[tape.run]
+    extra = dict(state.extra)
+    for effect in motor.effects:
+        if effect.spring_state:
+            extra[effect.spring_state] += own.twist
+        if effect.thermal_state:
+            extra[effect.thermal_state] += own.rise
+    return pack(state._replace(extra=extra)).T[tape.run]
 
 
 def _guessed_starts(motor: Motor, own: RunUnknowns, tape: Tape, initial: Starts) -> Starts:

@@ -1,12 +1,15 @@
-"""Effects named for the likeliest timing of the voltages: which that is, a fit without the effects may not tell."""
+"""Effects named for the likeliest timing of the voltages, and for runs that begin with a warm winding: neither may show
+in a fit without the effects."""
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
 from ...effects import EFFECTS
+from ...identify.corrections.initial_temperature import with_initial_temperatures
 from ...identify.corrections.input_timing import (
     negative_log_likelihood_within,
     only_current_is_late,
@@ -25,7 +28,7 @@ SAME_LEAD = 0.05
 
 
 class Attempt(NamedTuple):
-    """Effects named for one timing of the voltages."""
+    """Effects named for one timing of the voltages and one set of runs that begin with a warm winding."""
 
     prepared: Prepared
     solved: Solved
@@ -35,6 +38,23 @@ class Attempt(NamedTuple):
 
 
 def likeliest_attempt(
+    prepared: Prepared, search: str, seed: int, report: ReportProgress
+) -> Attempt:
+    """The effects named, and then once more if these reveal another timing of the voltages, or runs that begin with a
+    warm winding."""
+    attempt = _of_likeliest_timing(prepared, search, seed, report)
+    chosen = attempt.naming.chosen
+    warm, _ = with_initial_temperatures(chosen.prepared, chosen.fit)
+    if warm.problem.begins_warm is None:
+        return attempt
+    problem = replace(attempt.prepared.problem, begins_warm=warm.problem.begins_warm)
+    again = _named(
+        attempt.prepared._replace(problem=problem), attempt.solved, attempt.identifying, report
+    )
+    return min(attempt, again, key=_negative_log_likelihood)
+
+
+def _of_likeliest_timing(
     prepared: Prepared, search: str, seed: int, report: ReportProgress
 ) -> Attempt:
     """The effects named, and then once more if these reveal another timing of the voltages: the likelier ones of both,
@@ -47,10 +67,7 @@ def likeliest_attempt(
         return timed, solved, time.perf_counter() - began
 
     def attempt(timing: Timing | None = None) -> Attempt:
-        prepared, solved, identifying = identified(timing)
-        report("gathering evidence", solved.fit.fitness)
-        selection = StepwiseSelection(model_of((), prepared, solved.fit), solved, report)
-        return Attempt(prepared, solved, selection, selection.name(), identifying)
+        return _named(*identified(timing), report)
 
     first = attempt()
     zero_order, timing = first.naming.chosen, first.prepared.timing
@@ -61,14 +78,21 @@ def likeliest_attempt(
         if only_current_is_late(chosen.prepared, chosen.fit):
             return attempt(ZERO_ORDER_HOLD)
         zero_order = _with_effects_of(chosen, identified(ZERO_ORDER_HOLD)[0])
-        gain = _negative_log_likelihood(zero_order) - _negative_log_likelihood(chosen)
-        if not gain > MIN_LOG_LIKELIHOOD_GAIN:
+        if not _gain(chosen, zero_order) > MIN_LOG_LIKELIHOOD_GAIN:
             return attempt(ZERO_ORDER_HOLD)
     likelier = other_timings(zero_order.prepared, zero_order.fit)[:1]
     if not likelier or _is_tried(likelier[0], timing):
         return first
-    attempts = (first, attempt(likelier[0]))
-    return min(attempts, key=lambda a: _negative_log_likelihood(a.naming.chosen))
+    return min(first, attempt(likelier[0]), key=_negative_log_likelihood)
+
+
+def _named(
+    prepared: Prepared, solved: Solved, identifying: float, report: ReportProgress
+) -> Attempt:
+    """The effects named beside the motor without effects that was identified."""
+    report("gathering evidence", solved.fit.fitness)
+    selection = StepwiseSelection(model_of((), prepared, solved.fit), solved, report)
+    return Attempt(prepared, solved, selection, selection.name(), identifying)
 
 
 def _with_effects_of(model: Model, prepared: Prepared) -> Model:
@@ -77,8 +101,15 @@ def _with_effects_of(model: Model, prepared: Prepared) -> Model:
     return model_of(model.effects, *polish_with_angle(prepared, model.fit.optimum))
 
 
-def _negative_log_likelihood(model: Model) -> float:
-    return negative_log_likelihood_within(model.prepared, model.fit)
+def _negative_log_likelihood(attempt: Attempt) -> float:
+    chosen = attempt.naming.chosen
+    return negative_log_likelihood_within(chosen.prepared, chosen.fit)
+
+
+def _gain(better: Model, model: Model) -> float:
+    """The gain in log-likelihood of one model over another."""
+    worse, best = (negative_log_likelihood_within(m.prepared, m.fit) for m in (model, better))
+    return worse - best
 
 
 def _is_tried(other: Timing, timing: Timing) -> bool:
