@@ -184,9 +184,14 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
 
     check_outputs({"--out": out}, [motor, input])
     columns = dict(pairs("--column", column))
-    from .recordings.recording_file import read_recording, write_recording
+    from .recordings.recording_file import (
+        check_recording_suffix,
+        read_recording,
+        write_recording,
+    )
     from .simulate import simulate
 
+    check_recording_suffix(out)
     driven = read_recording(input, columns, to_simulate=True)
     write_recording(simulate(motor, driven), out)
 

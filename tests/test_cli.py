@@ -244,6 +244,7 @@ def test_diagnose_reports_bad_input_in_one_message(faked, capsys):
         ("diagnose a.csv --json x --experiment x", ["--experiment", "the output of --json"]),
         ("simulate motor.json --input a.csv", ["--out"]),
         ("simulate motor.json --input a.csv --out a.csv", ["--out", "an input"]),
+        ("simulate motor.json --input a.csv --out a.pdf", ["a.pdf", ".csv or .parquet"]),
     ],
 )
 def test_bad_arguments_are_refused_before_anything_is_read(faked, capsys, arguments, names):

@@ -1026,6 +1026,7 @@ INVALID = {
     ),
     "unknown effect": (lambda r: identify(r, effects=("magic",)), "magic"),
     "unknown search": (lambda r: identify(r, search="magic"), "magic"),
+    "negative seed": (lambda r: identify(r, seed=-1), "negative"),
 }
 
 

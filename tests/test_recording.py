@@ -418,9 +418,9 @@ def test_missing_outputs_are_nan(tmp_path, cell):
 
 def test_runs_of_files_of_the_same_name_are_named_after_their_paths(tmp_path):
     paths = [tmp_path / name for name in ("a/x/run.csv", "b/x/run.csv", "c.csv", "c.txt", "d.csv")]
-    for path in paths:
+    for k, path in enumerate(paths):
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(table("time_s,voltage_V,speed", T, T, T))
+        path.write_text(table("time_s,voltage_V,speed", T, T, T + k))
     runs = named_apart(recordings_of(paths))
     names = [run.name for run in runs]
     assert names == ["a/x/run.csv", "b/x/run.csv", "c.csv", "c.txt", "d"]
@@ -428,6 +428,10 @@ def test_runs_of_files_of_the_same_name_are_named_after_their_paths(tmp_path):
     again = tmp_path / "a" / ".." / "d.csv"
     with pytest.raises(InputError, match=r"d\.csv: this file is listed twice"):
         named_apart(recordings_of([*paths, again]))
+    copy = tmp_path / "copy.csv"
+    copy.write_bytes(paths[0].read_bytes())
+    with pytest.raises(InputError, match=r"copy\.csv: it holds the same data as run"):
+        named_apart(recordings_of([paths[0], copy]))
 
 
 def test_an_empty_column_counts_as_absent(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +136,8 @@ def recordings_of(runs: Runs, to_simulate: bool = False) -> list[Recording]:
 def named_apart(recordings: Sequence[Recording]) -> list[Recording]:
     """The recordings, those with the same name renamed after as much of the paths of their files as tells them apart.
 
-    **Raises**: `InputError` if a file is listed twice, or if recordings without files have the same name.
+    **Raises**: `InputError` if a file is listed twice, if two hold the same data, or if two without files have the same
+    name.
     """
     count = Counter(run.name for run in recordings)
     paths: list[Path] = []
@@ -149,7 +151,19 @@ def named_apart(recordings: Sequence[Recording]) -> list[Recording]:
         if path in paths:
             raise InputError(run.source, "this file is listed twice", "List it only once")
         paths.append(path)
+    for first, second in combinations(recordings, 2):
+        if _hold_the_same(first, second):
+            what, mend = f"it holds the same data as {first.name}", "List only one of them"
+            raise InputError(second.source or second.name, what, mend)
     return [run if count[run.name] == 1 else _named_after_path(run, paths) for run in recordings]
+
+
+def _hold_the_same(first: Recording, second: Recording) -> bool:
+    """Whether two recordings are copies: they would count twice in the fit, or validate nothing as hold-outs."""
+    own, other = first.columns(), second.columns()
+    return own.keys() == other.keys() and all(
+        np.array_equal(own[name], other[name], equal_nan=True) for name in own
+    )
 
 
 def _named_after_path(run: Recording, paths: Sequence[Path]) -> Recording:
@@ -171,14 +185,18 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     import polars as pl
 
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in (".csv", ".parquet"):
-        what = f"cannot write files of type '{suffix}'"
-        raise InputError(str(path), what, "Use the suffix .csv or .parquet")
+    check_recording_suffix(path)
     data = recording.columns()
     frame = pl.DataFrame({QUANTITIES[quantity].header: array for quantity, array in data.items()})
     with replacing(path) as part, part.open("wb") as file:
-        frame.write_csv(file) if suffix == ".csv" else frame.write_parquet(file)
+        frame.write_csv(file) if path.suffix.lower() == ".csv" else frame.write_parquet(file)
+
+
+def check_recording_suffix(path: Path) -> None:
+    """**Raises**: `InputError` if recordings are not written to files with the suffix of this one."""
+    if path.suffix.lower() not in (".csv", ".parquet"):
+        what = f"cannot write files of type '{path.suffix}'"
+        raise InputError(str(path), what, "Use the suffix .csv or .parquet")
 
 
 def _time_of_dates(table: Table) -> dict[str, Column]:

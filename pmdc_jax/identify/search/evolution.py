@@ -103,8 +103,10 @@ def search(
     `population` and `generations`, by default the method's own; `progress`, called in every generation.
     An interrupt from the keyboard ends the search with the candidates found so far.
 
-    **Raises**: `InputError` on an unknown method.
+    **Raises**: `InputError` on an unknown method, or a negative seed.
     """
+    if seed < 0:
+        raise InputError("--seed", f"{seed} is negative", "Give zero or a positive number")
     if method not in METHODS:
         raise InputError(
             "--search", f"unknown search {method}", f"Choose from {', '.join(METHODS)}"
