@@ -1121,9 +1121,9 @@ def test_a_hold_out_may_begin_at_any_angle(share_of_period):
     motor, periods = {name: getattr(PAPER, name) for name in PARAMETERS}, 7.0
     wave = {"amplitude_Nm": 0.03, "phase_rad": 0.0, "periods": periods}
     plant = Plant(**motor, cogging_Nm=wave["amplitude_Nm"], cogging_periods=periods)
-    driven, angle = vb.staircase(3.0), 2 * np.pi / periods * share_of_period
-    runs = []
-    for name, begins in (("first", 0.0), ("second", angle)):
+    angle, runs = 2 * np.pi / periods * share_of_period, []
+    for name, seconds, begins in (("first", 3.0, 0.0), ("second", 2.9, angle)):
+        driven = vb.staircase(seconds)
         seen = simulate(plant, driven.time, driven.voltage, driven.load, angle=begins)
         runs.append(Recording(name, driven.time, driven.voltage, seen[:, 0], seen[:, 1]))
     with jax.enable_x64(True):

@@ -17,6 +17,7 @@ PACKAGE = Path(__file__).parents[1] / "pmdc_jax"
 ALLOWED_IMPORTS = {
     "errors": set(),
     "progress": set(),
+    "words": set(),
     "files": {"errors"},
     "json_file": {"errors"},
     "runtime": {"files"},
@@ -46,6 +47,7 @@ ALLOWED_IMPORTS = {
         "recordings",
         "runtime",
         "simulate",
+        "words",
     },
     "diagnose": {
         "effects",
@@ -66,6 +68,7 @@ ALLOWED_IMPORTS = {
         "progress",
         "recordings",
         "wheelchair",
+        "words",
     },
 }
 # the parts that compute results, and their modules that only define results; a tuning is defined where it is computed

@@ -18,6 +18,7 @@ from ..diagnose.diagnosis import (
 )
 from ..effects import EFFECTS
 from ..identify.identification import RunFit
+from ..words import enumerate_words
 from .diagnosis_figures import (
     AXIS_TITLES,
     curve_figure,
@@ -41,7 +42,6 @@ from .identification import identification_content
 from .identification_sentences import role_word, runs_in_order
 from .notation import (
     effect_words,
-    enumerate_words,
     field_words,
     fixed,
     formula_text,

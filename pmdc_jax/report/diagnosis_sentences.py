@@ -19,10 +19,10 @@ from ..diagnose.diagnosis import (
 )
 from ..diagnose.hypotheses.effect_relations import CONTAINS, unbalanced_equation
 from ..identify.identification import Estimate, Role, RunFit
+from ..words import enumerate_words
 from .identification_sentences import as_sentence, cautions, role_word
 from .notation import (
     effect_words,
-    enumerate_words,
     field_words,
     p_value_words,
     percent,

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from ..identify.identification import Estimate, Identification, Role, RunFit
-from .notation import NARROW_SPACE, enumerate_words, percent, significant
+from ..words import enumerate_words
+from .notation import NARROW_SPACE, percent, significant
 
 STATUS_WORDS = {
     "identified": "identified",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from math import floor, isfinite, log10
 
 from attrs import evolve, frozen
@@ -161,13 +160,6 @@ def parameter_words(effect: str, field: str) -> str:
 def p_value_words(p_value: float) -> str:
     """ "p < 0.001" or "p = 0.21"."""
     return "p < 0.001" if p_value < 1e-3 else f"p = {significant(p_value, 2)}"
-
-
-def enumerate_words(words: Sequence[str]) -> str:
-    """ "R, L and Kb"."""
-    if len(words) < 2:
-        return "".join(words)
-    return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _decimals(value: float, stderr: float) -> int:

@@ -14,8 +14,9 @@ from rich.text import Text
 from ..identify.identification import Estimate, Identification
 from ..progress import ReportProgress, silent
 from ..recordings.recording import Finding
+from ..words import enumerate_words
 from .identification_sentences import role_word, runs_in_order, status_word, summary
-from .notation import enumerate_words, percent, significant, write_estimate
+from .notation import percent, significant, write_estimate
 
 STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
 SEVERITY_STYLES = {"error": "red", "warning": "yellow"}

@@ -21,7 +21,7 @@ from ...identify.fit.likelihood import negative_log_likelihood
 from ...identify.fit.run_unknowns import fit_run_unknowns
 from ...identify.identification import Estimate
 from ...identify.parameters import unit_of
-from ...identify.results import run_fits
+from ...identify.run_fits import run_fits
 from ...identify.uncertainty.covariance import information_of
 from ...identify.uncertainty.identifiability import sees_torque_scale
 from ...motor import PARAMETERS

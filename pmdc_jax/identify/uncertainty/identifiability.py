@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...recordings.recording import Recording
+from ...words import enumerate_words
 from ..identification import Direction
 from ..parameters import Parameters
 
@@ -49,7 +50,7 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
     driven = any(r.drive == "torque" for r in recordings)
     measured = any(r.voltage is not None and r.current is not None for r in recordings)
     turning = any(r.speed is not None or r.angle is not None for r in recordings if not r.held)
-    listed = enumerate_names(sorted(names))
+    listed = enumerate_words(sorted(names))
     if electrical and not measured and names & {"R", "L", "Kb", "Kt"}:
         return (
             f"No run has both voltage and current, so {listed} trade off against each other",
@@ -94,7 +95,3 @@ def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]
         f"The runs cannot distinguish {listed}",
         "Add a run with more excitation: voltage steps, both directions, several speeds and loads",
     )
-
-
-def enumerate_names(names: Sequence[str]) -> str:
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

@@ -1,0 +1,107 @@
+"""What a user should know of an identification besides its numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..motor import Motor
+from ..recordings.recording import OVER_BOTH, OVER_LAST
+from .identification import RunFit
+from .noise.sensor_noise import rms
+from .prepare import Prepared
+from .solve import Solved
+
+# An unknown load is worth a message from this share of the motor's torque on (root mean square),
+MIN_LOAD_SHARE = 0.02
+# if it differs by less than this share of itself between the runs
+MAX_LOAD_SPREAD = 0.2
+# Initial rise of a winding's resistance that is worth a message
+MIN_INITIAL_RISE = 0.005
+# Units of what drives a motor
+UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
+# Spans over which a speed may be averaged
+AVERAGING_SPANS = {
+    OVER_LAST: "the last sample interval",
+    OVER_BOTH: "the last and the next sample interval",
+}
+
+
+def messages_of(
+    prepared: Prepared,
+    solved: Solved,
+    motor: Motor,
+    training: Sequence[RunFit],
+    rises: Float[Array, " runs"],
+    Kt_set_to_Kb: bool,
+) -> tuple[str, ...]:
+    """What was corrected, assumed or interrupted, and what the loads and the temperatures of the runs may be.
+
+    **Arguments**: `training`, the fits of the training runs; `rises`, the initial rise of the resistance in each run.
+    """
+    messages = _corrections(prepared)
+    if solved.search.interrupted:
+        messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
+    if Kt_set_to_Kb:
+        messages.append("Kt was set equal to Kb, as holds in SI units, and J and f scale with it")
+    return (*messages, *_unknown_load(motor, training), *_warm_windings(prepared, rises))
+
+
+def _corrections(prepared: Prepared) -> list[str]:
+    """What the sensors and the recorder did to the signals, as far as it is modelled."""
+    messages = [
+        f"{run.name}: the recorded {run.drive} has {prepared.input_noise[run.name]:.3g} {UNITS[run.drive]} of sensor "
+        "noise that did not reach the motor: it was removed"
+        for run in prepared.runs
+        if run.name in prepared.input_noise
+    ]
+    acts = "steps between samples" if prepared.stepped else prepared.timing.what
+    if acts:
+        messages.append(f"the voltage {acts}: this is modelled")
+    if prepared.timing.current_mean:
+        messages.append("the current is a mean over the last sample interval: this is modelled")
+    if prepared.averaging:
+        messages.append(
+            f"the speed is a mean over {AVERAGING_SPANS[prepared.averaging]}, as differences of an angle are:"
+            " this is modelled"
+        )
+    return messages
+
+
+def _unknown_load(motor: Motor, training: Sequence[RunFit]) -> list[str]:
+    """What the unknown load of the runs may be, where it is considerable and the same in all of them."""
+    loads = [fit.load_offset for fit in training if fit.load_offset is not None]
+    currents = [fit.current for fit in training if fit.current is not None]
+    if not loads or not currents:
+        return []
+    least, largest = sorted((min(loads), max(loads)), key=abs)
+    motor_torque = float(motor.Kt) * rms(np.concatenate(currents))
+    differ = abs(largest - least) > MAX_LOAD_SPREAD * abs(least)
+    if differ or abs(least) < MIN_LOAD_SHARE * motor_torque:
+        return []
+    what = "a constant load"
+    if all(np.ptp(np.sign(fit.speed_simulated)) < 2 for fit in training):
+        what += ", or friction, which looks the same while the motor turns one way only"
+    return [
+        f"the unknown load is {largest:.3g} N m in all runs: {what}. If nothing was attached, give --unloaded"
+    ]
+
+
+def _warm_windings(prepared: Prepared, rises: Float[Array, " runs"]) -> list[str]:
+    """The runs that begin with a winding warmer than that of the coolest one."""
+    begins_warm = prepared.problem.begins_warm
+    if begins_warm is None or not prepared.problem.has_temperature:
+        return []
+    warmer = [
+        f"{run.name} by {100 * rise:.2g} %"
+        # the tape is padded by runs without samples
+        for run, warm, rise in zip(prepared.runs, begins_warm, rises, strict=False)
+        if warm and rise > MIN_INITIAL_RISE
+    ]
+    if not warmer:
+        return []
+    return [
+        f"the winding is warm, and R larger, at the start of {', '.join(warmer)}: this is modelled"
+    ]
