@@ -290,6 +290,9 @@ def _notes(
         elif column.unit is None:
             mend = f"If this is wrong, write the unit in the header, as in {QUANTITIES[quantity].header}"
             yield note(column.header, f"the header has no unit: {column.base} assumed", mend)
+    if "temperature" in matched and "temperature" not in empty:
+        mend = "That of the winding is computed from its current: see resistance_heating"
+        yield note(matched["temperature"].header, "a recorded temperature is not used", mend)
     if mixed := mixed_axes(matched):
         shaft, axis = mixed
         what = f"{shaft.base} is a unit of a rotating shaft, but the {axis.base} of {axis.header} is not"
