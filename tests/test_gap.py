@@ -22,6 +22,7 @@ def run_fit(role: str, misfit: float, noise: float, seed: int) -> RunFit:
         current_fit_percent=None,
         speed_fit_percent=None,
         load_offset=None,
+        initial_rise=None,
         time=TIME,
         voltage=None,
         current=None,

@@ -59,6 +59,7 @@ def fake_run(name: str, rng: np.random.Generator, samples: int) -> RunFit:
         current_fit_percent=97.83,
         speed_fit_percent=99.41,
         load_offset=0.0123 if name == "loaded" else None,
+        initial_rise=None,
         time=time,
         voltage=voltage,
         current=noisy_current,

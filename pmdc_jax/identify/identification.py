@@ -57,6 +57,8 @@ class RunFit:
     current_fit_percent: float | None
     speed_fit_percent: float | None
     load_offset: float | None  # N m, estimated constant load of a run whose load is unknown
+    # by which share the resistance is larger at the start of a run that begins with a warm winding
+    initial_rise: float | None
     time: np.ndarray
     voltage: np.ndarray | None
     current: np.ndarray | None

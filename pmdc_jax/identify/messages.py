@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Array, Float
 
 from ..motor import Motor
 from ..recordings.recording import OVER_BOTH, OVER_LAST
 from .identification import RunFit
 from .noise.sensor_noise import rms
 from .prepare import Prepared
+from .run_fits import of_training
 from .solve import Solved
 
 # An unknown load is worth a message from this share of the motor's torque on (root mean square),
@@ -33,20 +33,16 @@ def messages_of(
     prepared: Prepared,
     solved: Solved,
     motor: Motor,
-    training: Sequence[RunFit],
-    rises: Float[Array, " runs"],
+    fit: Mapping[str, RunFit],
     Kt_set_to_Kb: bool,
 ) -> tuple[str, ...]:
-    """What was corrected, assumed or interrupted, and what the loads and the temperatures of the runs may be.
-
-    **Arguments**: `training`, the fits of the training runs; `rises`, the initial rise of the resistance in each run.
-    """
+    """What was corrected, assumed or interrupted, and what the loads and the temperatures of the runs may be."""
     messages = _corrections(prepared)
     if solved.search.interrupted:
         messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
     if Kt_set_to_Kb:
         messages.append("Kt was set equal to Kb, as holds in SI units, and J and f scale with it")
-    return (*messages, *_unknown_load(motor, training), *_warm_windings(prepared, rises))
+    return (*messages, *_unknown_load(motor, of_training(fit)), *_warm_windings(fit))
 
 
 def _corrections(prepared: Prepared) -> list[str]:
@@ -89,19 +85,12 @@ def _unknown_load(motor: Motor, training: Sequence[RunFit]) -> list[str]:
     ]
 
 
-def _warm_windings(prepared: Prepared, rises: Float[Array, " runs"]) -> list[str]:
+def _warm_windings(fit: Mapping[str, RunFit]) -> list[str]:
     """The runs that begin with a winding warmer than that of the coolest one."""
-    begins_warm = prepared.problem.begins_warm
-    if begins_warm is None or not prepared.problem.has_temperature:
-        return []
-    warmer = [
-        f"{run.name} by {100 * rise:.2g} %"
-        # the tape is padded by runs without samples
-        for run, warm, rise in zip(prepared.runs, begins_warm, rises, strict=False)
-        if warm and rise > MIN_INITIAL_RISE
-    ]
-    if not warmer:
+    rises = {name: one.initial_rise or 0.0 for name, one in fit.items()}
+    warm = [f"{name} by {100 * x:.2g} %" for name, x in rises.items() if x > MIN_INITIAL_RISE]
+    if not warm:
         return []
     return [
-        f"the winding is warm, and R larger, at the start of {', '.join(warmer)}: this is modelled"
+        f"the winding is warm, and R larger, at the start of {', '.join(warm)}: this is modelled"
     ]

@@ -15,7 +15,7 @@ from .identification import Direction, Identification
 from .messages import messages_of
 from .noise.sensor_noise import white_noise
 from .prepare import Prepared
-from .run_fits import large_residuals, measured_and_residuals, of_training, run_fits
+from .run_fits import large_residuals, measured_and_residuals, run_fits
 from .solve import Solved
 from .uncertainty.covariance import information_of
 from .uncertainty.identifiability import explain_directions
@@ -60,14 +60,7 @@ def results_of(prepared: Prepared, solved: Solved) -> Identification:
         findings=prepared.findings,
         covariance=covariance,
         covariance_names=names,
-        messages=messages_of(
-            prepared,
-            solved,
-            motor,
-            of_training(fit),
-            unknowns.runs.rise,
-            Kt_set_to_Kb=chosen is not released,
-        ),
+        messages=messages_of(prepared, solved, motor, fit, Kt_set_to_Kb=chosen is not released),
         missed=large_residuals(fit),
     )
 

@@ -39,6 +39,7 @@ def run_fits(
             current_fit_percent=_fit_percent(i, current),
             speed_fit_percent=_fit_percent(w, speed),
             load_offset=float(own.load_offset[index]) if tape.load_unknown[index] else None,
+            initial_rise=float(own.rise[index]) or None,  # exactly zero where it was not fitted
             time=run.time,
             voltage=run.voltage,
             current=i if driven else run.current,

@@ -134,6 +134,7 @@ def _run_fit(fit: RunFit) -> dict[str, Any]:
         "current_fit_percent": fit.current_fit_percent,
         "speed_fit_percent": fit.speed_fit_percent,
         "load_offset": fit.load_offset,
+        "initial_rise": fit.initial_rise,
         "samples": len(fit.time),
     }
 
