@@ -19,7 +19,7 @@ MIN_LOAD_SHARE = 0.02
 # if it differs by less than this share of itself between the runs
 MAX_LOAD_SPREAD = 0.2
 # Initial rise of a winding's resistance that is worth a message
-MIN_INITIAL_RISE = 0.005
+MIN_INITIAL_RISE = 0.02
 # Units of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
 # Spans over which a speed may be averaged

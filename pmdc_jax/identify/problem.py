@@ -52,7 +52,7 @@ class Problem(eqx.Module):
     fitted_runs: Bool[Array, " runs"]
     whitening: Whitening | None = None  # in place of the noise, where residuals are correlated
     nuisance: Nuisance | None = None
-    # which runs may begin with a warm winding; None: none
+    # which training runs may begin with a warm winding, None: none; hold-outs always may
     begins_warm: Bool[Array, " runs"] | None = None
 
     @property
@@ -113,7 +113,9 @@ class Problem(eqx.Module):
         angle = self.angle_unknown & self.depends_on_angle
         load = jnp.asarray(tape.load_unknown)
         twist = self.has_spring & drive.free
-        warm = jnp.zeros_like(load) if self.begins_warm is None else self.begins_warm
+        warm = (
+            ~self.fitted_runs if self.begins_warm is None else ~self.fitted_runs | self.begins_warm
+        )
         rise = self.has_temperature & warm & drive.voltage
         own = jnp.stack([drive.voltage, drive.free, load, angle, twist, rise], 1)
         return jnp.concatenate([self.free[None, :] & self.fitted_runs[:, None], own], 1)

@@ -48,11 +48,9 @@ def _runs_that_tell(problem: Problem, fit: Fit) -> Int[np.ndarray, " telling"]:
 def _with_cold_run(
     prepared: Prepared, fit: Fit, telling: Int[np.ndarray, " telling"], cold: int
 ) -> tuple[Prepared, Fit]:
-    """The runs that tell, and the hold-outs, with an initial rise, except one that begins cold; and the fit to them."""
+    """The runs that tell with an initial rise, except one that begins cold; and the fit to them."""
     problem = prepared.problem
-    warm = ~np.asarray(problem.fitted_runs)
-    warm[telling] = True
-    warm[cold] = False
+    warm = np.isin(np.arange(problem.tape.runs), telling[telling != cold])
     problem = replace(problem, begins_warm=jnp.asarray(warm))
     return prepared._replace(problem=problem), polish(problem, fit.optimum)
 
