@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import attrs
@@ -166,7 +165,7 @@ def refit_from(
 ) -> Model:
     """A model fitted from a start to whitened residuals; its `fit` is evaluated without the filter."""
     prepared, whitened = polish_with_angle(with_whitening(prepared, white), start)
-    prepared = prepared._replace(problem=replace(prepared.problem, whitening=None))
+    prepared = prepared.with_problem(whitening=None)
     # no step: the unfiltered residuals at the same point
     unfiltered = fit_at(prepared.problem, whitened.optimum)
     optimum = whitened.optimum._replace(fitness=unfiltered.fitness)

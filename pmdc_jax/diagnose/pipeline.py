@@ -28,8 +28,8 @@ from .evidence.electrical_balance import electrical_misfit
 from .experiment import next_experiment
 from .gap import closed_fraction, gaps_by_role, gaps_of_runs
 from .judgement import implausible_effect, judge, unneeded_effect
+from .selection.attempts import Attempt, likeliest_attempt
 from .selection.naming import Naming
-from .selection.timing import Attempt, likeliest_attempt
 
 
 @double_precision

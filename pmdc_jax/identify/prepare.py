@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,10 +49,13 @@ class Prepared(NamedTuple):
     # whether steps of the voltages were placed between samples
     stepped: bool = False
 
+    def with_problem(self, **fields: Any) -> Prepared:
+        """The same runs with some fields of the problem replaced."""
+        return self._replace(problem=replace(self.problem, **fields))
+
     def with_tape(self, **fields: Array | None) -> Prepared:
         """The same runs with some fields of the tape replaced."""
-        tape = replace(self.problem.tape, **fields)
-        return self._replace(problem=replace(self.problem, tape=tape))
+        return self.with_problem(tape=replace(self.problem.tape, **fields))
 
     @property
     def training(self) -> list[Recording]:

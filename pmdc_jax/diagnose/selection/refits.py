@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -135,7 +134,7 @@ class Refits:
             # all torques could scale up with Kt, until the part that is held is negligible
             fixed.add("Kt")
         free = jnp.asarray([name not in fixed for name in prepared.problem.parameters.names])
-        prepared = prepared._replace(problem=replace(prepared.problem, free=free))
+        prepared = prepared.with_problem(free=free)
         end = polish(with_whitening(prepared, white).problem, start, SHORT_REFIT_STEPS).optimum
         squares = end.fitness * prepared.problem.most_samples
         if squares > MAX_HELD_MISFIT * self.comparison.fitted(current, white).squares:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
@@ -49,10 +47,9 @@ def _with_cold_run(
     prepared: Prepared, fit: Fit, telling: Int[np.ndarray, " telling"], cold: int
 ) -> tuple[Prepared, Fit]:
     """The runs that tell with an initial rise, except one that begins cold; and the fit to them."""
-    problem = prepared.problem
-    warm = np.isin(np.arange(problem.tape.runs), telling[telling != cold])
-    problem = replace(problem, begins_warm=jnp.asarray(warm))
-    return prepared._replace(problem=problem), polish(problem, fit.optimum)
+    warm = np.isin(np.arange(prepared.problem.tape.runs), telling[telling != cold])
+    prepared = prepared.with_problem(begins_warm=jnp.asarray(warm))
+    return prepared, polish(prepared.problem, fit.optimum)
 
 
 def _relative_to(warm: tuple[Prepared, Fit], rise: float) -> Fit:

@@ -47,7 +47,7 @@ def with_fitted_reading(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 def _with_nuisance(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the instant of reading as a nuisance parameter, and the fit to them."""
     nuisance = Nuisance(change_by_reading(prepared.problem, fit)[..., None], fit.noise)
-    prepared = prepared._replace(problem=replace(prepared.problem, nuisance=nuisance))
+    prepared = prepared.with_problem(nuisance=nuisance)
     return prepared, polish(prepared.problem, fit.optimum)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import attrs
 import jax
 import jax.numpy as jnp
@@ -26,9 +24,8 @@ def with_timing(prepared: Prepared, timing: Timing) -> Prepared:
     ]
     driven = Tape.from_recordings(runs, timing=timing)
     names = ("value", "load", "rise", "reading", "averaging")
-    tape = replace(tape, **jax.tree.map(jnp.asarray, {n: getattr(driven, n) for n in names}))
-    problem = replace(prepared.problem, tape=tape)
-    acting = prepared._replace(runs=runs, problem=problem, timing=timing)
+    retimed = jax.tree.map(jnp.asarray, {name: getattr(driven, name) for name in names})
+    acting = prepared.with_tape(**retimed)._replace(runs=runs, timing=timing)
     # what acts during the first sample was not recorded: without outputs there, the initial state makes up for it
     return without_ends(acting) if timing.ahead < 0 or timing.current_mean else acting
 

@@ -201,8 +201,7 @@ def _with_steps(prepared: Prepared, fit: Fit, steps: Sequence[VoltageSteps]) -> 
         rise[at] += rise_like_step(share, rate * tape.sample_time_of(run)) * s.height
     tape = replace(tape, value=jnp.asarray(value), rise=jnp.asarray(rise))
     nuisance = Nuisance(jnp.asarray(responses), fit.noise)
-    problem = replace(problem, tape=tape, nuisance=nuisance)
-    return prepared._replace(problem=problem, stepped=True)
+    return prepared.with_problem(tape=tape, nuisance=nuisance)._replace(stepped=True)
 
 
 def _responses(

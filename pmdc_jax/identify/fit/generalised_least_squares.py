@@ -9,8 +9,6 @@ of plain least squares.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ...simulate import Tape
@@ -76,7 +74,7 @@ def with_whitening(prepared: Prepared, white: Whitener) -> Prepared:
         filters[run], scales[run] = np.zeros((len(A), 2, 2)), np.zeros((2, 2))
         filters[run][:, *both], scales[run][both] = A, S
     whitening = Whitening.of(filters, scales, tape.weight, tape.run)
-    return prepared._replace(problem=replace(prepared.problem, whitening=whitening))
+    return prepared.with_problem(whitening=whitening)
 
 
 def training_indices(prepared: Prepared) -> list[int]:

@@ -4,7 +4,6 @@ in a fit without the effects."""
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -45,12 +44,10 @@ def likeliest_attempt(
     attempt = _of_likeliest_timing(prepared, search, seed, report)
     chosen = attempt.naming.chosen
     warm, _ = with_initial_temperatures(chosen.prepared, chosen.fit)
-    if warm.problem.begins_warm is None:
+    if (begins_warm := warm.problem.begins_warm) is None:
         return attempt
-    problem = replace(attempt.prepared.problem, begins_warm=warm.problem.begins_warm)
-    again = _named(
-        attempt.prepared._replace(problem=problem), attempt.solved, attempt.identifying, report
-    )
+    prepared = attempt.prepared.with_problem(begins_warm=begins_warm)
+    again = _named(prepared, attempt.solved, attempt.identifying, report)
     return min(attempt, again, key=_negative_log_likelihood)
 
 
