@@ -602,7 +602,9 @@ def test_a_run_may_begin_with_a_twisted_shaft(x64, name):
             assert np.max(np.abs(found - right[channel])) < case.tolerance * np.max(right[channel])
 
 
-@pytest.mark.parametrize("name", ["shaft_compliance", "gear_backlash"])
+@pytest.mark.parametrize(
+    "name", ["shaft_compliance", pytest.param("gear_backlash", marks=pytest.mark.slow)]
+)
 def test_a_constant_load_acts_on_the_same_inertia_as_a_recorded_one(x64, name):
     """On the load's side of the shaft or gear, which it twists already before a run begins."""
     weight, motor = 0.1, with_effect(name)

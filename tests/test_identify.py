@@ -411,7 +411,9 @@ def test_a_locked_rotor_identifies_the_electrical_half(columns):
     assert found.converged
 
 
-@pytest.mark.parametrize(("step", "samples"), [(2e-4, 150), (5e-6, 2000)])
+@pytest.mark.parametrize(
+    ("step", "samples"), [(2e-4, 150), pytest.param(5e-6, 2000, marks=pytest.mark.slow)]
+)
 def test_a_single_rise_of_the_current_identifies_the_electrical_half(step, samples):
     """As recorded by an oscilloscope: a few time constants long, which are far longer than a sample."""
     voltage = np.where(np.arange(samples) < samples // 6, 0.0, 3.0)
@@ -424,6 +426,7 @@ def test_a_single_rise_of_the_current_identifies_the_electrical_half(step, sampl
     assert not any("times its white noise" in message for message in found.messages)
 
 
+@pytest.mark.slow
 def test_a_locked_rotor_may_be_fitted_with_other_runs(runs, found):
     """It reduces the standard errors of R and L, and impairs no other parameter."""
     more = identify([*runs, locked_rotor(4, speed=np.zeros(SAMPLES))])
