@@ -74,16 +74,8 @@ class Prepared(NamedTuple):
     def with_effects(self, effects: Sequence[type[AbstractEffect]]) -> Prepared:
         """The same runs for a motor with other effects."""
         parameters = self.parameters(effects)
-        problem = Problem(
-            parameters,
-            self.problem.tape,
-            self.problem.noise,
-            free=jnp.ones(len(parameters.names), bool),
-            fitted_runs=self.problem.fitted_runs,
-            nuisance=self.problem.nuisance,
-            begins_warm=self.problem.begins_warm,
-        )
-        return self._replace(problem=problem)
+        free = jnp.ones(len(parameters.names), bool)
+        return self.with_problem(parameters=parameters, free=free, whitening=None)
 
 
 def prepare(
@@ -117,12 +109,14 @@ def prepare(
         )
     # hold-out runs are on the tape too, but only their own unknowns may be fitted to them
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True))
+    fitted_runs = jnp.arange(tape.runs) < len(recordings)
     problem = Problem(
         parameters,
         tape,
         jnp.asarray(noise),
         free=jnp.ones(len(parameters.names), bool),
-        fitted_runs=jnp.arange(tape.runs) < len(recordings),
+        fitted_runs=fitted_runs,
+        begins_warm=~fitted_runs,
     )
     roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
     return Prepared(

@@ -50,10 +50,9 @@ class Problem(eqx.Module):
     noise: Float[Array, "2"]  # standard deviations of current A and speed rad/s
     free: Bool[Array, " parameters"]
     fitted_runs: Bool[Array, " runs"]
+    begins_warm: Bool[Array, " runs"]  # which runs may begin with a warm winding
     whitening: Whitening | None = None  # in place of the noise, where residuals are correlated
     nuisance: Nuisance | None = None
-    # which training runs may begin with a warm winding, None: none; hold-outs always may
-    begins_warm: Bool[Array, " runs"] | None = None
 
     @property
     def outputs(self) -> int:
@@ -113,10 +112,7 @@ class Problem(eqx.Module):
         angle = self.angle_unknown & self.depends_on_angle
         load = jnp.asarray(tape.load_unknown)
         twist = self.has_spring & drive.free
-        warm = (
-            ~self.fitted_runs if self.begins_warm is None else ~self.fitted_runs | self.begins_warm
-        )
-        rise = self.has_temperature & warm & drive.voltage
+        rise = self.has_temperature & self.begins_warm & drive.voltage
         own = jnp.stack([drive.voltage, drive.free, load, angle, twist, rise], 1)
         return jnp.concatenate([self.free[None, :] & self.fitted_runs[:, None], own], 1)
 

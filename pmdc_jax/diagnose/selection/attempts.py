@@ -44,11 +44,10 @@ def likeliest_attempt(
     attempt = _of_likeliest_timing(prepared, search, seed, report)
     chosen = attempt.naming.chosen
     warm, _ = with_initial_temperatures(chosen.prepared, chosen.fit)
-    if (begins_warm := warm.problem.begins_warm) is None:
+    if warm is chosen.prepared:
         return attempt
-    prepared = attempt.prepared.with_problem(begins_warm=begins_warm)
-    again = _named(prepared, attempt.solved, attempt.identifying, report)
-    return min(attempt, again, key=_negative_log_likelihood)
+    prepared = attempt.prepared.with_problem(begins_warm=warm.problem.begins_warm)
+    return _likelier(attempt, _named(prepared, attempt.solved, attempt.identifying, report))
 
 
 def _of_likeliest_timing(
@@ -75,12 +74,13 @@ def _of_likeliest_timing(
         if only_current_is_late(chosen.prepared, chosen.fit):
             return attempt(ZERO_ORDER_HOLD)
         zero_order = _with_effects_of(chosen, identified(ZERO_ORDER_HOLD)[0])
-        if not _gain(chosen, zero_order) > MIN_LOG_LIKELIHOOD_GAIN:
+        gain = _negative_log_likelihood(zero_order) - _negative_log_likelihood(chosen)
+        if not gain > MIN_LOG_LIKELIHOOD_GAIN:
             return attempt(ZERO_ORDER_HOLD)
     likelier = other_timings(zero_order.prepared, zero_order.fit)[:1]
     if not likelier or _is_tried(likelier[0], timing):
         return first
-    return min(first, attempt(likelier[0]), key=_negative_log_likelihood)
+    return _likelier(first, attempt(likelier[0]))
 
 
 def _named(
@@ -98,15 +98,13 @@ def _with_effects_of(model: Model, prepared: Prepared) -> Model:
     return model_of(model.effects, *polish_with_angle(prepared, model.fit.optimum))
 
 
-def _negative_log_likelihood(attempt: Attempt) -> float:
-    chosen = attempt.naming.chosen
-    return negative_log_likelihood_within(chosen.prepared, chosen.fit)
+def _likelier(*attempts: Attempt) -> Attempt:
+    """The attempt whose effects make the runs likeliest."""
+    return min(attempts, key=lambda a: _negative_log_likelihood(a.naming.chosen))
 
 
-def _gain(better: Model, model: Model) -> float:
-    """The gain in log-likelihood of one model over another."""
-    worse, best = (negative_log_likelihood_within(m.prepared, m.fit) for m in (model, better))
-    return worse - best
+def _negative_log_likelihood(model: Model) -> float:
+    return negative_log_likelihood_within(model.prepared, model.fit)
 
 
 def _is_tried(other: Timing, timing: Timing) -> bool:

@@ -18,8 +18,7 @@ MAX_STDERR = 0.02
 def with_initial_temperatures(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     """The runs with the initial rise of the resistance fitted in all but the coolest one, and the fit to them; both
     unchanged unless that is clearly likelier than that all begin cold."""
-    problem = prepared.problem
-    telling = _runs_that_tell(problem, fit) if problem.has_temperature else np.zeros(0, int)
+    telling = _runs_that_tell(prepared.problem, fit)
     if len(telling) < 2:
         return prepared, fit
     coolest = int(telling[0])
@@ -35,7 +34,7 @@ def with_initial_temperatures(prepared: Prepared, fit: Fit) -> tuple[Prepared, F
 def _runs_that_tell(problem: Problem, fit: Fit) -> Int[np.ndarray, " telling"]:
     """The training runs that tell how warm they begin."""
     names = problem.parameters.names
-    if "R" not in names:
+    if not problem.has_temperature or "R" not in names:
         return np.zeros(0, int)
     by_R = np.asarray(fit.evaluation.jacobian)[..., names.index("R")]
     of_block = np.square(by_R).sum((1, 2))
@@ -47,8 +46,8 @@ def _with_cold_run(
     prepared: Prepared, fit: Fit, telling: Int[np.ndarray, " telling"], cold: int
 ) -> tuple[Prepared, Fit]:
     """The runs that tell with an initial rise, except one that begins cold; and the fit to them."""
-    warm = np.isin(np.arange(prepared.problem.tape.runs), telling[telling != cold])
-    prepared = prepared.with_problem(begins_warm=jnp.asarray(warm))
+    warm = prepared.problem.begins_warm.at[telling].set(True).at[cold].set(False)
+    prepared = prepared.with_problem(begins_warm=warm)
     return prepared, polish(prepared.problem, fit.optimum)
 
 
