@@ -592,6 +592,7 @@ def problem_of(runs: list[Recording], bounds=None) -> Problem:
         jnp.array([NOISE.current_A, NOISE.speed_rad_s]),
         free=jnp.ones(6, bool),
         fitted_runs=jnp.ones(2, bool),
+        begins_warm=jnp.zeros(2, bool),
     )
 
 
