@@ -50,6 +50,7 @@ def test_brushes_that_block_the_current_cause_no_electrical_misfit():
     assert electrical_misfit(fitted()) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_pulses_not_aligned_with_the_samples_cause_no_electrical_misfit():
     assert electrical_misfit(fitted(voltage_noise=0.2)) < 1.5

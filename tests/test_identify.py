@@ -188,6 +188,7 @@ def test_a_bound_along_an_unidentifiable_direction_is_not_reported(x64):
     assert found.parameters["Kt"].value == pytest.approx(found.parameters["Kb"].value, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_constant_load_is_not_identifiable_where_the_scale_of_torques_is_not():
     """Like Kt, J and f; its interval would reach from minus to plus twenty times its value. With Kt tied it has one."""
     rng = np.random.default_rng(6)
@@ -895,9 +896,8 @@ def test_bounds_are_the_ranges_of_an_effect_if_its_quantity_was_not_recorded(run
     assert bounds["brush_voltage_drop.voltage_V"] == (given.lower, given.upper)
 
 
-@pytest.mark.parametrize(
-    "warmer_K", [(30.0, 0.0, 20.0), pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("warmer_K", [(30.0, 0.0, 20.0), (0.0, 0.0, 0.0)])
 def test_a_run_may_begin_with_a_warm_winding(warmer_K):
     """The bench heats by an integrator of its own. If all began cold, R would be 2.5 % too large, and the heating found
     a quarter too small."""

@@ -291,19 +291,20 @@ def test_the_timing_of_a_voltage_is_found(timing):
 FAST = TRUE | {"L": 8e-5}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("read", "message"),
     [
         ("current", "the current is a mean over the last sample"),
-        pytest.param("both", "the speed is a mean over the last sample", marks=pytest.mark.slow),
-        pytest.param("late", "acts one sample later", marks=pytest.mark.slow),
-        pytest.param("7 tenths", "acts 0.3 of a sample later", marks=pytest.mark.slow),
-        pytest.param("3 tenths early", "acts 0.3 of a sample earlier", marks=pytest.mark.slow),
-        pytest.param("5 tenths early", "acts 0.5 of a sample earlier", marks=pytest.mark.slow),
-        pytest.param("held", None, marks=pytest.mark.slow),
+        ("both", "the speed is a mean over the last sample"),
+        ("late", "acts one sample later"),
+        ("7 tenths", "acts 0.3 of a sample later"),
+        ("3 tenths early", "acts 0.3 of a sample earlier"),
+        ("5 tenths early", "acts 0.5 of a sample earlier"),
+        ("held", None),
     ],
 )
-@pytest.mark.parametrize("truth", [FAST, pytest.param(TRUE, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("truth", [FAST, TRUE])
 def test_what_looks_like_another_inductance_is_found(read, message, truth):
     """Taken as read at the samples, these currents would treble L of the fast motor, some without larger residuals."""
     rng, runs = np.random.default_rng(13), []

@@ -62,12 +62,8 @@ MEAN_OVER = {
 }
 
 
-SLOW = {"counts of two samples", "counts of the last sample", "tachometer", "rounded"}
-
-
-@pytest.mark.parametrize(
-    "kind", [pytest.param(k, marks=pytest.mark.slow) if k in SLOW else k for k in MEAN_OVER]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", MEAN_OVER)
 def test_a_speed_that_is_a_mean_is_recognised(kind):
     found = identify(recorded(kind), tie=[("Kt", "Kb")])
     means = [m for m in found.messages if "is a mean over" in m]
@@ -146,6 +142,7 @@ def test_differences_over_two_samples_are_recognised_by_missing_power_at_the_nyq
     assert averaging_of_differences([])[0] is None
 
 
+@pytest.mark.slow
 def test_counts_without_a_current_are_not_taken_for_means():
     """Their lag may be that of an inductance."""
     runs = [attrs.evolve(r, current=None) for r in recorded("counts of the last sample")]
