@@ -222,7 +222,7 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
     )
     selection = UndecidedSelection()
     tried = Mock(spec=Model, effects=("stribeck_friction",))
-    refits = Mock(spec=Refits, with_signal=Mock(return_value=tried))
+    refits = Mock(spec=Refits, with_signals=Mock(return_value=[tried]))
     selection.proposals.by_evidence = lambda current: []
     selection.proposals.by_largest_gain = Proposals(
         refits, lambda model: found, set()
@@ -231,8 +231,8 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
     selection._leaves_little = lambda current, better: leaves_little
     better = selection._step(Mock(spec=Model, effects=()))
     assert better is (tried if leaves_little else None)
-    calls = refits.with_signal.call_args_list
-    assert [effect_of(call.args[1]) for call in calls] == list(gains)[:2]
+    [call] = refits.with_signals.call_args_list
+    assert [effect_of(signal) for signal in call.args[1]] == list(gains)[:2]
 
 
 @pytest.mark.parametrize(("count", "p_value", "exchanges"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])
@@ -244,7 +244,7 @@ def test_a_full_set_exchanges_the_effect_in_the_same_equation(
     peak = Mock(spec=Signal, candidate=Mock(effect="stribeck_friction"), gain=1.0)
     monkeypatch.setattr(proposals, "clear_signals", lambda found: [peak])
     exchanged = Mock(spec=Model)
-    refits = Mock(spec=Refits, with_signal=lambda *_: exchanged)
+    refits = Mock(spec=Refits, with_signals=lambda current, signals, found: [exchanged])
     refits.without.return_value = Mock(spec=Model)
     found = Mock(
         spec=Assessment,

@@ -19,6 +19,7 @@ from scipy.integrate import cumulative_trapezoid, solve_ivp
 
 from benchmarks import virtual_bench as vb
 from pmdc_jax.effects import EFFECTS
+from pmdc_jax.effects.sine import cosine, sine
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import Motor
 from pmdc_jax.recordings.recording import OVER_BOTH, OVER_LAST, Averaging, Recording
@@ -503,6 +504,18 @@ def test_a_torque_wave_with_about_one_period_or_more_per_sample(x64, name, max_r
         for motor in (LINEAR, with_effect(name, values))
     )
     assert np.std(found - expected) < max_ratio * np.std(plain - expected)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e3, 1e6, 1e8])
+def test_sine_and_cosine_are_exact_to_rounding(x64, size):
+    x = size * np.concatenate([np.linspace(-4, 4, 20001), np.arange(-2, 3) * np.pi / 2])
+    error = 5e-16 if size < 1e8 else np.spacing(x.max())  # beyond, that of x itself
+    for found, expected in ((sine, np.sin), (cosine, np.cos)):
+        np.testing.assert_allclose(found(x), expected(x), rtol=0, atol=error)
+    for found, slope in ((sine, np.cos), (cosine, lambda x: -np.sin(x))):
+        slopes = jax.vmap(jax.grad(found))(jnp.asarray(x))
+        np.testing.assert_allclose(slopes, slope(x), rtol=0, atol=error)
+    assert sine(jnp.float32(1.0)).dtype == cosine(jnp.float32(1.0)).dtype == jnp.float32
 
 
 @pytest.mark.parametrize("name", sorted(FAST_TO_COMPILE))

@@ -566,6 +566,6 @@ def test_threads_work_in_the_precision_of_their_caller(double):
 
 
 def test_threads_may_start_threads():
-    """All cores may be waiting for others already, so these work on one after another."""
+    """All cores may be waiting for others already, so these do themselves what no other has begun."""
     found = map_in_threads(lambda k: sum(map_in_threads(lambda j: j * k, range(9))), range(20))
     assert found == [36 * k for k in range(20)]

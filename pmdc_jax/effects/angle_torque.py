@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .base import AbstractEffect, ParameterRange, Scalars, State
+from .sine import cosine, sine
 
 if TYPE_CHECKING:
     from ..motor import Motor
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 
 PHASE_RANGE = ParameterRange("rad", -4.0, 4.0, "linear")
 PERIODS_RANGE = ParameterRange("", 0.5, 200.0)
+# Half of the angle of a step, in rad of the wave, below which its mean is that of Simpson's rule to twelve digits
+SMALL_TURN = 0.02
 
 
 class _Angular(AbstractEffect):
@@ -119,7 +122,7 @@ class TorqueRipple(_Angular):
 
 def _wave(effect: CoggingTorque | TorqueRipple, state: State) -> Scalars:
     """sin(n angle + phase)."""
-    return jnp.sin(effect.periods * state.extra["angle"] + effect.phase_rad)
+    return sine(effect.periods * state.extra["angle"] + effect.phase_rad)
 
 
 def _period(effect: CoggingTorque | TorqueRipple) -> dict[str, Scalars]:
@@ -134,4 +137,6 @@ def _averaging_factor(effect: CoggingTorque | TorqueRipple, turn: Scalars) -> Sc
     **Source**: exponential fitting, Ixaru, Vanden Berghe, "Exponential Fitting" (2004), chapter 4.
     """
     half = effect.periods * turn / 2
-    return 3 * jnp.sinc(half / jnp.pi) / (2 + jnp.cos(half))
+    small = jnp.abs(half) < SMALL_TURN
+    size = jnp.where(small, 1.0, half)
+    return jnp.where(small, 1 - half**4 / 180, 3 * sine(size) / (size * (2 + cosine(size))))

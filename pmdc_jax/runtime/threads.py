@@ -6,9 +6,9 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import ParamSpec, TypeVar
+from typing import Generic, ParamSpec, TypeVar
 
 import jax
 
@@ -23,9 +23,23 @@ MAX_AHEAD = 4
 _this_thread = threading.local()
 
 
+class Task(Generic[T]):
+    """A call in another thread."""
+
+    def __init__(self, call: Callable[[], T]) -> None:
+        self._call, self._future = call, _threads().submit(call)
+
+    def result(self) -> T:
+        """The result, waited for. One of the threads makes a call itself that none of them has begun: all may be at
+        work, or waiting for others."""
+        if getattr(_this_thread, "is_worker", False) and self._future.cancel():
+            return self._call()
+        return self._future.result()
+
+
 def map_in_threads(function: Callable[[A], T], items: Iterable[A]) -> list[T]:
     """Results of a function for every item, computed in parallel on all cores."""
-    return [future.result() for future in [submit(function, item) for item in items]]
+    return [task.result() for task in [submit(function, item) for item in items]]
 
 
 def map_in_threads_until(
@@ -45,7 +59,7 @@ def map_in_threads_until(
 def run_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
     """Results of calls in their order, with some of the next ones running in other threads: one for every core, but at
     most `MAX_AHEAD`."""
-    waiting: deque[Future[T]] = deque()
+    waiting: deque[Task[T]] = deque()
     for call in calls:
         waiting.append(submit(call))
         if len(waiting) > min(CORES, MAX_AHEAD):
@@ -54,15 +68,8 @@ def run_ahead(calls: Iterable[Callable[[], T]]) -> Iterator[T]:
         yield waiting.popleft().result()
 
 
-def submit(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-    """Run a call in another thread, with the caller's precision, which JAX keeps for each thread.
-
-    In such a thread the call runs at once: all cores are at work, and waiting for another thread could deadlock.
-    """
-    if getattr(_this_thread, "is_worker", False):
-        done: Future[T] = Future()
-        done.set_result(function(*args, **kwargs))
-        return done
+def submit(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Task[T]:
+    """Run a call in another thread, with the caller's precision, which JAX keeps for each thread."""
     double = jax.config.read("jax_enable_x64")
 
     def call() -> T:
@@ -70,7 +77,7 @@ def submit(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Futur
         with jax.enable_x64(double):
             return function(*args, **kwargs)
 
-    return _threads().submit(call)
+    return Task(call)
 
 
 @cache

@@ -35,8 +35,7 @@ class BackwardElimination:
         """The model after backward elimination: without effects that it does not need, and with simpler forms of
         effects, alone or with another effect added, where these are as good."""
         white = self.comparison.filter_of(model)
-        for effect in model.effects[:-1]:
-            smaller = self.refits.without(model, effect, white)
+        for smaller in self.refits.without_each(model, model.effects[:-1], white):
             if (
                 self.is_new(smaller)
                 and self.comparison.ranked([model, smaller], white)[0].model is smaller
@@ -44,7 +43,7 @@ class BackwardElimination:
                 return self.reduced(smaller)
         for effect in model.effects:
             for simple in self._simpler_forms(effect):
-                simpler = self.refits.with_replacement(model, white, effect, simple)
+                [simpler] = self.refits.with_replacements(model, white, [(effect, simple)])
                 if self.is_new(simpler) and self._is_as_good(simpler, model):
                     return self.reduced(simpler)
                 pair = simpler and self._simple_form_with_another(simpler, model, effect)
@@ -79,8 +78,9 @@ class BackwardElimination:
             and s.gain > least
         ]
         best = max(others, key=lambda s: s.gain, default=None)
-        pair = best and self.refits.with_signal(simpler, best, assessment.screen)
-        return pair if pair and pair.is_possible else None
+        tried = [best] if best else []
+        pairs = self.refits.with_signals(simpler, tried, assessment.screen)
+        return next((pair for pair in pairs if pair and pair.is_possible), None)
 
     def _is_far_better(self, pair: Model, model: Model, white: Whitener) -> bool:
         """Whether two effects beat a rich one by `BIC_MARGIN`, and leave no more unfiltered squares."""

@@ -106,7 +106,7 @@ class Proposals:
         unfiltered = assessment.screen._replace(evidence=assessment.screen.unfiltered)
         least = MIN_UNFILTERED_SHARE * assessment.screen.unfiltered.regress().squares
         promising = most_promising(assessment.unfiltered_signals(), set(current.effects), least)
-        tried = [self.refits.with_signal(current, s, unfiltered) for s in promising]
+        tried = self.refits.with_signals(current, promising, unfiltered)
         return [m for m in tried if m is not None and m.fit.fitness < decisive]
 
     def by_exchange(self, current: Model) -> Proposed:
@@ -141,10 +141,8 @@ class Proposals:
     def in_refit_only_forms(self, model: Model, effects: set[str]) -> Proposed:
         """The model with each of some effects replaced by its refit-only form, if it has one."""
         white = self.assess(model).screen.white
-        return [
-            self.refits.with_replacement(model, white, simpler, REFIT_ONLY[simpler])
-            for simpler in sorted(effects & REFIT_ONLY.keys())
-        ]
+        forms = [(simpler, REFIT_ONLY[simpler]) for simpler in sorted(effects & REFIT_ONLY.keys())]
+        return self.refits.with_replacements(model, white, forms)
 
     def by_swap(self, current: Model, equivalents: Mapping[str, set[str]]) -> Proposed:
         """The model with one effect replaced by one of its `equivalents`, that was as good when it was added, or by one
@@ -152,14 +150,16 @@ class Proposals:
         if len(current.effects) < 2:
             return []
         white = self.assess(current).screen.white
-        return [
-            self.refits.with_replacement(current, white, effect, other)
+        others = {
+            effect: equivalents.get(effect, set()) | TRIALS[effect].alike.keys()
             for effect in current.effects
-            for other in sorted(
-                (equivalents.get(effect, set()) | TRIALS[effect].alike.keys())
-                - set(current.effects)
-            )
+        }
+        swaps = [
+            (effect, other)
+            for effect in current.effects
+            for other in sorted(others[effect] - set(current.effects))
         ]
+        return self.refits.with_replacements(current, white, swaps)
 
     def _is_sufficient(self, model: Model | None) -> bool:
         """Whether a model leaves nothing that is worth another trial.
@@ -199,8 +199,7 @@ class Proposals:
 
     def _with_signals(self, current: Model, signals: Sequence[Signal]) -> Proposed:
         """The model with the effect of each signal."""
-        screen = self.assess(current).screen
-        return [self.refits.with_signal(current, s, screen) for s in signals]
+        return self.refits.with_signals(current, signals, self.assess(current).screen)
 
 
 def _is_room_for_another(current: Model, assessment: Assessment) -> bool:

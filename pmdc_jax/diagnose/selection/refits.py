@@ -19,7 +19,7 @@ from ...identify.solve import POOR_FIT, Solved, search_and_refine
 from ...identify.uncertainty.covariance import information_of
 from ...identify.uncertainty.identifiability import moved_by
 from ...progress import ReportProgress
-from ...runtime.threads import map_in_threads_until
+from ...runtime.threads import map_in_threads, map_in_threads_until
 from ..evidence.signals import Screen, Signal
 from ..hypotheses.candidates import Scales
 from ..hypotheses.effect_relations import FULLER
@@ -66,15 +66,36 @@ class Refits:
         # pairs of a set and a model from which it has been refitted, or need not be
         self.refitted_from: set[tuple[frozenset[str], Model]] = set()
 
-    def with_signal(self, current: Model, signal: Signal, found: Screen) -> Model | None:
-        """The current model with the effect of a signal added; None if physics forbids the coefficients found.
+    def with_signals(
+        self, current: Model, signals: Sequence[Signal], found: Screen
+    ) -> list[Model | None]:
+        """The current model with the effect of each of some signals added, in parallel; None if physics forbids the
+        coefficients found.
 
         A set that was fitted from another model and does not realise the promised gain is fitted again from this one.
         """
+        # in this order, as the first start values of an effect are kept
+        additions = [(signal, *self._addition(current, signal, found)) for signal in signals]
+
+        def with_signal(addition: tuple[Signal, tuple[str, ...], Refit]) -> Model | None:
+            signal, effects, refit = addition
+            model, key = self._stored_or_fitted(effects, current, refit), frozenset(effects)
+            if model is None or (key, current) in self.refitted_from:
+                return model
+            if self._realises_gain(model, current, signal, found.white):
+                return model
+            return self._stored_or_better(key, current, refit)
+
+        return map_in_threads(with_signal, additions)
+
+    def _addition(
+        self, current: Model, signal: Signal, found: Screen
+    ) -> tuple[tuple[str, ...], Refit]:
+        """The effects with that of a signal added, and what fits them."""
         effects = effects_with(current.effects, effect_of(signal))
+        start = self.starts.from_signal(current, effects, signal, found)
 
         def refit() -> Model | None:
-            start = self.starts.from_signal(current, effects, signal, found)
             if start is None:
                 return None
             of_trial = self.starts.of_trial(current, effects)
@@ -82,30 +103,34 @@ class Refits:
                 return self._best_of_starts(effects, [start, *of_trial], found.white)
             return self._refit_from_signal(effects, start, current, signal, found.white)
 
-        model, key = self._stored_or_fitted(effects, current, refit), frozenset(effects)
-        if model is None or (key, current) in self.refitted_from:
-            return model
-        if self._realises_gain(model, current, signal, found.white):
-            return model
-        return self._stored_or_better(key, current, refit)
+        return effects, refit
 
-    def with_replacement(self, current: Model, white: Whitener, old: str, new: str) -> Model | None:
-        """The current model with `new` in place of `old`: a fuller or a simpler form of it, an effect that resembles
-        it, one with starts of its own, or one fitted before. Others have no values to start from."""
-        effects = (*(e for e in current.effects if e != old), new)
+    def with_replacements(
+        self, current: Model, white: Whitener, replacements: Sequence[tuple[str, str]]
+    ) -> list[Model | None]:
+        """The current model with a new effect in place of an old one, for each of some pairs (old, new), in parallel.
 
-        def refit() -> Model:
+        The new one is a fuller or a simpler form of the old one, an effect that resembles it, one with starts of its
+        own, or one fitted before. Others have no values to start from.
+        """
+        # in this order, as the first start values of an effect are kept
+        refits = [self._replacement(current, white, old, new) for old, new in replacements]
+        return map_in_threads(lambda of: self._stored_or_fitted(of[0], current, of[1]), refits)
+
+    def _replacement(
+        self, current: Model, white: Whitener, old: str, new: str
+    ) -> tuple[tuple[str, ...], Refit]:
+        """The effects with `new` in place of `old`, and what fits them if no fit is stored."""
+        effects, starts, max_misfit = (*(e for e in current.effects if e != old), new), [], np.inf
+        if frozenset(effects) not in self.models:
             starts = self.starts.of_trial(current, effects)
             if not starts:
                 values = self.starts.values_from_replaced(current, old, new)
                 starts = [self.starts.from_model(current, effects, values)]
-            max_misfit = np.inf
             if old in FULLER and FULLER[old].effect == new:
                 starts = [self.starts.from_simple_form(current, old, effects), *starts]
                 max_misfit = MAX_FULLER_MISFIT * _misfit(current)
-            return self._best_of_starts(effects, starts, white, max_misfit)
-
-        return self._stored_or_fitted(effects, current, refit)
+        return effects, lambda: self._best_of_starts(effects, starts, white, max_misfit)
 
     def with_global_search(self, current: Model, effect: str) -> Model:
         """The current model with one more effect, by a new global search; or the stored fit of the set, if better."""
@@ -140,6 +165,10 @@ class Refits:
         if squares > MAX_HELD_MISFIT * self.comparison.fitted(current, white).squares:
             return None
         return refit_from(effects, prepared, end, white)
+
+    def without_each(self, model: Model, effects: Sequence[str], white: Whitener) -> list[Model]:
+        """The model `without` each of some of its effects, in parallel."""
+        return map_in_threads(lambda effect: self.without(model, effect, white), effects)
 
     def without(self, model: Model, effect: str, white: Whitener) -> Model:
         """The model without one of its effects; fitted again if the larger one's parameters beat the stored fit."""

@@ -44,8 +44,8 @@ def p_values_without(
     """By effect of the chosen set, the p-value of the runs without it: a likelihood-ratio test, chi-squared with one
     degree of freedom for each of the effect's parameters."""
     p_values = {}
-    for effect in chosen.effects:
-        smaller = refits.without(chosen, effect, white)
+    smaller_models = refits.without_each(chosen, chosen.effects, white)
+    for effect, smaller in zip(chosen.effects, smaller_models, strict=True):
         squares = {f.model.effects: f.squares for f in comparison.ranked([chosen, smaller], white)}
         gain = squares[smaller.effects] - squares[chosen.effects]
         p_values[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
