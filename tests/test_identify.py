@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from unittest.mock import Mock
 
 import attrs
 import equinox as eqx
@@ -24,8 +25,9 @@ from pmdc_jax import InputError, identify
 from pmdc_jax.control.spread import drawn_motors
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify import problem as problems
-from pmdc_jax.identify.fit.generalised_least_squares import last_fit, residuals_of
-from pmdc_jax.identify.fit.polish import fit_at, polish
+from pmdc_jax.identify.fit import polish as polishing
+from pmdc_jax.identify.fit.generalised_least_squares import last_fit, residuals_of, with_whitening
+from pmdc_jax.identify.fit.polish import FIRST_TO_GIVE_UP, fit_at, polish
 from pmdc_jax.identify.fit.refine import Optimum, refine
 from pmdc_jax.identify.fit.run_unknowns import fit_run_unknowns
 from pmdc_jax.identify.identification import CONVERGED_DISTANCE, Identification
@@ -718,6 +720,28 @@ def test_a_refinement_with_too_few_steps_has_not_converged(x64, runs):
     far = optimum._replace(unknowns=start_at(problem, 1.3))
     assert not polish(problem, far, steps=1).optimum.converged
     assert polish(problem, optimum, steps=12).optimum.converged
+
+
+def test_a_fit_that_cannot_compete_is_given_up(x64, runs, monkeypatch):
+    """With R 10 % too large the squares are far above those of the noise, wherever the other parameters are."""
+    prepared = prepare(runs, ())
+    best = polish(prepared.problem, refine(prepared.problem, start_at(prepared.problem)))
+    white = fit_whitener(residuals_of(prepared, best))
+    held = with_whitening(prepared.with_problem(free=jnp.arange(6) > 0), white).problem
+    far = best.optimum.moved(held.parameters, 0.1 * np.ones(6))
+    evaluations = Mock(side_effect=evaluate)
+    monkeypatch.setattr(polishing, "evaluate", evaluations)
+
+    def made(useful: float) -> tuple[int, float]:
+        evaluations.reset_mock()
+        fitness = polish(held, far, useful=useful).fitness
+        return evaluations.call_count, fitness * held.most_samples
+
+    count, least = made(np.inf)
+    assert made(least) == (count, least)
+    fewer, squares = made(0.5 * least)
+    assert FIRST_TO_GIVE_UP <= fewer < count
+    assert least <= squares < 1.1 * least
 
 
 @pytest.mark.parametrize("standard_errors", [0.1, 2.0])

@@ -161,10 +161,17 @@ class Model:
 
 
 def refit_from(
-    effects: tuple[str, ...], prepared: Prepared, start: Optimum, white: Whitener
+    effects: tuple[str, ...],
+    prepared: Prepared,
+    start: Optimum,
+    white: Whitener,
+    useful: float = np.inf,
 ) -> Model:
-    """A model fitted from a start to whitened residuals; its `fit` is evaluated without the filter."""
-    prepared, whitened = polish_with_angle(with_whitening(prepared, white), start)
+    """A model fitted from a start to whitened residuals; its `fit` is evaluated without the filter.
+
+    **Arguments**: `useful`, the largest sum of squared white residuals that is of any use, as of `polish`.
+    """
+    prepared, whitened = polish_with_angle(with_whitening(prepared, white), start, useful=useful)
     prepared = prepared.with_problem(whitening=None)
     # no step: the unfiltered residuals at the same point
     unfiltered = fit_at(prepared.problem, whitened.optimum)

@@ -158,13 +158,17 @@ def _searched_parameters(prepared: Prepared) -> Parameters:
 
 
 def polish_with_angle(
-    prepared: Prepared, end: Optimum, known: Evaluation | None = None
+    prepared: Prepared, end: Optimum, known: Evaluation | None = None, useful: float = np.inf
 ) -> tuple[Prepared, Fit]:
-    """Polish; where a torque depends on the rotor angle, update the angle from the fit and repeat while that helps."""
-    polished = polish(prepared.problem, end, known=known)
-    for _ in range(ANGLE_ITERATIONS if prepared.problem.depends_on_angle else 0):
+    """Polish; where a torque depends on the rotor angle, update the angle from the fit and repeat while that helps.
+
+    **Arguments**: as of `polish`.
+    """
+    polished = polish(prepared.problem, end, known=known, useful=useful)
+    is_useful = polished.fitness * prepared.problem.most_samples <= useful
+    for _ in range(ANGLE_ITERATIONS if prepared.problem.depends_on_angle and is_useful else 0):
         again = prepared._replace(problem=with_rotor_angle(prepared.problem, polished))
-        better = polish(again.problem, polished.optimum)
+        better = polish(again.problem, polished.optimum, useful=useful)
         if not better.fitness < (1 - MIN_ANGLE_GAIN) * polished.fitness:
             break
         prepared, polished = again, better

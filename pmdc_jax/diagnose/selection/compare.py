@@ -9,11 +9,15 @@ import numpy as np
 
 from ...identify.fit.generalised_least_squares import fit_whitened, residuals_of, sum_of_squares
 from ...identify.noise.noise_model import Whitener, fit_whitener
+from ...identify.prepare import Prepared
 from ..hypotheses.effect_relations import is_simpler_form
 from ..model import Model
 
 # Models whose criteria (BIC, in noise variances) differ by less are equivalent
 BIC_MARGIN = 8.0
+# A model is not fitted to the end if its squares will exceed those with which it might compete by this, in noise
+# variances: a probability below 1e-20
+HOPELESS_EXCESS = 100.0
 # Fall of the squares, in noise variances, below which no further fitting step is made
 MIN_DECREASE = 0.1
 # A model that leaves so many times the unfiltered squares of another one is worse, whatever its filtered squares are
@@ -36,37 +40,54 @@ class Comparison:
         self._filters: dict[Model, Whitener] = {}
         self._fitted: dict[tuple[Model, Whitener], Fitted] = {}
 
-    def ranked(self, models: Sequence[Model], white: Whitener) -> list[Fitted]:
+    def ranked(
+        self, models: Sequence[Model], white: Whitener, margin: float = BIC_MARGIN
+    ) -> list[Fitted]:
         """Models by their criteria when fitted to residuals whitened by one filter, the best first.
 
         One that leaves far more unfiltered squares than another is ruled out (infinite criterion): a whitening filter
-        suppresses whatever changes slowly.
+        suppresses whatever changes slowly. Where the criterion will exceed the least by more than `margin`, and
+        `HOPELESS_EXCESS`, the fit is given up.
         """
-        least = min(m.fit.fitness for m in models)
-        fitted = [
-            self.fitted(m, white)
-            if m.fit.fitness < DECISIVE_RATIO * least
-            else Fitted(m, np.inf, np.inf)
-            for m in models
-        ]
+        least_unfiltered = min(m.fit.fitness for m in models)
+        fitted, useful = [], np.inf
+        for model in sorted(models, key=lambda m: m.fit.fitness):
+            if model.fit.fitness < DECISIVE_RATIO * least_unfiltered:
+                fitted.append(self.fitted(model, white, useful - _penalty(model.prepared)))
+                useful = min(useful, fitted[-1].criterion + margin + HOPELESS_EXCESS)
+            else:
+                fitted.append(Fitted(model, np.inf, np.inf))
         return sorted(fitted, key=lambda f: f.criterion)
 
-    def fitted(self, model: Model, white: Whitener) -> Fitted:
-        """A model fitted to its residuals whitened by a filter."""
+    def fitted(self, model: Model, white: Whitener, useful: float = np.inf) -> Fitted:
+        """A model fitted to its residuals whitened by a filter; `useful`, the largest sum of squares that is of any
+        use, as of `polish`."""
         key = model, white
-        if key not in self._fitted:
-            prepared, polished = fit_whitened(model.prepared, model.fit, white, MIN_DECREASE)
-            squares = sum_of_squares(prepared, polished)
-            samples = prepared.problem.samples.sum()
-            penalty = len(prepared.problem.parameters.names) * np.log(samples)
-            self._fitted[key] = Fitted(model, squares, squares + penalty)
-        return self._fitted[key]
+        if key in self._fitted:
+            return self._fitted[key]
+        prepared, polished = fit_whitened(model.prepared, model.fit, white, MIN_DECREASE, useful)
+        squares = sum_of_squares(prepared, polished)
+        fitted = Fitted(model, squares, squares + _penalty(prepared))
+        if squares <= useful:  # not given up
+            self._fitted[key] = fitted
+        return fitted
+
+    def useful_squares(self, smaller: Prepared, model: Model, white: Whitener) -> float:
+        """The largest sum of squares with which a smaller model may still compete with a model."""
+        criterion = self.fitted(model, white).criterion
+        return criterion + BIC_MARGIN + HOPELESS_EXCESS - _penalty(smaller)
 
     def filter_of(self, model: Model) -> Whitener:
         """The filter that whitens the residuals of a model."""
         if model not in self._filters:
             self._filters[model] = fit_whitener(residuals_of(model.prepared, model.fit))
         return self._filters[model]
+
+
+def _penalty(prepared: Prepared) -> float:
+    """What the criterion adds to the squares for the number of parameters."""
+    samples = prepared.problem.samples.sum()
+    return float(len(prepared.problem.parameters.names) * np.log(samples))
 
 
 def simplest_equivalent(ranked: Sequence[Fitted]) -> Model:

@@ -41,8 +41,6 @@ SHORT_REFIT_STEPS = 8
 SAME_OPTIMUM_RATIO = 1.05
 # A fuller form whose short refits leave no less than this share of the simple form's misfit is searched no further
 MAX_FULLER_MISFIT = 0.9
-# A fuller form held where it clearly acts is fitted no further if a short refit leaves so many times the squares
-MAX_HELD_MISFIT = 4.0
 
 # Fits a model; None if physics forbids it
 Refit = Callable[[], Model | None]
@@ -148,9 +146,11 @@ class Refits:
         assert model is not None
         return model
 
-    def with_fuller_form_held(self, current: Model, white: Whitener, effect: str) -> Model | None:
+    def with_fuller_form_held(
+        self, current: Model, white: Whitener, effect: str, useful: float
+    ) -> Model:
         """The current model with a fuller form of an effect, whose extra parameters are held where they clearly act;
-        None if a short refit shows that it fits far worse."""
+        `useful`, as of `refit_from`."""
         fuller = FULLER[effect]
         effects = (*(e for e in current.effects if e != effect), fuller.effect)
         prepared, start = self.starts.from_simple_form(current, effect, effects)
@@ -160,11 +160,7 @@ class Refits:
             fixed.add("Kt")
         free = jnp.asarray([name not in fixed for name in prepared.problem.parameters.names])
         prepared = prepared.with_problem(free=free)
-        end = polish(with_whitening(prepared, white).problem, start, SHORT_REFIT_STEPS).optimum
-        squares = end.fitness * prepared.problem.most_samples
-        if squares > MAX_HELD_MISFIT * self.comparison.fitted(current, white).squares:
-            return None
-        return refit_from(effects, prepared, end, white)
+        return refit_from(effects, prepared, start, white, useful)
 
     def without_each(self, model: Model, effects: Sequence[str], white: Whitener) -> list[Model]:
         """The model `without` each of some of its effects, in parallel."""
@@ -176,7 +172,8 @@ class Refits:
         prepared, start = self.starts.from_model(model, rest, {})
 
         def refit() -> Model:
-            return refit_from(rest, prepared, start, white)
+            useful = self.comparison.useful_squares(prepared, model, white)
+            return refit_from(rest, prepared, start, white, useful)
 
         smaller = self._stored_or_fitted(rest, model, refit)
         assert smaller is not None

@@ -25,17 +25,17 @@ def rivals_of(
     ruled out."""
     white = assessment.screen.white
     models = [chosen, *(m for m in refits.models.values() if m.is_possible)]
-    ranked = comparison.ranked(models, white)
-    least = next(f.criterion for f in ranked if f.model is chosen)
     unexplained = assessment.clearest.gain if assessment.p_value < FALSE_ALARM else 0.0
     margin = BIC_MARGIN + UNEXPLAINED_SHARE * unexplained
+    ranked = comparison.ranked(models, white, margin)
+    least = next(f.criterion for f in ranked if f.model is chosen)
     near = [f.model for f in ranked if f.criterion < least + margin]
     rivals = [m for m in near if are_rivals(set(m.effects), set(chosen.effects))]
     # with the fuller form held clearly present: a free fit would return to the simple form where the runs show little
     simple = [effect for effect in chosen.effects if effect in FULLER]
-    fuller = [refits.with_fuller_form_held(chosen, white, effect) for effect in simple]
     limit = comparison.fitted(chosen, white).squares + RULED_OUT
-    return rivals + [m for m in fuller if m and comparison.fitted(m, white).squares < limit]
+    fuller = [refits.with_fuller_form_held(chosen, white, effect, limit) for effect in simple]
+    return rivals + [m for m in fuller if comparison.fitted(m, white, limit).squares < limit]
 
 
 def p_values_without(

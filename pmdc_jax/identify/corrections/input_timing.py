@@ -92,7 +92,8 @@ class _Trials:
     def fitted(self, timing: Timing) -> tuple[Prepared, Fit]:
         """The runs with this timing, and the fit to them."""
         if timing not in self._fitted:
-            refit = self._refitted(without_averaging(with_timing(self.prepared, timing)))
+            timed = without_averaging(with_timing(self.prepared, timing))
+            refit = self._refitted(timed, self.fit)
             # only a fit with the right timing can tell a mean over the last sample from a delay
             self._fitted[timing] = with_averaging(*with_even_clock(*refit))
         return self._fitted[timing]
@@ -120,22 +121,25 @@ class _Trials:
 
     def best_lead(self, ahead: int) -> float:
         """The lead that fits best, if the voltages act between two samples, at least so many ahead."""
+        nearest = self.fit
 
         def misfit(lead: float) -> float:
-            return self._refitted(with_timing(self.prepared, Timing(lead)))[1].cost
+            nonlocal nearest
+            _, nearest = self._refitted(with_timing(self.prepared, Timing(lead)), nearest)
+            return nearest.cost
 
         limits, tolerance = (ahead + MARGIN, ahead + 1 - MARGIN), {"xatol": LEAD_TOLERANCE}
         best = minimize_scalar(misfit, bounds=limits, method="bounded", options=tolerance)
         return float(best.x)
 
-    def _refitted(self, other: Prepared) -> tuple[Prepared, Fit]:
-        """The best fit to the runs with another timing, from the inductance with which the currents depend on two
-        voltages as they were seen to."""
+    def _refitted(self, other: Prepared, start: Fit) -> tuple[Prepared, Fit]:
+        """The best fit from a start to the runs with another timing, from the inductance with which the currents depend
+        on two voltages as they were seen to."""
         timing, voltages = other.timing, self.voltages
         if not (voltages and timing.reading and timing.ahead == voltages.ahead):
-            return refitted(other, self.fit)
-        R = float(other.problem.parameters(self.fit.coordinates).R)
-        return refitted(other, self.fit, R * voltages.time_constant(timing.reading))
+            return refitted(other, start)
+        R = float(other.problem.parameters(start.coordinates).R)
+        return refitted(other, start, R * voltages.time_constant(timing.reading))
 
 
 def _likelier(trials: _Trials, proposed: Sequence[Timing]) -> list[Timing]:

@@ -49,12 +49,19 @@ def _is_exact(prepared: Prepared, fit: Fit) -> bool:
 
 
 def fit_whitened(
-    prepared: Prepared, start: Fit, white: Whitener, tolerance: float = TOLERANCE
+    prepared: Prepared,
+    start: Fit,
+    white: Whitener,
+    tolerance: float = TOLERANCE,
+    useful: float = np.inf,
 ) -> tuple[Prepared, Fit]:
-    """The problem with whitened residuals, and its solution started from a plain fit nearby."""
+    """The problem with whitened residuals, and its solution started from a plain fit nearby.
+
+    **Arguments**: `tolerance` and `useful` as of `polish`.
+    """
     prepared = with_whitening(prepared, white)
     known = reweighted(prepared.problem, start)
-    return prepared, polish(prepared.problem, start.optimum, MAX_STEPS, tolerance, known)
+    return prepared, polish(prepared.problem, start.optimum, MAX_STEPS, tolerance, known, useful)
 
 
 def sum_of_squares(prepared: Prepared, polished: Fit) -> float:

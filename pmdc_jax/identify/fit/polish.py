@@ -34,6 +34,9 @@ from .refine import Optimum
 PATIENCE, MIN_COST_DECREASE = 5, 1e-5
 # Gauss-Newton steps at most
 MAX_STEPS = 20
+# From this evaluation on a polish is given up where it would not be useful even if the squares fell so many times
+# further than the next step is predicted to reduce them
+FIRST_TO_GIVE_UP, OPTIMISM = 3, 3.0
 
 
 class Fit(NamedTuple):
@@ -71,12 +74,14 @@ def polish(
     steps: int = MAX_STEPS,
     tolerance: float = TOLERANCE,
     known: Evaluation | None = None,
+    useful: float = np.inf,
 ) -> Fit:
     """Gauss-Newton iterations in which each output is weighted by the standard deviation of its own residuals.
 
     It ends where no step within the bounds is predicted to lower the sum of squares by more than `tolerance`, in noise
     variances, or none is found that lowers it. A coordinate held at a bound is released where the gradient points back
-    inside. `known` is the evaluation at the start, if there is one already.
+    inside. `known` is the evaluation at the start, if there is one already. The fit is given up where its sum of
+    whitened squares will hardly fall to `useful`, the largest that is of any use.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
     ridge = ridge_of(problem)
@@ -95,6 +100,8 @@ def polish(
             fixed = {k for k in fixed if (best.matrix[k, -1] > 0) == (coordinates[k] <= low[k])}
             step, gain = gauss_newton_step(best.matrix, fixed, ridge)
             if gain <= tolerance * _residual_variance(problem, best):
+                break
+            if len(costs) >= FIRST_TO_GIVE_UP and best.matrix[-1, -1] - OPTIMISM * gain > useful:
                 break
         elif share > 1e-3:
             share /= 4  # the last step was too long
