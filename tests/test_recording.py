@@ -25,6 +25,7 @@ from pmdc_jax.recordings.recording_file import (
     read_recording,
     read_recordings,
     recordings_of,
+    refuse_copies,
     write_recording,
 )
 
@@ -432,10 +433,15 @@ def test_runs_of_files_of_the_same_name_are_named_after_their_paths(tmp_path):
     again = tmp_path / "a" / ".." / "d.csv"
     with pytest.raises(InputError, match=r"d\.csv: this file is listed twice"):
         named_apart(recordings_of([*paths, again]))
-    copy = tmp_path / "copy.csv"
-    copy.write_bytes(paths[0].read_bytes())
+
+
+def test_copies_of_a_recording_are_refused(tmp_path):
+    paths = [tmp_path / name for name in ("run.csv", "other.csv", "copy.csv")]
+    for path, speed in zip(paths, (T, 2 * T, T), strict=True):
+        path.write_text(table("time_s,voltage_V,speed", T, T, speed))
+    refuse_copies(recordings_of(paths[:2]))
     with pytest.raises(InputError, match=r"copy\.csv: it holds the same data as run"):
-        named_apart(recordings_of([paths[0], copy]))
+        refuse_copies(recordings_of(paths))
 
 
 def test_an_empty_column_counts_as_absent(tmp_path):

@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..motor import PARAMETERS
 from ..recordings.clock import evenly_stamped
 from ..recordings.recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
-from ..recordings.recording_file import Runs, named_apart, recordings_of
+from ..recordings.recording_file import Runs, named_apart, recordings_of, refuse_copies
 from ..simulate import ZERO_ORDER_HOLD, Tape, Timing, uniform
 from .identification import Role
 from .noise.sensor_noise import white_noise
@@ -89,7 +89,9 @@ def prepare(
 ) -> Prepared:
     """Check the recordings and lay them out; raises `InputError` where they cannot give an answer."""
     recordings, holdout = recordings_of(recordings), recordings_of(holdout)
-    cleaned = without_unmeasured(named_apart([*recordings, *holdout]))
+    named = named_apart([*recordings, *holdout])
+    refuse_copies(named)
+    cleaned = without_unmeasured(named)
     recordings, holdout = cleaned[: len(recordings)], cleaned[len(recordings) :]
     _check_arguments(recordings, holdout, tie, known)
     findings = check([*recordings, *holdout])

@@ -136,8 +136,7 @@ def recordings_of(runs: Runs, to_simulate: bool = False) -> list[Recording]:
 def named_apart(recordings: Sequence[Recording]) -> list[Recording]:
     """The recordings, those with the same name renamed after as much of the paths of their files as tells them apart.
 
-    **Raises**: `InputError` if a file is listed twice, if two hold the same data, or if two without files have the same
-    name.
+    **Raises**: `InputError` if a file is listed twice, or if two without files have the same name.
     """
     count = Counter(run.name for run in recordings)
     paths: list[Path] = []
@@ -151,15 +150,19 @@ def named_apart(recordings: Sequence[Recording]) -> list[Recording]:
         if path in paths:
             raise InputError(run.source, "this file is listed twice", "List it only once")
         paths.append(path)
+    return [run if count[run.name] == 1 else _named_after_path(run, paths) for run in recordings]
+
+
+def refuse_copies(recordings: Sequence[Recording]) -> None:
+    """**Raises**: `InputError` if two recordings hold the same data: they would count twice in the fit, or validate
+    nothing as hold-outs."""
     for first, second in combinations(recordings, 2):
         if _hold_the_same(first, second):
             what, mend = f"it holds the same data as {first.name}", "List only one of them"
             raise InputError(second.source or second.name, what, mend)
-    return [run if count[run.name] == 1 else _named_after_path(run, paths) for run in recordings]
 
 
 def _hold_the_same(first: Recording, second: Recording) -> bool:
-    """Whether two recordings are copies: they would count twice in the fit, or validate nothing as hold-outs."""
     own, other = first.columns(), second.columns()
     return own.keys() == other.keys() and all(
         np.array_equal(own[name], other[name], equal_nan=True) for name in own
