@@ -140,7 +140,8 @@ def sensor_ripple_of(found: Diagnosis) -> tuple[float, float]:
     return float(np.max(np.abs(clearest.value))), 2 * np.pi / clearest.x[-1]
 
 
-@pytest.mark.parametrize("periods", [1, pytest.param(14, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("periods", [1, 14])
 def test_an_error_of_the_speed_over_the_angle_is_attributed_to_the_sensor(periods):
     """Eccentricity of an encoder and ripple of a tachometer vary with the angle as cogging does."""
     runs = recorded(vb.BenchMotor(**PAPER), 6, NOISE)
@@ -388,13 +389,14 @@ def test_an_eccentric_weight_behind_a_gear_is_not_in_the_library():
     assert turn == pytest.approx(11.6, rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "factor", "friction"),
     [
         ("Kb", 0.97, 0.0),
-        pytest.param("R", 1.1, 0.08, marks=pytest.mark.slow),
-        pytest.param("J", 1.6, 0.0, marks=pytest.mark.slow),
-        pytest.param("f", 1.5, 0.0, marks=pytest.mark.slow),
+        ("R", 1.1, 0.08),
+        ("J", 1.6, 0.0),
+        ("f", 1.5, 0.0),
     ],
 )
 def test_a_parameter_that_differs_in_one_run_is_told(name, factor, friction):

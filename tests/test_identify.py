@@ -464,6 +464,7 @@ def test_torque_and_angle_identify_inertia_and_friction():
         assert result.parameters[name].status == "not_identifiable"
 
 
+@pytest.mark.slow
 def test_a_slowly_sampled_motor_is_identified():
     """Ten electrical time constants per sample, and two thirds of the mechanical one."""
     assert_accurate(identify(light_and_loaded(10, step=20e-3)), PAPER, percent=2.0)
@@ -1122,15 +1123,9 @@ def test_a_run_may_begin_anywhere_in_the_backlash(twist):
     assert fitted < 1.01 * least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        pytest.param(
-            {"tie": [("Kt", "Kb")], "known": {"R": PAPER.R}, "Kt": PAPER.Kb},
-            marks=pytest.mark.slow,
-        ),
-    ],
+    "options", [{}, {"tie": [("Kt", "Kb")], "known": {"R": PAPER.R}, "Kt": PAPER.Kb}]
 )
 def test_a_population_finds_backlash_that_a_gradient_misses(options):
     factors = {"gap_rad": 10.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2}

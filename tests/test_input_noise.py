@@ -73,6 +73,7 @@ def errors(found) -> np.ndarray:
     )
 
 
+@pytest.mark.slow
 def test_noise_of_the_voltage_sensor_does_not_bias_the_parameters():
     found = identify(recorded(applied_noise=0.0, sensor_noise=0.3))
     assert [m.split(":")[0] for m in found.messages if "did not reach the motor" in m] == [

@@ -74,6 +74,7 @@ class Refits:
         """
         # in this order, as the first start values of an effect are kept
         additions = [(signal, *self._addition(current, signal, found)) for signal in signals]
+        self._report_trial(current, [effects for _, effects, _ in additions])
 
         def with_signal(addition: tuple[Signal, tuple[str, ...], Refit]) -> Model | None:
             signal, effects, refit = addition
@@ -113,6 +114,7 @@ class Refits:
         """
         # in this order, as the first start values of an effect are kept
         refits = [self._replacement(current, white, old, new) for old, new in replacements]
+        self._report_trial(current, [effects for effects, _ in refits])
         return map_in_threads(lambda of: self._stored_or_fitted(of[0], current, of[1]), refits)
 
     def _replacement(
@@ -133,6 +135,7 @@ class Refits:
     def with_global_search(self, current: Model, effect: str) -> Model:
         """The current model with one more effect, by a new global search; or the stored fit of the set, if better."""
         effects = (*current.effects, effect)
+        self.report(f"searching with {_joined(effects)}", _misfit(current))
 
         def search() -> Model:
             prepared = current.prepared.with_effects([EFFECTS[e] for e in effects])
@@ -162,13 +165,19 @@ class Refits:
         prepared = prepared.with_problem(free=free)
         return refit_from(effects, prepared, start, white, useful)
 
-    def without_each(self, model: Model, effects: Sequence[str], white: Whitener) -> list[Model]:
-        """The model `without` each of some of its effects, in parallel."""
-        return map_in_threads(lambda effect: self.without(model, effect, white), effects)
-
     def without(self, model: Model, effect: str, white: Whitener) -> Model:
-        """The model without one of its effects; fitted again if the larger one's parameters beat the stored fit."""
-        rest = tuple(e for e in model.effects if e != effect)
+        """The model without one of its effects."""
+        return self.without_each(model, [effect], white)[0]
+
+    def without_each(self, model: Model, effects: Sequence[str], white: Whitener) -> list[Model]:
+        """The model without each of some of its effects, in parallel; fitted again if its parameters beat a stored
+        fit."""
+        rests = [tuple(e for e in model.effects if e != effect) for effect in effects]
+        self._report_trial(model, rests)
+        return map_in_threads(lambda rest: self._reduced_to(model, rest, white), rests)
+
+    def _reduced_to(self, model: Model, rest: tuple[str, ...], white: Whitener) -> Model:
+        """The model with only a rest of its effects."""
         prepared, start = self.starts.from_model(model, rest, {})
 
         def refit() -> Model:
@@ -205,10 +214,15 @@ class Refits:
         return self.models[key]
 
     def _fitted(self, key: frozenset[str], current: Model, refit: Refit) -> Model | None:
-        """A new fit of a set from the current model, reported and recorded in `refitted_from`."""
-        self.report(f"trying {' + '.join(sorted(key))}", _misfit(current))
+        """A new fit of a set from the current model, recorded in `refitted_from`."""
         self.refitted_from.add((key, current))
         return refit()
+
+    def _report_trial(self, current: Model, sets: Sequence[tuple[str, ...]]) -> None:
+        """Report which sets are fitted now; not in another thread, where nobody may expect to be called."""
+        new = [_joined(effects) for effects in sets if frozenset(effects) not in self.models]
+        if new:
+            self.report(f"trying {', '.join(new)}", _misfit(current))
 
     def _realises_gain(self, model: Model, current: Model, signal: Signal, white: Whitener) -> bool:
         """Whether a refit realises more than `MIN_REALISED_SHARE` of the gain that the evidence promised."""
@@ -261,6 +275,10 @@ class Refits:
         if factors and best.fitness < max_misfit:
             return _refit_with_population(effects, prepared, start, factors, seed)
         return refit_from(effects, prepared, start, white)
+
+
+def _joined(effects: Sequence[str]) -> str:
+    return " + ".join(sorted(effects))
 
 
 def _misfit(model: Model) -> float:
