@@ -50,11 +50,12 @@ class Comparison:
         `HOPELESS_EXCESS`, the fit is given up.
         """
         least_unfiltered = min(m.fit.fitness for m in models)
-        fitted, useful = [], np.inf
+        fitted, least = [], np.inf
         for model in sorted(models, key=lambda m: m.fit.fitness):
             if model.fit.fitness < DECISIVE_RATIO * least_unfiltered:
-                fitted.append(self.fitted(model, white, useful - _penalty(model.prepared)))
-                useful = min(useful, fitted[-1].criterion + margin + HOPELESS_EXCESS)
+                useful = _useful_squares(model.prepared, least, margin)
+                fitted.append(self.fitted(model, white, useful))
+                least = min(least, fitted[-1].criterion)
             else:
                 fitted.append(Fitted(model, np.inf, np.inf))
         return sorted(fitted, key=lambda f: f.criterion)
@@ -74,8 +75,7 @@ class Comparison:
 
     def useful_squares(self, smaller: Prepared, model: Model, white: Whitener) -> float:
         """The largest sum of squares with which a smaller model may still compete with a model."""
-        criterion = self.fitted(model, white).criterion
-        return criterion + BIC_MARGIN + HOPELESS_EXCESS - _penalty(smaller)
+        return _useful_squares(smaller, self.fitted(model, white).criterion, BIC_MARGIN)
 
     def filter_of(self, model: Model) -> Whitener:
         """The filter that whitens the residuals of a model."""
@@ -88,6 +88,11 @@ def _penalty(prepared: Prepared) -> float:
     """What the criterion adds to the squares for the number of parameters."""
     samples = prepared.problem.samples.sum()
     return float(len(prepared.problem.parameters.names) * np.log(samples))
+
+
+def _useful_squares(prepared: Prepared, least: float, margin: float) -> float:
+    """The largest sum of squares with which a fit may still compete with the least criterion, within a margin."""
+    return least + margin + HOPELESS_EXCESS - _penalty(prepared)
 
 
 def simplest_equivalent(ranked: Sequence[Fitted]) -> Model:

@@ -11,7 +11,7 @@ from ..hypotheses.effect_relations import CONTAINS, FULLER, with_split_friction
 from ..model import MAX_EFFECTS, Model
 from .compare import BIC_MARGIN, Comparison
 from .refits import Refits
-from .shortlist import COMPARABLE_GAIN, clear_signals, effect_of
+from .shortlist import COMPARABLE_GAIN, clear_signals, effect_of, of_largest_gain
 
 # A simpler form may leave at most so many times the unfiltered squares of the richer one
 MAX_MISFIT_GROWTH = 1.5
@@ -77,9 +77,7 @@ class BackwardElimination:
             and with_split_friction({*present, effect}) != with_split_friction(set(model.effects))
             and s.gain > least
         ]
-        best = max(others, key=lambda s: s.gain, default=None)
-        tried = [best] if best else []
-        pairs = self.refits.with_signals(simpler, tried, assessment.screen)
+        pairs = self.refits.with_signals(simpler, of_largest_gain(others), assessment.screen)
         return next((pair for pair in pairs if pair and pair.is_possible), None)
 
     def _is_far_better(self, pair: Model, model: Model, white: Whitener) -> bool:

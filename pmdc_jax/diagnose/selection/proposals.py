@@ -22,6 +22,7 @@ from .shortlist import (
     clear_signals,
     effect_of,
     most_promising,
+    of_largest_gain,
     richer_form,
     shortlist,
 )
@@ -79,7 +80,7 @@ class Proposals:
             return []
         if current.effects:
             others = [s for s in clear_signals(assessment) if effect_of(s) not in current.effects]
-            likeliest = _of_largest_gain(others)
+            likeliest = of_largest_gain(others)
         else:
             likeliest = shortlist(current, assessment)
         return self._with_signals(current, likeliest)
@@ -94,7 +95,7 @@ class Proposals:
         earlier = [self.assess(m) for m in self.superseded if set(m.effects) < present]
         clear = {effect_of(s) for before in earlier for s in clear_signals(before)}
         others = [s for s in assessment.candidate_signals if effect_of(s) in clear - present]
-        return self._with_signals(current, _of_largest_gain(others))
+        return self._with_signals(current, of_largest_gain(others))
 
     def by_unfiltered_misfit(self, current: Model) -> Proposed:
         """The current model with one of the effects that gain most on the unfiltered misfit, if that falls by a factor
@@ -150,14 +151,13 @@ class Proposals:
         if len(current.effects) < 2:
             return []
         white = self.assess(current).screen.white
-        others = {
-            effect: equivalents.get(effect, set()) | TRIALS[effect].alike.keys()
-            for effect in current.effects
-        }
         swaps = [
             (effect, other)
             for effect in current.effects
-            for other in sorted(others[effect] - set(current.effects))
+            for other in sorted(
+                (equivalents.get(effect, set()) | TRIALS[effect].alike.keys())
+                - set(current.effects)
+            )
         ]
         return self.refits.with_replacements(current, white, swaps)
 
@@ -210,8 +210,3 @@ def _is_room_for_another(current: Model, assessment: Assessment) -> bool:
         and not assessment.may_be_model_form_error(current)
         and not assessment.is_sensor_error()
     )
-
-
-def _of_largest_gain(signals: Sequence[Signal]) -> list[Signal]:
-    """The signal of the largest gain; empty if there is none."""
-    return sorted(signals, key=lambda s: -s.gain)[:1]

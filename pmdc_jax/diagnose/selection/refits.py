@@ -174,6 +174,8 @@ class Refits:
         fit."""
         rests = [tuple(e for e in model.effects if e != effect) for effect in effects]
         self._report_trial(model, rests)
+        if any(frozenset(rest) not in self.models for rest in rests):
+            self.comparison.fitted(model, white)  # once, before each thread asks for it
         return map_in_threads(lambda rest: self._reduced_to(model, rest, white), rests)
 
     def _reduced_to(self, model: Model, rest: tuple[str, ...], white: Whitener) -> Model:

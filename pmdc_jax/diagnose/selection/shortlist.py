@@ -116,6 +116,11 @@ def richer_form(
     ][:1]
 
 
+def of_largest_gain(signals: Sequence[Signal]) -> list[Signal]:
+    """The signal of the largest gain; empty if there is none."""
+    return sorted(signals, key=lambda s: -s.gain)[:1]
+
+
 def effect_of(signal: Signal) -> str:
     """The name of the effect that a candidate's signal is of."""
     assert signal.candidate is not None
