@@ -8,6 +8,7 @@ import attrs
 import numpy as np
 
 from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction, InputDeadZone
+from ..identify.fit.gauss_newton import TRIAL_TOLERANCE
 from ..identify.fit.generalised_least_squares import (
     last_fit,
     residuals_of,
@@ -171,7 +172,9 @@ def refit_from(
 
     **Arguments**: `useful`, the largest sum of squared white residuals that is of any use, as of `polish`.
     """
-    prepared, whitened = polish_with_angle(with_whitening(prepared, white), start, useful=useful)
+    prepared, whitened = polish_with_angle(
+        with_whitening(prepared, white), start, TRIAL_TOLERANCE, useful=useful
+    )
     prepared = prepared.with_problem(whitening=None)
     # no step: the unfiltered residuals at the same point
     unfiltered = fit_at(prepared.problem, whitened.optimum)
@@ -189,7 +192,7 @@ def model_of(effects: tuple[str, ...], prepared: Prepared, fit: Fit) -> Model:
 def final_fit(model: Model, white: Whitener) -> tuple[Prepared, Fit]:
     """The last fit of a model: to whitened residuals where `last_fit` allows it, else by plain least squares."""
     known = reweighted(model.prepared.problem, model.fit)
-    prepared, unfiltered = polish_with_angle(model.prepared, model.fit.optimum, known)
+    prepared, unfiltered = polish_with_angle(model.prepared, model.fit.optimum, known=known)
     return last_fit(prepared, unfiltered, model.fit, white)
 
 

@@ -21,6 +21,7 @@ from .corrections.retiming import with_timing
 from .corrections.speed_averaging import with_averaging, with_evident_averaging
 from .corrections.step_times import with_step_times
 from .corrections.uneven_sampling import with_even_clock
+from .fit.gauss_newton import TOLERANCE
 from .fit.polish import Fit, polish
 from .fit.refine import Optimum, refine
 from .fit.run_unknowns import with_holdout_unknowns
@@ -36,6 +37,8 @@ from .search.evolution import search as global_search
 STARTS = 4
 # Two refinements found the same optimum if their fitness agrees to this share.
 FITNESS_TOLERANCE = 1e-4
+# ... where the model lacks something: refinements then end further from the optimum
+POOR_FIT_TOLERANCE = 1e-3
 # A mean square of the residuals above this many noise variances asks for another search, up to this many in all.
 POOR_FIT = 1.5
 MAX_SEARCHES = 5
@@ -135,7 +138,7 @@ def search_and_refine(
         if search_result.interrupted or _agreed(ends, problem.outputs):
             break
         search_result = _continued(search_result, run_search(seed + attempt))
-        ends = sorted([*ends, *_refine_all(problem, search_result)], key=_fitness)
+        ends = _refine_all(problem, search_result, ends)
     prepared, polished = polish_with_angle(prepared, ends[0])
     seconds = {"search": search_ended - began, "refine": time.perf_counter() - search_ended}
     record = _search_record(search, search_result, ends)
@@ -158,17 +161,21 @@ def _searched_parameters(prepared: Prepared) -> Parameters:
 
 
 def polish_with_angle(
-    prepared: Prepared, end: Optimum, known: Evaluation | None = None, useful: float = np.inf
+    prepared: Prepared,
+    end: Optimum,
+    tolerance: float = TOLERANCE,
+    known: Evaluation | None = None,
+    useful: float = np.inf,
 ) -> tuple[Prepared, Fit]:
     """Polish; where a torque depends on the rotor angle, update the angle from the fit and repeat while that helps.
 
     **Arguments**: as of `polish`.
     """
-    polished = polish(prepared.problem, end, known=known, useful=useful)
+    polished = polish(prepared.problem, end, tolerance=tolerance, known=known, useful=useful)
     is_useful = polished.fitness * prepared.problem.most_samples <= useful
     for _ in range(ANGLE_ITERATIONS if prepared.problem.depends_on_angle and is_useful else 0):
         again = prepared._replace(problem=with_rotor_angle(prepared.problem, polished))
-        better = polish(again.problem, polished.optimum, useful=useful)
+        better = polish(again.problem, polished.optimum, tolerance=tolerance, useful=useful)
         if not better.fitness < (1 - MIN_ANGLE_GAIN) * polished.fitness:
             break
         prepared, polished = again, better
@@ -197,17 +204,21 @@ def _distinct(search_result: SearchResult, parameters: Parameters) -> list[np.nd
     return kept
 
 
-def _refine_all(problem: Problem, search_result: SearchResult) -> list[Optimum]:
-    """Refine the best distinct candidates of a search, one on each core at a time, until they agree; the best first."""
+def _refine_all(
+    problem: Problem, search_result: SearchResult, before: Sequence[Optimum] = ()
+) -> list[Optimum]:
+    """Refine the best distinct candidates of a search, one on each core at a time, until they agree with each other and
+    those `before`; the best of all first."""
     starts = [
         _start(problem.tape, candidate)
         for candidate in _distinct(search_result, problem.parameters)
     ]
 
     def agreed(ends: list[Optimum]) -> bool:
-        return _agreed(sorted(ends, key=_fitness), problem.outputs)
+        return _agreed(sorted([*before, *ends], key=_fitness), problem.outputs)
 
-    return sorted(map_in_threads_until(lambda s: refine(problem, s), starts, agreed), key=_fitness)
+    ends = map_in_threads_until(lambda s: refine(problem, s), starts, agreed)
+    return sorted([*before, *ends], key=_fitness)
 
 
 def _fitness(end: Optimum) -> float:
@@ -219,13 +230,14 @@ def _agreed(ends: Sequence[Optimum], outputs: int) -> bool:
     more starts than one search has. Larger residuals may be due to the model or to a local optimum: only another search
     can tell.
     """
-    needed = 2 if ends[0].fitness < POOR_FIT * outputs else STARTS + 1
-    return _times_found(ends) >= needed
+    if ends[0].fitness < POOR_FIT * outputs:
+        return _times_found(ends) >= 2
+    return _times_found(ends, POOR_FIT_TOLERANCE) > STARTS
 
 
-def _times_found(ends: Sequence[Optimum]) -> int:
+def _times_found(ends: Sequence[Optimum], tolerance: float = FITNESS_TOLERANCE) -> int:
     fitness = np.array([end.fitness for end in ends])
-    return int(np.sum(fitness <= fitness[0] * (1 + FITNESS_TOLERANCE) + 1e-12))
+    return int(np.sum(fitness <= fitness[0] * (1 + tolerance) + 1e-12))
 
 
 def _search_record(method: str, search_result: SearchResult, ends: Sequence[Optimum]) -> Search:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...identify.fit.gauss_newton import TRIAL_TOLERANCE
 from ...identify.fit.generalised_least_squares import fit_whitened, residuals_of, sum_of_squares
 from ...identify.noise.noise_model import Whitener, fit_whitener
 from ...identify.prepare import Prepared
@@ -18,8 +19,6 @@ BIC_MARGIN = 8.0
 # A model is not fitted to the end if its squares will exceed those with which it might compete by this, in noise
 # variances: a probability below 1e-20
 HOPELESS_EXCESS = 100.0
-# Fall of the squares, in noise variances, below which no further fitting step is made
-MIN_DECREASE = 0.1
 # A model that leaves so many times the unfiltered squares of another one is worse, whatever its filtered squares are
 DECISIVE_RATIO = 3.0
 
@@ -66,7 +65,7 @@ class Comparison:
         key = model, white
         if key in self._fitted:
             return self._fitted[key]
-        prepared, polished = fit_whitened(model.prepared, model.fit, white, MIN_DECREASE, useful)
+        prepared, polished = fit_whitened(model.prepared, model.fit, white, TRIAL_TOLERANCE, useful)
         squares = sum_of_squares(prepared, polished)
         fitted = Fitted(model, squares, squares + _penalty(prepared))
         if squares <= useful:  # not given up

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...effects import EFFECTS
+from ...identify.fit.gauss_newton import TRIAL_TOLERANCE
 from ...identify.fit.generalised_least_squares import residuals_of, with_whitening
 from ...identify.fit.polish import fit_at, polish
 from ...identify.fit.refine import Optimum
@@ -248,7 +249,7 @@ class Refits:
         model = refit_from(effects, prepared, point, white)
         if self._realises_gain(model, current, signal, white):
             return model
-        plain = polish(prepared.problem, point)
+        plain = polish(prepared.problem, point, tolerance=TRIAL_TOLERANCE)
         if plain.fitness < MAX_PLAIN_MISFIT * _misfit(model):
             return model_of(effects, prepared, plain)
         from_plain = refit_from(effects, prepared, plain.optimum, white)

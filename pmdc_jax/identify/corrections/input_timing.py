@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
 from ...simulate import FIRST_ORDER_HOLD, RECORDED_EARLY, RECORDED_LATE, SMOOTH, Timing
+from ..fit.gauss_newton import TRIAL_TOLERANCE
 from ..fit.generalised_least_squares import training_indices
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
 from ..fit.polish import Fit, fit_at
@@ -137,9 +138,10 @@ class _Trials:
         on two voltages as they were seen to."""
         timing, voltages = other.timing, self.voltages
         if not (voltages and timing.reading and timing.ahead == voltages.ahead):
-            return refitted(other, start)
+            return refitted(other, start, tolerance=TRIAL_TOLERANCE)
         R = float(other.problem.parameters(start.coordinates).R)
-        return refitted(other, start, R * voltages.time_constant(timing.reading))
+        inductance = R * voltages.time_constant(timing.reading)
+        return refitted(other, start, inductance, TRIAL_TOLERANCE)
 
 
 def _likelier(trials: _Trials, proposed: Sequence[Timing]) -> list[Timing]:

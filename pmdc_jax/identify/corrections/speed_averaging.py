@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from ...recordings.recording import OVER_BOTH, OVER_LAST, Averaging
 from ...simulate import Tape
+from ..fit.gauss_newton import TOLERANCE
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..fit.polish import Fit, polish
 from ..noise.sensor_noise import quantum
@@ -124,11 +125,16 @@ def _shifted_earlier(prepared: Prepared) -> Prepared:
     return prepared.with_tape(measured=jnp.asarray(laid.measured), weight=weight)
 
 
-def refitted(prepared: Prepared, fit: Fit, inductance: float | None = None) -> tuple[Prepared, Fit]:
+def refitted(
+    prepared: Prepared,
+    fit: Fit,
+    inductance: float | None = None,
+    tolerance: float = TOLERANCE,
+) -> tuple[Prepared, Fit]:
     """The runs, and the best fit to them that starts from `fit`, or from there with a smaller inductance: a large one
     may have compensated part of a sample of delay.
 
-    **Arguments**: `inductance`, H, if it is known about which, to start from.
+    **Arguments**: `inductance`, H, if it is known about which, to start from; `tolerance`, as of `polish`.
     """
     parameters = prepared.problem.parameters
     starts = [fit.optimum]
@@ -139,8 +145,12 @@ def refitted(prepared: Prepared, fit: Fit, inductance: float | None = None) -> t
             change = np.log(inductance) - float(fit.coordinates[L])
             starts = [fit.optimum.moved(parameters, change * along_L)]
         elif prepared.averaging == OVER_LAST or prepared.timing.current_mean:
-            starts.append(fit.optimum.moved(parameters, -L_REDUCTION * along_L))
-    ends = [polish(prepared.problem, start) for start in starts]
+            smaller = fit.optimum.moved(parameters, -L_REDUCTION * along_L)
+            if float(smaller.unknowns.coordinates[L]) < float(
+                fit.coordinates[L]
+            ):  # not at its bound
+                starts.append(smaller)
+    ends = [polish(prepared.problem, start, tolerance=tolerance) for start in starts]
     return prepared, min(ends, key=lambda end: end.cost)
 
 

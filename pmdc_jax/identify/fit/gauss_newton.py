@@ -12,6 +12,8 @@ from ..problem import Evaluation, Problem
 # Predicted reduction of the sum of squares, in noise variances, below which no step is taken: the square of 0.045
 # standard errors
 TOLERANCE = 2e-3
+# ... in fits that are only compared: far less than the differences that decide
+TRIAL_TOLERANCE = 0.5
 # Curvature added to every coordinate in a step, as a prior that knows each to within a factor of e, and to the initial
 # state, as one that knows it to within what was measured: negligible for what the data determine, while what they do
 # not determine, such as a current that has settled before it is read, stays where it is

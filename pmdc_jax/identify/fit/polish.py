@@ -79,13 +79,13 @@ def polish(
     """Gauss-Newton iterations in which each output is weighted by the standard deviation of its own residuals.
 
     It ends where no step within the bounds is predicted to lower the sum of squares by more than `tolerance`, in noise
-    variances, or none is found that lowers it. A coordinate held at a bound is released where the gradient points back
-    inside. `known` is the evaluation at the start, if there is one already. The fit is given up where its sum of
-    whitened squares will hardly fall to `useful`, the largest that is of any use.
+    variances, or the last one did not, or none is found that lowers it. A coordinate held at a bound is released where
+    the gradient points back inside. `known` is the evaluation at the start, if there is one already. The fit is given
+    up where its sum of whitened squares will hardly fall to `useful`, the largest that is of any use.
     """
     low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
     ridge = ridge_of(problem)
-    fixed = set(start.at_bound)
+    fixed, held = set(start.at_bound), None  # at a bound now, and as the last step was made
     best = trial = _evaluate_weighted(problem, start.unknowns, known)
     step, share, gain = np.zeros(len(flatten(start.unknowns))), 1.0, np.inf
     costs = [best.cost]
@@ -95,12 +95,16 @@ def polish(
         if not np.isfinite(best.cost):
             break  # a failed simulation has no gradient
         if trial.cost <= best.cost + 1e-9:
+            fell = (best.cost - trial.cost) * float(np.sum(problem.samples))
             best, share = trial, 1.0
             coordinates = np.asarray(best.unknowns.coordinates)
             fixed = {k for k in fixed if (best.matrix[k, -1] > 0) == (coordinates[k] <= low[k])}
             step, gain = gauss_newton_step(best.matrix, fixed, ridge)
             if gain <= tolerance * _residual_variance(problem, best):
                 break
+            if fell <= tolerance and fixed == held:
+                break
+            held = frozenset(fixed)
             if len(costs) >= FIRST_TO_GIVE_UP and best.matrix[-1, -1] - OPTIMISM * gain > useful:
                 break
         elif share > 1e-3:
