@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from functools import partial
+from functools import partial, reduce
+from operator import add
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+from scipy.linalg import toeplitz
+from scipy.special import factorial
 
 Matrix = Float[Array, "n n *#batch"]
 
@@ -22,8 +24,9 @@ SERIES_LIMIT = 3e-3
 def product(
     a: Float[Array, "n n *#batch"], b: Float[Array, "n m *#batch"]
 ) -> Float[Array, "n m ..."]:
-    """Matrix product over the two leading axes; a sum, since XLA on CPU is slow on batches of tiny dots."""
-    return (a[:, :, None] * b[None]).sum(1)
+    """Matrix product over the two leading axes; as sums, because XLA on CPU is slow on batches of tiny dots, and on
+    reductions over a leading axis."""
+    return reduce(add, (a[:, j, None] * b[j] for j in range(len(b))))
 
 
 @partial(jax.jit, static_argnames="count")
@@ -37,33 +40,39 @@ def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
     **Source**: Hochbruck, Ostermann, "Exponential integrators", Acta Numerica 19 (2010), section 2;
     Skaflestad, Wright, Applied Numerical Mathematics 59 (2009), equation (2.5), doi:10.1016/j.apnum.2008.03.021.
     """
-    one = jnp.zeros_like(z) + jnp.eye(len(z)).reshape(len(z), len(z), *[1] * (z.ndim - 2))
-    small = z / 2**HALVINGS
+    batch = [1] * (z.ndim - 2)
+    one = jnp.zeros_like(z) + jnp.eye(len(z)).reshape(*z.shape[:2], *batch)
+    small, reciprocals = z / 2**HALVINGS, jnp.asarray(1 / factorial(np.arange(ORDER + count + 1)))
+    # phi_count by Horner's scheme, then phi_(k - 1)(z) = 1 / (k - 1)! + z phi_k
+    phis = [
+        jax.lax.fori_loop(
+            1,
+            ORDER + 1,
+            lambda j, phi: reciprocals[ORDER + count - j] * one + product(small, phi),
+            reciprocals[ORDER + count] * one,
+        )
+    ]
+    for k in reversed(range(1, count)):
+        phis.insert(0, reciprocals[k] * one + product(small, phis[0]))
+    start = jnp.stack([product(small, phis[0]), *phis])
+    scale, sums = (jnp.asarray(x).reshape(*x.shape, 1, *batch) for x in _doubling(count))
 
-    def series(k: int) -> Matrix:
-        term = one / float(math.factorial(ORDER + k))
-        for j in reversed(range(ORDER)):
-            term = one / float(math.factorial(j + k)) + product(small, term)
-        return term
+    def doubled(f: Float[Array, "functions n n *batch"]) -> Float[Array, "functions n n *batch"]:
+        """phi_0 - 1 and the others of twice the matrix."""
+        return scale[:, None] * jax.vmap(product, (None, 0))(f[0], f) + product(sums, f)
 
-    def double(carry: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
-        decay, *half = carry
-        f0 = one + decay
-        doubled = [
-            sum(
-                (half[j - 1] / float(math.factorial(p - j)) for j in range(1, p + 1)),
-                start=product(f0, half[p - 1]),
-            )
-            / 2**p
-            for p in range(1, count + 1)
-        ]
-        return (2 * decay + product(decay, decay), *doubled)
+    half, whole = jax.lax.fori_loop(0, HALVINGS, lambda _, f: (f[1], doubled(f[1])), (start, start))
+    return [one + half[0], *half[1:]], [one + whole[0], *whole[1:]]
 
-    phis = [series(k) for k in range(1, count + 1)]
-    start = (product(small, phis[0]), *phis)
-    half = jax.lax.fori_loop(0, HALVINGS - 1, lambda _, carry: double(carry), start)
-    full = double(half)
-    return [one + half[0], *half[1:]], [one + full[0], *full[1:]]
+
+def _doubling(
+    count: int,
+) -> tuple[Float[np.ndarray, " functions"], Float[np.ndarray, "functions functions"]]:
+    """The doubled functions phi_0 - 1, phi_1, ... as `scale` (phi_0 - 1) f plus `sums` of the functions f."""
+    scale = 0.5 ** np.arange(count + 1)
+    sums = np.eye(count + 1) + np.tril(toeplitz(1 / factorial(np.arange(count + 1))))
+    sums[1:, 0] = 0.0
+    return scale, scale[:, None] * sums
 
 
 def scalar_phi(z: ArrayLike, k: int) -> np.ndarray:

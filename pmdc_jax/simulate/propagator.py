@@ -201,9 +201,7 @@ def grid_propagators(motor: Motor, tape: Tape) -> Propagator:
     """The propagators of one step on every grid of the tape, stacked along the first axis."""
     steps, delay, reading = steps_in_sample(motor, tape), motor.speed_delay(), tape.reading
 
-    def of_grid(g: int) -> Propagator:
-        sample = jnp.asarray(tape.sample_time)[g]
-        drive = Drive(*(jnp.asarray(share)[g] for share in tape.drive))
+    def of_grid(sample: Float[Array, ""], drive: Drive) -> Propagator:
         options = (tape.rise is not None, tape.averaging is not None)
 
         def instant(share: Scalars) -> Instant:
@@ -218,8 +216,7 @@ def grid_propagators(motor: Motor, tape: Tape) -> Propagator:
             propagator = propagator._replace(speed_seen=instant(1 - (behind - jnp.floor(behind))))
         return propagator
 
-    grids = map(of_grid, range(tape.sample_time.shape[0]))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *grids)
+    return jax.vmap(of_grid)(*jax.tree.map(jnp.asarray, (tape.sample_time, tape.drive)))
 
 
 def pick_grid(

@@ -83,7 +83,6 @@ def polish(
     the gradient points back inside. `known` is the evaluation at the start, if there is one already. The fit is given
     up where its sum of whitened squares will hardly fall to `useful`, the largest that is of any use.
     """
-    low, high = np.asarray(problem.parameters.lower), np.asarray(problem.parameters.upper)
     ridge = ridge_of(problem)
     fixed, held = set(start.at_bound), None  # at a bound now, and as the last step was made
     best = trial = _evaluate_weighted(problem, start.unknowns, known)
@@ -97,8 +96,7 @@ def polish(
         if trial.cost <= best.cost + 1e-9:
             fell = (best.cost - trial.cost) * float(np.sum(problem.samples))
             best, share = trial, 1.0
-            coordinates = np.asarray(best.unknowns.coordinates)
-            fixed = {k for k in fixed if (best.matrix[k, -1] > 0) == (coordinates[k] <= low[k])}
+            fixed = _still_held(problem, best, fixed)
             step, gain = gauss_newton_step(best.matrix, fixed, ridge)
             if gain <= tolerance * _residual_variance(problem, best):
                 break
@@ -111,13 +109,9 @@ def polish(
             share /= 4  # the last step was too long
         else:
             break
-        moved = np.asarray(flatten(best.unknowns)) + _damped_log_step(
-            problem.parameters, share * step
-        )
-        inside = np.clip(moved[: len(low)], low, high)
-        fixed |= set(np.flatnonzero(inside != moved[: len(low)]).tolist())
-        moved[: len(low)] = inside
-        trial = _evaluate_weighted(problem, unflatten(problem, jnp.asarray(moved)))
+        unknowns, stopped = _moved(problem, best.unknowns, share * step)
+        fixed |= stopped
+        trial = _evaluate_weighted(problem, unknowns)
         costs.append(min(trial.cost, best.cost))
     distance = float(np.sqrt(gain / _residual_variance(problem, best)))
     optimum = Optimum(best.unknowns, best.fitness, tuple(sorted(fixed)), distance)
@@ -127,6 +121,23 @@ def polish(
 def fit_at(problem: Problem, point: Optimum) -> Fit:
     """The fit that stays at a point: its evaluation and its noise."""
     return polish(problem, point, steps=0)
+
+
+def _still_held(problem: Problem, best: _WeightedPoint, fixed: set[int]) -> set[int]:
+    """The coordinates that stay at a bound, because the gradient does not point back inside."""
+    low, coordinates = np.asarray(problem.parameters.lower), np.asarray(best.unknowns.coordinates)
+    return {k for k in fixed if (best.matrix[k, -1] > 0) == (coordinates[k] <= low[k])}
+
+
+def _moved(problem: Problem, unknowns: Unknowns, step: np.ndarray) -> tuple[Unknowns, set[int]]:
+    """The unknowns a step further on, within their bounds, and the coordinates that a bound stopped."""
+    parameters = problem.parameters
+    low, high = np.asarray(parameters.lower), np.asarray(parameters.upper)
+    moved = np.asarray(flatten(unknowns)) + _damped_log_step(parameters, step)
+    inside = np.clip(moved[: len(low)], low, high)
+    stopped = np.flatnonzero(inside != moved[: len(low)])
+    moved[: len(low)] = inside
+    return unflatten(problem, jnp.asarray(moved)), set(stopped.tolist())
 
 
 def _damped_log_step(parameters: Parameters, step: np.ndarray) -> np.ndarray:
