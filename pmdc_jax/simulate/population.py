@@ -27,8 +27,9 @@ STRIDE = 16
 # Sums of squared errors of current (A^2) and speed (rad^2/s^2)
 Errors = tuple[Float[Array, " population"], Float[Array, " population"]]
 
-# With fewer candidates for each, linear or with effects, threads cost more than they save.
-MIN_LINEAR_PER_THREAD, MIN_PER_THREAD = 256, 32
+# With fewer candidates for each, linear or with effects, threads cost more than they save; with more, what is carried
+# from sample to sample leaves the processor's cache.
+MIN_LINEAR_PER_THREAD, MIN_PER_THREAD, MAX_PER_THREAD = 256, 32, 1024
 
 
 def squared_errors(motors: Motor, tape: Tape) -> Errors:
@@ -37,11 +38,8 @@ def squared_errors(motors: Motor, tape: Tape) -> Errors:
     **Arguments**: `motors`, whose fields have the shape (population,). Every run starts at the tape's initial
     state; unknown loads are taken as zero. A motor whose simulation fails gets infinity, never NaN.
     """
-    size = motors.R.shape[0]
-    least = MIN_PER_THREAD if motors.effects else MIN_LINEAR_PER_THREAD
-    cores = CORES if jax.default_backend() == "cpu" else 1
-    shares = max(1, min(cores, size // least))
-    if shares == 1 or size % shares:  # shares of another size would need another compilation
+    shares = _shares(motors)
+    if shares == 1:
         return _errors(motors, tape, np.asarray(0), 1)
 
     def part(k: int) -> Errors:
@@ -51,6 +49,15 @@ def squared_errors(motors: Motor, tape: Tape) -> Errors:
     parts = map_in_threads(part, range(shares))
     current, speed = (jnp.asarray(np.concatenate(errors)) for errors in zip(*parts, strict=True))
     return current, speed
+
+
+def _shares(motors: Motor) -> int:
+    """Number of equal shares in which a population is simulated: those of different sizes would be compiled twice."""
+    if jax.default_backend() != "cpu":
+        return 1
+    size, least = motors.R.shape[0], MIN_PER_THREAD if motors.effects else MIN_LINEAR_PER_THREAD
+    most = max(min(CORES, size // least), size // MAX_PER_THREAD, 1)
+    return next(shares for shares in range(most, 0, -1) if size % shares == 0)
 
 
 # The widest vectors that the processor has: by default XLA uses half of that width.
