@@ -141,7 +141,7 @@ def search_and_refine(
         ends = _refine_all(problem, search_result, ends)
     prepared, polished = polish_with_angle(prepared, ends[0])
     seconds = {"search": search_ended - began, "refine": time.perf_counter() - search_ended}
-    record = _search_record(search, search_result, ends)
+    record = _search_record(search, search_result, ends, problem.outputs)
     return prepared, Solved(polished, record, seed, seconds)
 
 
@@ -230,23 +230,25 @@ def _agreed(ends: Sequence[Optimum], outputs: int) -> bool:
     more starts than one search has. Larger residuals may be due to the model or to a local optimum: only another search
     can tell.
     """
-    if ends[0].fitness < POOR_FIT * outputs:
-        return _times_found(ends) >= 2
-    return _times_found(ends, POOR_FIT_TOLERANCE) > STARTS
+    needed = 2 if ends[0].fitness < POOR_FIT * outputs else STARTS + 1
+    return _times_found(ends, outputs) >= needed
 
 
-def _times_found(ends: Sequence[Optimum], tolerance: float = FITNESS_TOLERANCE) -> int:
+def _times_found(ends: Sequence[Optimum], outputs: int) -> int:
     fitness = np.array([end.fitness for end in ends])
+    tolerance = FITNESS_TOLERANCE if fitness[0] < POOR_FIT * outputs else POOR_FIT_TOLERANCE
     return int(np.sum(fitness <= fitness[0] * (1 + tolerance) + 1e-12))
 
 
-def _search_record(method: str, search_result: SearchResult, ends: Sequence[Optimum]) -> Search:
+def _search_record(
+    method: str, search_result: SearchResult, ends: Sequence[Optimum], outputs: int
+) -> Search:
     return Search(
         method=method,
         evaluations=search_result.evaluations,
         best=search_result.best,
         median=search_result.median,
         refined=np.array([end.fitness for end in ends]),
-        times_found=_times_found(ends),
+        times_found=_times_found(ends, outputs),
         interrupted=search_result.interrupted,
     )

@@ -146,9 +146,7 @@ def refitted(
             starts = [fit.optimum.moved(parameters, change * along_L)]
         elif prepared.averaging == OVER_LAST or prepared.timing.current_mean:
             smaller = fit.optimum.moved(parameters, -L_REDUCTION * along_L)
-            if float(smaller.unknowns.coordinates[L]) < float(
-                fit.coordinates[L]
-            ):  # not at its bound
+            if smaller.unknowns.coordinates[L] < fit.coordinates[L]:  # not at its bound
                 starts.append(smaller)
     ends = [polish(prepared.problem, start, tolerance=tolerance) for start in starts]
     return prepared, min(ends, key=lambda end: end.cost)
