@@ -32,6 +32,8 @@ from .refine import Optimum
 # The polish stops if the cost fell by less than MIN_COST_DECREASE over the last PATIENCE steps: dry elements leave
 # kinks, at which the linearised model predicts a larger reduction than there is
 PATIENCE, MIN_COST_DECREASE = 5, 1e-5
+# Reduction predicted for a step, over the tolerance, up to which it is not taken if the last one was of no use
+MAX_PREDICTED = 20.0
 # Gauss-Newton steps at most
 MAX_STEPS = 20
 # From this evaluation on a polish is given up where it would not be useful even if the squares fell so many times
@@ -79,9 +81,10 @@ def polish(
     """Gauss-Newton iterations in which each output is weighted by the standard deviation of its own residuals.
 
     It ends where no step within the bounds is predicted to lower the sum of squares by more than `tolerance`, in noise
-    variances, or the last one did not, or none is found that lowers it. A coordinate held at a bound is released where
-    the gradient points back inside. `known` is the evaluation at the start, if there is one already. The fit is given
-    up where its sum of whitened squares will hardly fall to `useful`, the largest that is of any use.
+    variances, or by little more where the last one did not, or none is found that lowers it. A coordinate held at a
+    bound is released where the gradient points back inside. `known` is the evaluation at the start, if there is one
+    already. The fit is given up where its sum of whitened squares will hardly fall to `useful`, the largest that is of
+    any use.
     """
     ridge = ridge_of(problem)
     fixed, held = set(start.at_bound), None  # at a bound now, and as the last step was made
@@ -98,9 +101,10 @@ def polish(
             best, share = trial, 1.0
             fixed = _still_held(problem, best, fixed)
             step, gain = gauss_newton_step(best.matrix, fixed, ridge)
-            if gain <= tolerance * _residual_variance(problem, best):
+            predicted = gain / _residual_variance(problem, best)
+            if predicted <= tolerance:
                 break
-            if fell <= tolerance and fixed == held:
+            if fell <= tolerance and predicted <= MAX_PREDICTED * tolerance and fixed == held:
                 break
             held = frozenset(fixed)
             if len(costs) >= FIRST_TO_GIVE_UP and best.matrix[-1, -1] - OPTIMISM * gain > useful:
