@@ -230,13 +230,18 @@ def _agreed(ends: Sequence[Optimum], outputs: int) -> bool:
     more starts than one search has. Larger residuals may be due to the model or to a local optimum: only another search
     can tell.
     """
-    needed = 2 if ends[0].fitness < POOR_FIT * outputs else STARTS + 1
+    needed = 2 if _is_good(ends[0], outputs) else STARTS + 1
     return _times_found(ends, outputs) >= needed
+
+
+def _is_good(end: Optimum, outputs: int) -> bool:
+    """Whether the residuals are about as small as the noise."""
+    return end.fitness < POOR_FIT * outputs
 
 
 def _times_found(ends: Sequence[Optimum], outputs: int) -> int:
     fitness = np.array([end.fitness for end in ends])
-    tolerance = FITNESS_TOLERANCE if fitness[0] < POOR_FIT * outputs else POOR_FIT_TOLERANCE
+    tolerance = FITNESS_TOLERANCE if _is_good(ends[0], outputs) else POOR_FIT_TOLERANCE
     return int(np.sum(fitness <= fitness[0] * (1 + tolerance) + 1e-12))
 
 
