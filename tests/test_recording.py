@@ -188,6 +188,25 @@ def test_a_torque_column_of_unknown_name_is_noted(tmp_path):
     assert note.column == "M_Nm" and "looks like load" in note.what
 
 
+@pytest.mark.parametrize(
+    "header", ["M_brake (mNm)", "Brake torque [Nm]", "M_Last [Nm]", "dyno torque / Nm"]
+)
+def test_a_torque_named_after_a_load_is_the_load(tmp_path, header):
+    run = read_text(tmp_path, table(f"time_s,voltage_V,n_rpm,i_A,{header}", T, T, T, T, T))
+    assert run.load is not None
+    assert run.load[-1] == pytest.approx(T[-1] * (1e-3 if "mNm" in header else 1.0))
+    (note,) = run.notes
+    assert note.column == header and "because of its name and unit" in note.what
+
+
+@pytest.mark.parametrize("header", ["M_blast [Nm]", "brake_limit [Nm]", "brake [A]"])
+def test_other_columns_are_not_taken_for_a_load(tmp_path, header):
+    assert (
+        read_text(tmp_path, table(f"time_s,voltage_V,n_rpm,i_A,{header}", T, T, T, T, T)).load
+        is None
+    )
+
+
 def test_columns_are_recognised_by_their_unit_alone(tmp_path):
     run = read_text(tmp_path, table("time_s,U_mot/V,I_mot [mA],n_ist [U/min]", T, T, T, T))
     np.testing.assert_allclose((run.voltage, run.current, run.speed), (T, T / 1e3, T * RPM))

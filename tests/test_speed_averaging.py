@@ -37,6 +37,10 @@ def recorded(kind: str) -> list[Recording]:
         speed = np.gradient(count, excitation.time) * 2 * np.pi / LINES
         if kind == "counts of the last sample":
             speed = np.diff(count, prepend=count[0]) * 2 * np.pi / LINES / 1e-3
+        if kind == "counts around the instant":
+            halfway = CubicSpline(excitation.time, outputs[:, 2])(excitation.time + 5e-4)
+            count = np.floor(halfway * LINES / (2 * np.pi))
+            speed = np.diff(count, prepend=count[0]) * 2 * np.pi / LINES / 1e-3
         if kind == "tachometer":
             speed = outputs[:, 1] + np.std(speed - outputs[:, 1]) * rng.standard_normal(len(speed))
         if kind == "rounded":
@@ -56,6 +60,7 @@ def recorded(kind: str) -> list[Recording]:
 MEAN_OVER = {
     "counts of two samples": "the last and the next sample interval",
     "counts of the last sample": "the last sample interval",
+    "counts around the instant": None,  # hardly differ from the speed there
     "tachometer": None,
     "rounded": None,
     "angle alone": None,  # differentiated by the package, without a message

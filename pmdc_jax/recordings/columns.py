@@ -97,8 +97,10 @@ MOTOR_SYMBOLS = {
     quantity: re.compile(rf"({symbol})_?(mot|motor|arm|armature)")
     for quantity, symbol in {"voltage": "u|v", "current": "i", "speed": "w|omega"}.items()
 }
-# Quantities recognised by their unit alone, if only one column has it; not torques, which may be load or motor torque
-TOLD_BY_UNIT = ("time", "voltage", "current", "speed", "angle")
+# Quantities recognised by their unit, if only one column has it; a torque, which may also be that of the motor, only if
+# its name has a word of `LOADS`
+TOLD_BY_UNIT = ("time", "voltage", "current", "speed", "angle", "load")
+LOADS = re.compile(r"(?i)(?<![a-z])(load|last|brak|brems|dyno)")
 # Names of columns that are the time if they hold dates with times; numbers need a unit
 DATED = ("timestamp", "time_stamp", "datetime", "date_time", "date", "datum")
 # Words in the names of columns that hold set points, limits or supplies rather than a measurement of the motor
@@ -186,10 +188,12 @@ def _match_by_unit_or_symbol(
 
 
 def _measured_unit(header: str, quantity: str) -> str | None:
-    """The shaft unit of the quantity in a header, None without one or if the name has a word of `NOT_MEASURED`."""
+    """The shaft unit of the quantity in a header, None without one or if the name does not go with it (see `LOADS` and
+    `NOT_MEASURED`)."""
     for name, unit, _ in _readings(header):
         if unit and _is_unit_of(unit, quantity, QUANTITIES[quantity].units[:1]):
-            return None if NOT_MEASURED.search(name) else unit
+            named = quantity != "load" or LOADS.search(name)
+            return unit if named and not NOT_MEASURED.search(name) else None
     return None
 
 

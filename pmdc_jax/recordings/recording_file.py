@@ -289,7 +289,8 @@ def _notes(
             yield note(column.header, "the column is empty", "It is ignored")
         elif column.by_unit:
             mend = f"If it is something else, map the right column: --column {quantity}=HEADER:UNIT"
-            yield note(column.header, f"used as the {quantity}, because of its unit", mend)
+            why = "name and unit" if quantity == "load" else "unit"
+            yield note(column.header, f"used as the {quantity}, because of its {why}", mend)
         elif column.unit is None:
             mend = f"If this is wrong, write the unit in the header, as in {QUANTITIES[quantity].header}"
             yield note(column.header, f"the header has no unit: {column.base} assumed", mend)

@@ -18,7 +18,11 @@ from jaxtyping import Float
 from ...recordings.recording import OVER_BOTH, OVER_LAST, Averaging
 from ...simulate import Tape
 from ..fit.gauss_newton import TOLERANCE
-from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
+from ..fit.likelihood import (
+    MIN_LOG_LIKELIHOOD_GAIN,
+    leaves_only_noise,
+    negative_log_likelihood,
+)
 from ..fit.polish import Fit, polish
 from ..noise.sensor_noise import quantum
 from ..prepare import Prepared
@@ -65,10 +69,10 @@ def with_averaging(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 
     **Arguments**: `fit`, to the runs as they are. **Returns**: both unchanged if no mean was found.
     """
-    if prepared.averaging:
-        return prepared, fit
+    if prepared.averaging == OVER_LAST:
+        return _or_centred(prepared, fit)
     mean, min_gain, counted = _averaging_by_noise(prepared)
-    if mean is None:
+    if prepared.averaging or mean is None:
         return prepared, fit
     inner = without_ends(prepared, SPEED)
     averaged, better = refitted(_with_speeds_averaged(inner, mean), fit)
@@ -83,6 +87,16 @@ def with_averaging(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
         if last < unlikeliness or refitted(_shifted_earlier(inner), fit)[1].cost < other.cost:
             return prepared, fit
     return averaged, better
+
+
+def _or_centred(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+    """The runs with their speeds treated as instantaneous, if these are clearly likelier than means over the last
+    sample, and the fit to them: a counter read half a sample before and after each instant tells the speed at it."""
+    centred, other = refitted(without_averaging(prepared), fit)
+    gain = negative_log_likelihood(prepared, fit) - negative_log_likelihood(centred, other)
+    if gain > MIN_LOG_LIKELIHOOD_GAIN and leaves_only_noise(centred, other):
+        return centred, other
+    return prepared, fit
 
 
 def without_averaging(prepared: Prepared) -> Prepared:
