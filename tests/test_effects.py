@@ -646,7 +646,7 @@ def test_many_short_blocks_of_a_run_with_backlash_are_joined(x64):
     gear = EFFECTS["gear_backlash"](**jax.tree.map(jnp.asarray, {**values, "gap_rad": 0.0765}))
     numbers = (4.47, 0.0011, 0.1294, 0.131, 2.11e-4, 8.3e-5)
     motor = Motor(*map(jnp.asarray, numbers), effects=(gear,))
-    outputs, _ = sensitivities(lambda nothing: motor, jnp.zeros(1), tape)
+    outputs, *_ = sensitivities(lambda nothing: motor, jnp.zeros(1), tape)
     assert np.max(np.abs(outputs - free_run(motor, tape))) < 1e-4 * np.max(np.abs(outputs))
 
 
@@ -684,7 +684,7 @@ def test_sensitivities_match_central_differences(x64, name):
     # away from zero, where a dry element has no derivative
     own[2:, :2] = 1.0, 5.0
     start_of_runs = RunUnknowns(*jnp.asarray(own.T))
-    outputs, jacobian = sensitivities(parameters, jnp.asarray(at), tape, start_of_runs)
+    outputs, jacobian, *_ = sensitivities(parameters, jnp.asarray(at), tape, start_of_runs)
 
     def run(at, own):
         start_of_runs = RunUnknowns(*jnp.asarray(own.T))
@@ -752,7 +752,7 @@ def test_outputs_are_finite_over_the_whole_ranges(x64, name):
     limits = np.stack([parameters.lower[6:], parameters.upper[6:]])
     for corner in np.ndindex(*(2,) * limits.shape[1]):
         at = jnp.asarray(np.append(base, limits[list(corner), np.arange(limits.shape[1])]))
-        outputs, jacobian = sensitivities(parameters, at, tape)
+        outputs, jacobian, *_ = sensitivities(parameters, at, tape)
         assert jnp.all(jnp.isfinite(outputs)) and jnp.all(jnp.isfinite(jacobian)), (corner, at[6:])
 
 

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..runtime.compiled import compiled, is_traced, quickly_compiled
 from ..runtime.threads import CORES, map_in_threads
@@ -86,6 +86,11 @@ class Problem(eqx.Module):
         return any("angle" in effect.states for effect in self.parameters.effects)
 
     @property
+    def states(self) -> int:
+        """Number of states of the motor."""
+        return 2 + len({name for effect in self.parameters.effects for name in effect.states})
+
+    @property
     def has_spring(self) -> bool:
         """Whether an effect has a spring, which may be wound up at the start of a run."""
         return any(effect.spring_state for effect in self.parameters.effects)
@@ -126,6 +131,8 @@ class Evaluation(NamedTuple):
     simulated: Float[Array, "blocks 2 samples"]
     residuals: Float[Array, "blocks 2 samples"]
     jacobian: Float[Array, "blocks 2 samples columns"]
+    starts: Float[Array, "blocks states"]  # of the blocks of samples that are simulated in parallel
+    d_starts: Float[Array, "blocks states columns"]
 
 
 def scaled(evaluation: Evaluation, stretch: Float[Array | np.ndarray, "2"]) -> Evaluation:
@@ -138,33 +145,57 @@ def scaled(evaluation: Evaluation, stretch: Float[Array | np.ndarray, "2"]) -> E
 
 def select_blocks(blocks: Bool[Array, " blocks"], one: Evaluation, other: Evaluation) -> Evaluation:
     """`one` in the chosen blocks, `other` in the rest."""
-    return jax.tree.map(jax.vmap(jnp.where), *(Evaluation(*3 * [blocks]), one, other))
+    chosen = Evaluation(*len(Evaluation._fields) * [blocks])
+    return jax.tree.map(jax.vmap(jnp.where), *(chosen, one, other))
 
 
-def evaluate(problem: Problem, unknowns: Unknowns) -> Evaluation:
-    """Simulate every run of the problem and compare it with the measurement."""
+def evaluate(
+    problem: Problem, unknowns: Unknowns, starts: Float[np.ndarray, "blocks states"] | None = None
+) -> Evaluation:
+    """Simulate every run of the problem and compare it with the measurement.
+
+    **Arguments**: `starts`, as from `predicted_starts`, where an evaluation nearby is known; they make it quicker.
+    """
     # without whitening and nuisance, so that the simulation, slow to compile, is compiled only once
     bare = replace(problem, whitening=None, nuisance=None)
     has_effects = bool(bare.parameters.effects)
     with _empty_mesh():
         if has_effects and not is_traced(problem, unknowns):
-            simulated = _evaluate_in_threads(bare, unknowns)
+            simulated = _evaluate_in_threads(bare, unknowns, starts)
         else:
             simulated = (_evaluate if has_effects else _evaluate_linear)(bare, unknowns)
         return whitened(problem, _without_nuisance(problem, simulated))
 
 
-def _evaluate_in_threads(problem: Problem, unknowns: Unknowns) -> Evaluation:
+def predicted_starts(
+    problem: Problem, evaluation: Evaluation, change: Float[np.ndarray, " unknowns"]
+) -> Float[np.ndarray, "blocks states"]:
+    """Where the blocks start, to first order, after a change of the unknowns at which an evaluation was made."""
+    shared, own = np.split(change, [len(problem.free)])
+    of_run = own.reshape(problem.tape.runs, UNKNOWNS_PER_RUN)[np.asarray(problem.tape.run)]
+    by_shared, by_own = np.split(np.asarray(evaluation.d_starts), [len(shared)], axis=-1)
+    return (
+        np.asarray(evaluation.starts) + by_shared @ shared + np.einsum("bsp,bp->bs", by_own, of_run)
+    )
+
+
+def _evaluate_in_threads(
+    problem: Problem, unknowns: Unknowns, starts: Float[np.ndarray, "blocks states"] | None
+) -> Evaluation:
     """The evaluation with the runs divided among threads, because XLA simulates all of them on one core."""
     parts = problem.tape.parts(CORES if jax.default_backend() == "cpu" else 1)
+    begins = np.cumsum([0, *(blocks for _, blocks in parts)])
 
-    def of_part(part: tuple[Tape, int]) -> list[np.ndarray]:
-        tape, blocks = part
+    def of_part(k: int) -> list[np.ndarray]:
+        tape, blocks = parts[k]
+        guess = np.full((tape.value.shape[0], problem.states), np.nan)
+        if starts is not None:
+            guess[:blocks] = starts[begins[k] : begins[k + 1]]
         with _empty_mesh():
-            evaluation = _evaluate(replace(problem, tape=tape), unknowns)
+            evaluation = _evaluate(replace(problem, tape=tape), unknowns, guess)
         return [np.asarray(values)[:blocks] for values in evaluation]
 
-    by_signal = zip(*map_in_threads(of_part, parts), strict=True)
+    by_signal = zip(*map_in_threads(of_part, range(len(parts))), strict=True)
     return Evaluation(*(jnp.asarray(np.concatenate(values)) for values in by_signal))
 
 
@@ -175,19 +206,29 @@ def _empty_mesh() -> AbstractContextManager[None]:
 
 def whitened(problem: Problem, plain: Evaluation) -> Evaluation:
     """The evaluation with whitened residuals and derivatives, if the problem has a whitening filter."""
-    return plain if problem.whitening is None else _apply_whitening(problem, plain)
+    if problem.whitening is None:
+        return plain
+    residuals, jacobian = _apply_whitening(
+        problem.whitening, problem.noise, problem.tape.run, plain.residuals, plain.jacobian
+    )
+    return plain._replace(residuals=residuals, jacobian=jacobian)
 
 
-def _evaluated(problem: Problem, unknowns: Unknowns) -> Evaluation:
+def _evaluated(
+    problem: Problem,
+    unknowns: Unknowns,
+    starts: Float[Array | np.ndarray, "blocks states"] | None = None,
+) -> Evaluation:
     tape = problem.tape
-    simulated, jacobian = sensitivities(
-        problem.parameters, unknowns.coordinates, tape, unknowns.runs
+    simulated, jacobian, starts, d_starts = sensitivities(
+        problem.parameters, unknowns.coordinates, tape, unknowns.runs, starts
     )
     scale = tape.weight / problem.noise[:, None]
     jacobian = jacobian * scale[..., None] * problem.determinable()[tape.run][:, None, None, :]
     residuals = (simulated - tape.measured) * scale
     wild = ~jnp.all(jnp.abs(jacobian) < MAX_SENSITIVITY, (1, 2, 3)) & problem.fitted_runs[tape.run]
-    return Evaluation(simulated, jnp.where(wild[:, None, None], jnp.inf, residuals), jacobian)
+    residuals = jnp.where(wild[:, None, None], jnp.inf, residuals)
+    return Evaluation(simulated, residuals, jacobian, starts, d_starts)
 
 
 # `quickly_compiled` programs are as fast as others without effects, and up to a third slower with them
@@ -217,27 +258,42 @@ def _orthogonal(tape: Tape, allowed: Nuisance, plain: Evaluation) -> Evaluation:
     )
     share = jnp.linalg.solve(gram, along)
     projected = both[..., count:] - jnp.einsum("bcsi,bij->bcsj", nuisance, share[tape.run])
-    return Evaluation(plain.simulated, projected[..., -1], projected[..., :-1])
+    return plain._replace(residuals=projected[..., -1], jacobian=projected[..., :-1])
 
 
+# Only what is needed is passed to these two, so that one program serves the models of different effects
 @compiled
-def _apply_whitening(problem: Problem, plain: Evaluation) -> Evaluation:
-    both = jnp.concatenate([plain.jacobian, plain.residuals[..., None]], -1)
-    assert problem.whitening is not None
-    both = problem.whitening(both * problem.noise[:, None, None], problem.tape.run)
-    return Evaluation(plain.simulated, both[..., -1], both[..., :-1])
+def _apply_whitening(
+    whitening: Whitening,
+    noise: Float[Array | np.ndarray, "2"],
+    run: Int[Array | np.ndarray, " blocks"],
+    residuals: Float[Array, "blocks 2 samples"],
+    jacobian: Float[Array, "blocks 2 samples columns"],
+) -> tuple[Float[Array, "blocks 2 samples"], Float[Array, "blocks 2 samples columns"]]:
+    both = jnp.concatenate([jacobian, residuals[..., None]], -1)
+    both = whitening(both * noise[:, None, None], run)
+    return both[..., -1], both[..., :-1]
 
 
-@compiled
 def normal_matrix(
-    evaluation: Evaluation, tape: Tape, fitted_runs: Bool[Array, " runs"] | np.ndarray
+    evaluation: Evaluation, tape: Tape, fitted_runs: Bool[Array | np.ndarray, " runs"]
 ) -> Float[Array, "unknowns unknowns"]:
     """[J r]' [J r], columns: the coordinates, the own unknowns of run after run, and last the residual."""
-    _, r, jacobian = evaluation
-    both = jnp.concatenate([jacobian, r[..., None]], -1)
+    return _normal_matrix(evaluation.residuals, evaluation.jacobian, tape.run, fitted_runs)
+
+
+@compiled
+def _normal_matrix(
+    residuals: Float[Array, "blocks 2 samples"],
+    jacobian: Float[Array, "blocks 2 samples columns"],
+    run: Int[Array | np.ndarray, " blocks"],
+    fitted_runs: Bool[Array | np.ndarray, " runs"],
+) -> Float[Array, "unknowns unknowns"]:
+    runs = fitted_runs.shape[0]
+    both = jnp.concatenate([jacobian, residuals[..., None]], -1)
     of_block = jnp.einsum("bcsi,bcsj->bij", both, both)
-    of_run = jax.ops.segment_sum(of_block, tape.run, tape.runs) * fitted_runs[:, None, None]
-    index = _column_indices(jacobian.shape[-1] - UNKNOWNS_PER_RUN, tape.runs)
+    of_run = jax.ops.segment_sum(of_block, run, runs) * fitted_runs[:, None, None]
+    index = _column_indices(jacobian.shape[-1] - UNKNOWNS_PER_RUN, runs)
     size = index.max() + 1
     return jnp.zeros((size, size)).at[index[:, :, None], index[:, None, :]].add(of_run)
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..motor import Motor
@@ -69,11 +70,22 @@ def free_run(
     motor_on_grids = (motor, grid_propagators(motor, tape))
     initial = _initial_states(motor, own, tape)
     states = initial.shape[1]
-    starts, joined, last, *_ = _join_blocks(motor_on_grids, tape, own, initial)
+    guess = _guessed_starts(motor, own, tape, initial)
+    constant = _constant(motor_on_grids, states)
+    starts, joined, last, *_ = _join_blocks(motor_on_grids, constant, tape, own, initial, guess)
     simulated = last.simulated + jnp.einsum(
         "sncb,bn->scb", last.d_simulated[:, -states:], joined - starts
     )
     return reported(motor, tape, simulated.transpose(2, 1, 0))
+
+
+class Sensitivities(NamedTuple):
+    """A free run and its derivatives with respect to the parameters, and then to the unknowns of its own run."""
+
+    simulated: Float[Array, "blocks 2 samples"]  # current A and speed rad/s, as reported
+    d_simulated: Float[Array, "blocks 2 samples columns"]
+    starts: Starts  # of the blocks
+    d_starts: Float[Array, "blocks states columns"]
 
 
 @eqx.filter_jit
@@ -82,11 +94,13 @@ def sensitivities(
     parameters: Float[Array, " parameters"],
     tape: Tape,
     own: RunUnknowns | None = None,
-) -> tuple[Float[Array, "blocks 2 samples"], Float[Array, "blocks 2 samples columns"]]:
+    starts: Starts | Float[np.ndarray, "blocks states"] | None = None,
+) -> Sensitivities:
     """Free run, and its derivatives with respect to `parameters` and then to the unknowns of the sample's own run.
 
-    `assemble` makes a motor from the parameters; the rest is as in `free_run`. All is NaN if `MAX_PASSES` passes do not
-    join the blocks, as for a motor that depends chaotically on its initial state.
+    `assemble` makes a motor from the parameters; `starts` of the blocks, as far as they are about known, else NaN; the
+    rest is as in `free_run`. All is NaN if `MAX_PASSES` passes do not join the blocks, as for a motor that depends
+    chaotically on its initial state.
     """
     own = own or RunUnknowns.as_recorded(tape)
     count = len(parameters)
@@ -110,10 +124,16 @@ def sensitivities(
     columns = count + 1 + states
     d_motor_on_grids = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_motor_on_grids)
 
-    # joining takes several passes, with the columns of the start only; one more pass at the joined starts has all
-    starts = _join_blocks(motor_on_grids, tape, own, initial, MAX_PASSES).joined
-    passed = simulate_blocks(
-        motor_on_grids, d_motor_on_grids, columns, tape, starts, own.load_offset
+    guess = _guessed_starts(motor, own, tape, initial)
+    if starts is not None:
+        guess = jnp.where(jnp.isnan(starts), guess, starts)
+    if not motor.effects or motor.toothed:
+        # passes with the columns of the start only, where one is enough or many are needed
+        constant, passes = _constant(motor_on_grids, states), MAX_PASSES if motor.effects else 1
+        guess = _join_blocks(motor_on_grids, constant, tape, own, initial, guess, passes).joined
+    # otherwise every pass has all columns, because a pass with other columns is compiled anew
+    starts, _, passed, *_ = _join_blocks(
+        motor_on_grids, d_motor_on_grids, tape, own, initial, guess, MAX_PASSES
     )
     joined, d_starts = _newton_correction_with_derivatives(
         passed, tape, starts, initial, d_initial, count
@@ -125,13 +145,13 @@ def sensitivities(
     direct = _in_all_columns(jnp.moveaxis(passed.d_simulated[:, : count + 1], 1, -1), count)
     d_simulated = (direct + through).transpose(2, 1, 0, 3)
     if motor.speed_delay() is None and tape.averaging is None:
-        return simulated.transpose(2, 1, 0), d_simulated
+        return Sensitivities(simulated.transpose(2, 1, 0), d_simulated, joined, d_starts)
     simulated, d_simulated = value_and_derivatives(
         lambda motor, simulated: reported(motor, tape, simulated),
         (motor, simulated.transpose(2, 1, 0)),
         (d_motor, jnp.moveaxis(d_simulated, -1, 0)),
     )
-    return simulated, jnp.moveaxis(d_simulated, 0, -1)
+    return Sensitivities(simulated, jnp.moveaxis(d_simulated, 0, -1), joined, d_starts)
 
 
 def _in_all_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "... columns"]:
@@ -181,29 +201,33 @@ class Joining(NamedTuple):
     passes: Int[Array, ""]
 
 
+def _constant(motor_on_grids: MotorOnGrids, columns: int) -> MotorOnGrids:
+    """Derivatives of zero, for columns that are with respect to the starts only."""
+    return jax.tree.map(lambda leaf: jnp.zeros((columns, *leaf.shape)), motor_on_grids)
+
+
 def _join_blocks(
     motor_on_grids: MotorOnGrids,
+    d_motor_on_grids: MotorOnGrids,
     tape: Tape,
     own: RunUnknowns,
     initial: Starts,
+    guess: Starts,
     max_passes: int | None = None,
 ) -> Joining:
     """Simulate all blocks until every block begins where the one before it ended.
 
-    The joined starts are NaN if `max_passes` are not enough.
+    The starts are NaN if `max_passes` are not enough.
     """
-    motor, states = motor_on_grids[0], initial.shape[1]
-    # of the prepared motor with respect to the starts
-    no_derivatives = jax.tree.map(lambda leaf: jnp.zeros((states, *leaf.shape)), motor_on_grids)
-    guess = _guessed_starts(motor, own, tape, initial)
+    motor, columns = motor_on_grids[0], jax.tree.leaves(d_motor_on_grids)[0].shape[0]
     # the correction of a single pass joins a linear motor exactly; otherwise every pass makes at least one more block
     # of each run exact, so this ends for any motor
     exact = motor.affine and not motor.switches
-    allowed = 1 if exact else min(max_passes or len(guess) + 1, len(guess) + 1)
+    allowed = max_passes or (1 if exact else len(guess) + 1)
 
     def simulate(starts: Starts) -> Pass:
         return simulate_blocks(
-            motor_on_grids, no_derivatives, states, tape, starts, own.load_offset
+            motor_on_grids, d_motor_on_grids, columns, tape, starts, own.load_offset
         )
 
     def unjoined(joining: Joining) -> Bool[Array, ""]:
@@ -224,7 +248,10 @@ def _join_blocks(
     end = jax.lax.while_loop(unjoined, improve, start)
     if max_passes is None or exact:
         return end
-    return end._replace(joined=jnp.where(end.gap > MAX_RELATIVE_GAP, jnp.nan, end.joined))
+    failed = end.gap > MAX_RELATIVE_GAP
+    return end._replace(
+        starts=jnp.where(failed, jnp.nan, end.starts), joined=jnp.where(failed, jnp.nan, end.joined)
+    )
 
 
 def _newton_correction(

@@ -16,6 +16,7 @@ from ..problem import (
     evaluate,
     flatten,
     normal_matrix,
+    predicted_starts,
     scaled,
     unflatten,
     whitened,
@@ -115,7 +116,10 @@ def polish(
             break
         unknowns, stopped = _moved(problem, best.unknowns, share * step)
         fixed |= stopped
-        trial = _evaluate_weighted(problem, unknowns)
+        change = np.asarray(flatten(unknowns)) - np.asarray(flatten(best.unknowns))
+        trial = _evaluate_weighted(
+            problem, unknowns, starts=predicted_starts(problem, best.evaluation, change)
+        )
         costs.append(min(trial.cost, best.cost))
     distance = float(np.sqrt(gain / _residual_variance(problem, best)))
     optimum = Optimum(best.unknowns, best.fitness, tuple(sorted(fixed)), distance)
@@ -178,9 +182,12 @@ def reweighted(problem: Problem, fit: Fit) -> Evaluation:
 
 
 def _evaluate_weighted(
-    problem: Problem, unknowns: Unknowns, known: Evaluation | None = None
+    problem: Problem,
+    unknowns: Unknowns,
+    known: Evaluation | None = None,
+    starts: Float[np.ndarray, "blocks states"] | None = None,
 ) -> _WeightedPoint:
-    evaluation = evaluate(problem, unknowns) if known is None else known
+    evaluation = evaluate(problem, unknowns, starts) if known is None else known
     with np.errstate(over="ignore", invalid="ignore"):  # a step too far may be infinitely bad
         squares = squares_of_outputs(problem, evaluation)
         noise, stretch = residual_noise(problem, squares)
