@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..motor import Motor
-from ..recordings.recording import OVER_BOTH, OVER_LAST
+from ..recordings.recording import AROUND, OVER_BOTH, OVER_LAST
 from .identification import RunFit
 from .noise.sensor_noise import rms
 from .prepare import Prepared
@@ -26,6 +26,7 @@ UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
 AVERAGING_SPANS = {
     OVER_LAST: "the last sample interval",
     OVER_BOTH: "the last and the next sample interval",
+    AROUND: "the sample interval around each instant",
 }
 
 

@@ -72,6 +72,8 @@ class Averaging(NamedTuple):
 
 
 OVER_LAST, OVER_BOTH = Averaging(1.0, 0.0), Averaging(0.5, 0.5)
+# a mean from half a sample before each instant to half a sample after it hardly differs from the signal there
+AROUND = Averaging(0.0, 0.0)
 
 
 def _samples(values: ArrayLike) -> np.ndarray:

@@ -1,5 +1,5 @@
-"""Effects named for the likeliest timing of the voltages, and for runs that begin with a warm winding: neither may show
-in a fit without the effects."""
+"""Effects named for the likeliest timing of the voltages and of counted speeds, and for runs that begin with a warm
+winding: none of these may show in a fit without the effects."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from ...identify.corrections.input_timing import (
     only_current_is_late,
     other_timings,
 )
+from ...identify.corrections.speed_averaging import with_averaging
 from ...identify.fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN
 from ...identify.prepare import Prepared
 from ...identify.solve import Solved, polish_with_angle, solve
 from ...progress import ReportProgress
+from ...recordings.recording import AROUND, OVER_LAST
 from ...simulate import ZERO_ORDER_HOLD, Timing
 from ..model import Model, model_of
 from .naming import Naming, StepwiseSelection
@@ -39,10 +41,16 @@ class Attempt(NamedTuple):
 def likeliest_attempt(
     prepared: Prepared, search: str, seed: int, report: ReportProgress
 ) -> Attempt:
-    """The effects named, and then once more if these reveal another timing of the voltages, or runs that begin with a
-    warm winding."""
+    """The effects named, and then once more if these reveal another timing of the voltages or of counted speeds, or
+    runs that begin with a warm winding."""
     attempt = _of_likeliest_timing(prepared, search, seed, report)
     chosen = attempt.naming.chosen
+    if chosen.effects and chosen.prepared.averaging == OVER_LAST:
+        counted, _ = with_averaging(chosen.prepared, chosen.fit)
+        if counted.averaging == AROUND:
+            around = prepared._replace(averaging=AROUND)
+            attempt = _likelier(attempt, _of_likeliest_timing(around, search, seed, report))
+            chosen = attempt.naming.chosen
     warm, _ = with_initial_temperatures(chosen.prepared, chosen.fit)
     if warm is chosen.prepared:
         return attempt

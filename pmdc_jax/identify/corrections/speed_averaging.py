@@ -1,8 +1,8 @@
 """A speed computed by differencing an angle is a mean over one or two samples: it is detected and simulated as such.
 
 Where the speed changes within a few samples, such a mean lags, or smooths the motion as a compliant shaft might. The
-noise of the angle shows which mean it is; in case of doubt the fits to both decide. The simulation then reports the
-same mean.
+noise of the angle shows which mean it is; in case of doubt, and between a mean over the last sample and one around each
+instant, the fits to both decide. The simulation then reports the same mean.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...recordings.recording import OVER_BOTH, OVER_LAST, Averaging
+from ...recordings.recording import AROUND, OVER_BOTH, OVER_LAST, Averaging
 from ...simulate import Tape
 from ..fit.gauss_newton import TOLERANCE
 from ..fit.likelihood import (
@@ -56,7 +56,10 @@ def seems_averaged(prepared: Prepared) -> bool:
 
 
 def with_evident_averaging(prepared: Prepared) -> Prepared:
-    """The runs with their speeds treated as means over the last sample where the noise leaves no doubt of it."""
+    """The runs with their speeds treated as means over the last sample where the noise leaves no doubt of it, and
+    nothing else is known of them."""
+    if prepared.averaging:
+        return prepared
     mean, min_gain, _ = _averaging_by_noise(prepared)
     sure = mean is not None and np.isneginf(min_gain)
     return _with_speeds_averaged(without_ends(prepared, SPEED), mean) if sure else prepared
@@ -70,7 +73,7 @@ def with_averaging(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     **Arguments**: `fit`, to the runs as they are. **Returns**: both unchanged if no mean was found.
     """
     if prepared.averaging == OVER_LAST:
-        return _or_centred(prepared, fit)
+        return _or_around(prepared, fit)
     mean, min_gain, counted = _averaging_by_noise(prepared)
     if prepared.averaging or mean is None:
         return prepared, fit
@@ -89,13 +92,13 @@ def with_averaging(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     return averaged, better
 
 
-def _or_centred(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
-    """The runs with their speeds treated as instantaneous, if these are clearly likelier than means over the last
-    sample, and the fit to them: a counter read half a sample before and after each instant tells the speed at it."""
-    centred, other = refitted(without_averaging(prepared), fit)
-    gain = negative_log_likelihood(prepared, fit) - negative_log_likelihood(centred, other)
-    if gain > MIN_LOG_LIKELIHOOD_GAIN and leaves_only_noise(centred, other):
-        return centred, other
+def _or_around(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+    """The runs with their speeds treated as means around each instant, if these are clearly likelier than means over
+    the last sample and leave nothing but noise, and the fit to them; otherwise both unchanged."""
+    around, other = refitted(without_averaging(prepared)._replace(averaging=AROUND), fit)
+    gain = negative_log_likelihood(prepared, fit) - negative_log_likelihood(around, other)
+    if gain > MIN_LOG_LIKELIHOOD_GAIN and leaves_only_noise(around, other):
+        return around, other
     return prepared, fit
 
 
