@@ -89,7 +89,7 @@ def polish(
     """
     ridge = ridge_of(problem)
     fixed, held = set(start.at_bound), None  # at a bound now, and as the last step was made
-    best = trial = _evaluate_weighted(problem, start.unknowns, known)
+    best = trial = _evaluate_weighted(problem, start.unknowns, known, start.starts)
     step, share, gain = np.zeros(len(flatten(start.unknowns))), 1.0, np.inf
     costs = [best.cost]
     for _ in range(steps):
@@ -122,7 +122,8 @@ def polish(
         )
         costs.append(min(trial.cost, best.cost))
     distance = float(np.sqrt(gain / _residual_variance(problem, best)))
-    optimum = Optimum(best.unknowns, best.fitness, tuple(sorted(fixed)), distance)
+    starts = np.asarray(best.evaluation.starts)
+    optimum = Optimum(best.unknowns, best.fitness, tuple(sorted(fixed)), distance, starts)
     return Fit(optimum, best.evaluation, best.noise, best.cost)
 
 

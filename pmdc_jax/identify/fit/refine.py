@@ -28,6 +28,8 @@ class Optimum(NamedTuple):
     at_bound: tuple[int, ...]  # which coordinates were held at a bound
     # predicted from the gradient: how far the minimum is, in standard errors; infinite where it was not computed
     distance: float = np.inf
+    # there, of the blocks of samples that are simulated in parallel (see `evaluate`); None where they are not known
+    starts: Float[np.ndarray, "blocks states"] | None = None
 
     @property
     def converged(self) -> bool:
