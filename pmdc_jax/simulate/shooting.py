@@ -99,8 +99,8 @@ def sensitivities(
     """Free run, and its derivatives with respect to `parameters` and then to the unknowns of the sample's own run.
 
     `assemble` makes a motor from the parameters; `starts` of the blocks, as far as they are about known, else NaN; the
-    rest is as in `free_run`. All is NaN if `MAX_PASSES` passes do not join the blocks, as for a motor that depends
-    chaotically on its initial state.
+    rest is as in `free_run`. The free run is NaN if `MAX_PASSES` passes do not join the blocks, as for a motor that
+    depends chaotically on its initial state; its derivatives then say nothing.
     """
     own = own or RunUnknowns.as_recorded(tape)
     count = len(parameters)

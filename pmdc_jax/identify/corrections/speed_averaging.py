@@ -70,12 +70,14 @@ def with_averaging(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
 
     A speed that lags more than a mean would is late for another reason.
 
-    **Arguments**: `fit`, to the runs as they are. **Returns**: both unchanged if no mean was found.
+    **Arguments**: `fit`, to the runs as they are. **Returns**: both unchanged if no other mean was found.
     """
     if prepared.averaging == OVER_LAST:
         return _or_around(prepared, fit)
+    if prepared.averaging:
+        return prepared, fit
     mean, min_gain, counted = _averaging_by_noise(prepared)
-    if prepared.averaging or mean is None:
+    if mean is None:
         return prepared, fit
     inner = without_ends(prepared, SPEED)
     averaged, better = refitted(_with_speeds_averaged(inner, mean), fit)
