@@ -22,6 +22,7 @@ from pmdc_jax.diagnose.diagnosis import (
     NextExperiment,
     Region,
     breaks_electrical_equation,
+    unlike_held_out,
 )
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate
@@ -242,6 +243,14 @@ def test_a_hold_out_error_beyond_that_of_the_training_runs_is_reported(after, be
     gap = {"train": Gap(4.0, 1.0, 1.0), "holdout": Gap(5.0, after, 1.0)}
     assert named(gap=gap).beyond_fitted == beyond
     assert named(gap={"train": gap["train"]}).beyond_fitted is None
+
+
+@pytest.mark.parametrize(("before", "unlike"), [(5.0, True), (20.0, False)])
+def test_a_small_rest_of_a_large_hold_out_gap_does_not_refute_an_effect(before, unlike):
+    """15 noise variances are left, of 24 or of 399."""
+    gap = {"train": Gap(4.0, 1.0, 1.0), "holdout": Gap(before, 4.0, 1.0)}
+    assert unlike_held_out(gap) == unlike
+    assert "The error of the held-out runs is 4.00 times" in words(named(gap=gap))
 
 
 @pytest.mark.parametrize(

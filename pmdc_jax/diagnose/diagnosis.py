@@ -23,6 +23,9 @@ MAX_EXPLAINED_ELECTRICAL = 1.5
 MAX_ELECTRICAL_SHARE = 0.5
 # Misfit of hold-outs over that of the fitted runs above which the hold-outs show something that the fitted runs do not
 MAX_HOLDOUT_RATIO = 2.5
+# ... unless the effects added leave no more than this share of the hold-outs' gap, in squares: their formulas, too, may
+# be less exact where hold-outs go beyond the fitted runs
+MAX_HOLDOUT_SHARE = 0.2
 # Misfit of hold-outs after effects were added, over that before, above which these made them worse
 MAX_HOLDOUT_GROWTH = 1.1
 # Misfit of one fitted run over the largest of all others above which something happened in that run alone
@@ -191,7 +194,10 @@ def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:
 
 def unlike_held_out(gap: Mapping[Role, Gap]) -> bool:
     """Whether hold-outs show that something is missing that the fitted runs do not show."""
-    return beyond_fitted(gap) is not None or worse_held_out(gap)
+    if beyond_fitted(gap) is None:
+        return worse_held_out(gap)
+    before, after = gap["holdout"].before, gap["holdout"].after
+    return after**2 - 1 > MAX_HOLDOUT_SHARE * (before**2 - 1)
 
 
 def worse_held_out(gap: Mapping[Role, Gap]) -> bool:

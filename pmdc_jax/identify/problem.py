@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..runtime.compiled import compiled, is_traced, quickly_compiled
+from ..runtime.compiled import compiled, quickly_compiled
 from ..runtime.threads import CORES, map_in_threads
 from ..simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, sensitivities
 from .noise.whitening import Whitening
@@ -158,13 +157,11 @@ def evaluate(
     """
     # without whitening and nuisance, so that the simulation, slow to compile, is compiled only once
     bare = replace(problem, whitening=None, nuisance=None)
-    has_effects = bool(bare.parameters.effects)
-    with _empty_mesh():
-        if has_effects and not is_traced(problem, unknowns):
-            simulated = _evaluate_in_threads(bare, unknowns, starts)
-        else:
-            simulated = (_evaluate if has_effects else _evaluate_linear)(bare, unknowns)
-        return whitened(problem, _without_nuisance(problem, simulated))
+    if bare.parameters.effects:
+        simulated = _evaluate_in_threads(bare, unknowns, starts)
+    else:
+        simulated = _evaluate_linear(bare, unknowns)
+    return whitened(problem, _without_nuisance(problem, simulated))
 
 
 def predicted_starts(
@@ -191,17 +188,11 @@ def _evaluate_in_threads(
         guess = np.full((tape.value.shape[0], problem.states), np.nan)
         if starts is not None:
             guess[:blocks] = starts[begins[k] : begins[k + 1]]
-        with _empty_mesh():
-            evaluation = _evaluate(replace(problem, tape=tape), unknowns, guess)
+        evaluation = _evaluate(replace(problem, tape=tape), unknowns, guess)
         return [np.asarray(values)[:blocks] for values in evaluation]
 
     by_signal = zip(*map_in_threads(of_part, range(len(parts))), strict=True)
     return Evaluation(*(jnp.asarray(np.concatenate(values)) for values in by_signal))
-
-
-def _empty_mesh() -> AbstractContextManager[None]:
-    """Levenberg-Marquardt traces under an empty mesh; without a mesh everything would be traced a second time."""
-    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ()))
 
 
 def whitened(problem: Problem, plain: Evaluation) -> Evaluation:

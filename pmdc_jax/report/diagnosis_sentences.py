@@ -64,7 +64,11 @@ def verdict_sentences(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.effects:
         sentences += [_gap_sentence(diagnosis), _drift_sentence(diagnosis)]
     if diagnosis.verdict != "not_in_library":
-        sentences += [_formula_sentence(diagnosis), _slow_rest_sentence(diagnosis)]
+        sentences += [
+            _formula_sentence(diagnosis),
+            _slow_rest_sentence(diagnosis),
+            _held_out_sentence(diagnosis),
+        ]
     sentences.append(_run_apart_sentence(diagnosis))
     return [sentence for sentence in sentences if sentence] + cautions(diagnosis.final)
 
@@ -121,11 +125,7 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
             " can cause: what is missing acts on voltage or current, such as a sagging supply where the recorded"
             " voltage is duty cycle times nominal voltage; or the recorded current was filtered or averaged."
         )
-    if beyond := diagnosis.beyond_fitted:
-        sentences.append(
-            f"The error of the held-out runs is {significant(beyond)} times that of the training runs: they contain"
-            " something that the training runs do not show. Include one of them in the fit."
-        )
+    sentences.append(_held_out_sentence(diagnosis))
     if worse_held_out(diagnosis.gap):
         sentences.append(
             "The addition increases the error of the held-out runs: something else is missing that looks alike in the"
@@ -135,6 +135,16 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
         *sentences,
         "The parameters compensate for what is missing: the intervals do not cover this error.",
     ]
+
+
+def _held_out_sentence(diagnosis: Diagnosis) -> str:
+    """That the hold-outs are reproduced far worse than the fitted runs, if they are."""
+    if not (beyond := diagnosis.beyond_fitted):
+        return ""
+    return (
+        f"The error of the held-out runs is {significant(beyond)} times that of the training runs: they contain"
+        " something that the training runs do not show. Include one of them in the fit."
+    )
 
 
 def _curve_sentence(curve: LearnedCurve) -> str:

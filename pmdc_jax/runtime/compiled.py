@@ -88,7 +88,7 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        if is_traced(args, kwargs):
+        if _is_traced(args, kwargs):
             return inlined(*args, **kwargs)
         if programs() is None:
             return jitted()(*args, **kwargs)
@@ -113,7 +113,13 @@ def compiled(function: Callable[P, T], options: dict[str, Any] | None = None) ->
     return call
 
 
-def is_traced(*values: object) -> bool:
+def strongly_typed(tree: T) -> T:
+    """Arrays with strong types, as arithmetic returns them: for weak ones, as of constants, the program that takes them
+    would be compiled separately."""
+    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), tree)
+
+
+def _is_traced(*values: object) -> bool:
     """Whether a call with these arguments comes from code that is being compiled."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from ...runtime.compiled import quickly_compiled
+from ...runtime.compiled import quickly_compiled, strongly_typed
 from ..identification import CONVERGED_DISTANCE
 from ..parameters import Parameters
 from ..problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
@@ -44,69 +45,97 @@ class Optimum(NamedTuple):
         return self._replace(unknowns=self.unknowns._replace(coordinates=further))
 
 
-Columns = Float[Array, " columns"]
-# The problem, the start and the scales of its unknowns, and the sum of squares that normalises the residuals
-Arguments = tuple[Problem, Columns, Columns, Float[Array, ""]]
+Columns = Float[Array | np.ndarray, " columns"]
+Factor = Float[Array | np.ndarray, "rows rows"]
+
+# With the Jacobian as an array, which one program can pass on to the next
+SOLVER_OPTIONS = {"jac": "bwd"}
 
 
-# Levenberg-Marquardt depends on the residuals r and their Jacobian J only through J'J, J'r and r'r. It is therefore
-# given the shortest residual vector with the same products: its length is the number of unknowns plus one, instead of
-# the number of samples.
-@eqx.filter_custom_jvp
-def compressed(flat: Columns, args: Arguments) -> Float[Array, " columns+1"]:
-    return _factor(flat, args)[:, -1]
+class _Step(NamedTuple):
+    """Where Levenberg-Marquardt is."""
+
+    best: Columns  # of the unknowns tried so far
+    squares: Float[Array, ""]  # there
+    asked: Columns  # the unknowns to be tried next
+    ended: Bool[Array, ""]
+    state: tuple[Array, ...]  # leaves of optimistix's
 
 
-@compressed.def_jvp
-def _compressed_jvp(
-    primals: tuple[Columns, Arguments], tangents: tuple[Columns | None, Any]
-) -> tuple[Float[Array, " columns+1"], Float[Array, " columns+1"]]:
-    flat, args = primals
-    factor = _factor(flat, args)
-    direction = tangents[0]
-    change = jnp.zeros_like(factor[:, -1]) if direction is None else factor[:, :-1] @ direction
-    return factor[:, -1], change
+def _levenberg_marquardt(
+    problem: Problem, start: Unknowns, scale: np.ndarray, size: float, tolerance: float
+) -> tuple[Unknowns, float]:
+    """The unknowns with the least squares, and these.
+
+    **Arguments**: `scale` of the unknowns, and `size` of the squares, by which the solver's are divided.
+    """
+    flat_start, moves = np.asarray(flatten(start)), scale > 0
+
+    def in_units(scaled: Columns) -> Unknowns:
+        # those without a scale stay at their start, from which rounding would move them
+        flat = np.where(moves, np.asarray(scaled) * scale, flat_start)
+        return unflatten(problem, jnp.asarray(flat))
+
+    step = _begin(jnp.asarray(np.where(moves, flat_start / np.where(moves, scale, 1.0), 0.0)))
+    starts = None
+    for _ in range(MAX_STEPS):
+        evaluation = evaluate(problem, in_units(step.asked), starts)
+        starts = np.asarray(evaluation.starts)  # about where those of the next simulation are
+        matrix = np.asarray(normal_matrix(evaluation, problem.tape, problem.fitted_runs))
+        step = _next(step, _factor(matrix, scale, size), jnp.asarray(tolerance))
+        if step.ended:
+            break
+    return in_units(step.best), float(step.squares) * size
 
 
-def _factor(flat: Columns, args: Arguments) -> Float[Array, "columns+1 columns+1"]:
-    problem, flat_start, scale, size = args
-    # optimistix promotes dtypes strictly; under standard promotion earlier traces are reused
-    with jax.numpy_dtype_promotion("standard"):
-        evaluation = evaluate(problem, _unscaled(problem, flat, flat_start, scale))
-        matrix = normal_matrix(evaluation, problem.tape, problem.fitted_runs)
-    stretch = jnp.append(scale, 1.0)
-    matrix = matrix * stretch[:, None] * stretch / size
-    # a failed simulation must have a large sum of squares: NaN cannot be compared
-    bad = ~jnp.all(jnp.isfinite(matrix))
-    matrix = jnp.where(bad, jnp.zeros_like(matrix).at[-1, -1].set(1e12), matrix)
-    values, vectors = jnp.linalg.eigh(matrix)
-    return jnp.sqrt(jnp.maximum(values, 0.0))[:, None] * vectors.T
-
-
-def _unscaled(problem: Problem, flat: Columns, flat_start: Columns, scale: Columns) -> Unknowns:
-    """The unknowns in their units; those without a scale stay at their start, from which rounding would move them."""
-    return unflatten(problem, jnp.where(scale > 0, flat * scale, flat_start))
+# The simulation is no part of these two programs: one compilation serves all models with as many unknowns.
+@quickly_compiled
+def _begin(start: Columns) -> _Step:
+    leaves = tuple(jax.tree.leaves(_first_state(_solver(jnp.asarray(0.0)), start)))
+    step = _Step(start, jnp.asarray(np.inf), start, jnp.asarray(False), leaves)
+    return strongly_typed(step)
 
 
 @quickly_compiled
-def _levenberg_marquardt(
-    problem: Problem,
-    start: Unknowns,
-    scale: Columns,
-    size: Float[Array, ""],
-    tolerance: Float[Array, ""],
-) -> tuple[Unknowns, Float[Array, ""]]:
-    flat_start = flatten(start)
-    solution = optx.least_squares(
-        compressed,
-        optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),  # pyright: ignore[reportArgumentType]
-        jnp.where(scale > 0, flat_start / jnp.where(scale > 0, scale, 1.0), 0.0),
-        args=(problem, flat_start, scale, size),
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    ended = _unscaled(problem, solution.value, flat_start, scale)
-    return ended, 2 * solution.state.f_info.as_min() * size
+def _next(step: _Step, factor: Factor, tolerance: Float[Array, ""]) -> _Step:
+    """The next step, given the `factor` at the unknowns that this one asked for."""
+    solver, model = _solver(tolerance), (step.asked, factor)
+    like = jax.eval_shape(partial(_first_state, solver), step.asked)
+    before = jax.tree.unflatten(jax.tree.structure(like), step.state)
+    best, state, _ = solver.step(_linearised, step.best, model, SOLVER_OPTIONS, before, frozenset())
+    leaves = tuple(jax.tree.leaves(state))
+    return _Step(best, 2 * state.f_info.as_min(), state.y_eval, state.terminate, leaves)
+
+
+def _solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
+    return optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)  # pyright: ignore[reportArgumentType]
+
+
+def _first_state(solver: optx.LevenbergMarquardt, start: Columns) -> Any:
+    model = (start, jnp.zeros(2 * (len(start) + 1,)))
+    residuals, _ = jax.eval_shape(_linearised, start, model)
+    return solver.init(_linearised, start, model, SOLVER_OPTIONS, residuals, None, frozenset())
+
+
+def _linearised(
+    unknowns: Columns, model: tuple[Columns, Factor]
+) -> tuple[Float[Array | np.ndarray, " rows"], None]:
+    """The residuals, linearised about the only unknowns at which the solver asks for them and for their Jacobian."""
+    point, factor = model
+    return factor[:, -1] + factor[:, :-1] @ (unknowns - point), None
+
+
+def _factor(matrix: np.ndarray, scale: np.ndarray, size: float) -> np.ndarray:
+    """The shortest matrix [J r] of scaled unknowns with the right products [J r]' [J r], on which alone
+    Levenberg-Marquardt depends: it has as many rows as unknowns and one more, instead of one for each sample."""
+    stretch = np.append(scale, 1.0)
+    if np.all(np.isfinite(matrix)):
+        matrix = matrix * stretch[:, None] * stretch / size
+    else:  # a failed simulation must have a large sum of squares: NaN cannot be compared
+        matrix = np.zeros_like(matrix)
+        matrix[-1, -1] = 1e12
+    values, vectors = np.linalg.eigh(matrix)
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 
 def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-3) -> Optimum:
@@ -127,9 +156,7 @@ def refine(problem: Problem, start: Unknowns, tolerance: float = 1e-3) -> Optimu
     fixed, unknowns, squares = {}, start, size
     for _ in range(len(low) + 1):
         now = eqx.tree_at(lambda p: p.free, problem, _without(problem.free, fixed))
-        unknowns, squares = _levenberg_marquardt(
-            now, unknowns, jnp.asarray(scale), jnp.asarray(size), jnp.asarray(tolerance)
-        )
+        unknowns, squares = _levenberg_marquardt(now, unknowns, scale, size, tolerance)
         coordinates = np.array(unknowns.coordinates)
         beyond = {int(k): low[k] for k in np.flatnonzero(coordinates < low)}
         beyond |= {int(k): high[k] for k in np.flatnonzero(coordinates > high)}

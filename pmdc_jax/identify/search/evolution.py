@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
@@ -14,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ...errors import InputError
 from ...progress import ReportProgress
-from ...runtime.compiled import quickly_compiled
+from ...runtime.compiled import quickly_compiled, strongly_typed
 from ...simulate import Tape, squared_errors
 from ..parameters import Parameters
 
@@ -165,7 +164,8 @@ Asked = tuple[Float[Array, "population dimensions"], Leaves]
 def _first_points(kind: Kind, seed: Value, *start: Value) -> Asked:
     """The first points of the unit cube to evaluate, (population, dimensions), and the state of the algorithm."""
     algorithm, settings = _algorithm(kind)
-    return _ask(kind, seed, 1, algorithm.init(jax.random.key(seed), *start, settings))
+    state = algorithm.init(jax.random.key(seed), *start, settings)
+    return _asked(*algorithm.ask(_keys(seed, 1)[0], state, settings))
 
 
 @quickly_compiled
@@ -178,32 +178,23 @@ def _next_points(
     like = algorithm.init(jax.random.key(0), *start, settings)
     whole = jax.tree.unflatten(jax.tree.structure(like), state)
     whole, _ = algorithm.tell(_keys(seed, generation)[1], cube, fitness, whole, settings)
-    return _ask(kind, seed, generation + 1, whole)
+    return _asked(*algorithm.ask(_keys(seed, generation + 1)[0], whole, settings))
 
 
-def _ask(kind: Kind, seed: Value, generation: Value | int, state: State) -> Asked:
-    algorithm, settings = _algorithm(kind)
-    asked, state = algorithm.ask(_keys(seed, generation)[0], state, settings)
-    return jnp.clip(asked, 0.0, 1.0), tuple(map(_strongly_typed, jax.tree.leaves(state)))
+def _asked(points: Array, state: State) -> Asked:
+    return jnp.clip(points, 0.0, 1.0), tuple(jax.tree.leaves(strongly_typed(state)))
 
 
 def _keys(seed: Value, generation: Value | int) -> Array:
     return jax.random.split(jax.random.fold_in(jax.random.key(seed), generation))
 
 
-@cache
 def _algorithm(kind: Kind) -> tuple[EvolutionaryAlgorithm, Params]:
-    """evosax's algorithm and its settings."""
+    """evosax's algorithm and its settings; within a trace, because outside each operation is compiled by itself."""
     method = METHODS[kind.method]
-    with jax.ensure_compile_time_eval():  # called within a trace, it must not cache tracers
-        algorithm = method.algorithm()(kind.population, jnp.zeros(kind.dimensions))
-        default = algorithm.default_params
-    return algorithm, default.replace(std_init=INITIAL_SPREAD) if method.distribution else default
-
-
-def _strongly_typed(leaf: Array) -> Array:
-    """The leaf with a strong type, as after a step: with a weak one the first step would be compiled separately."""
-    return jax.lax.convert_element_type(leaf, leaf.dtype)
+    algorithm = method.algorithm()(kind.population, jnp.zeros(kind.dimensions))
+    settings = algorithm.default_params
+    return algorithm, settings.replace(std_init=INITIAL_SPREAD) if method.distribution else settings
 
 
 class _Fitness:
