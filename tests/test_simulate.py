@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from linear_motor import PAPER, exact_step, state_space
 from scipy import linalg, signal
 from scipy.integrate import solve_ivp
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import pmdc_jax
 from pmdc_jax import InputError
@@ -25,7 +26,7 @@ from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.recordings.clock import is_even
 from pmdc_jax.recordings.recording import OVER_LAST, Recording
 from pmdc_jax.recordings.recording_file import write_recording
-from pmdc_jax.runtime.threads import map_in_threads
+from pmdc_jax.runtime.threads import map_in_threads, one_blas_thread
 from pmdc_jax.simulate import (
     RunUnknowns,
     Tape,
@@ -569,3 +570,12 @@ def test_threads_may_start_threads():
     """All cores may be waiting for others already, so these do themselves what no other has begun."""
     found = map_in_threads(lambda k: sum(map_in_threads(lambda j: j * k, range(9))), range(20))
     assert found == [36 * k for k in range(20)]
+
+
+def test_blas_has_one_thread_while_a_public_function_runs():
+    def threads() -> set[int]:
+        return {x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"}
+
+    with threadpool_limits(2):
+        assert one_blas_thread(threads)() == {1}
+        assert threads() == {2}

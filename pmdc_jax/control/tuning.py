@@ -18,6 +18,7 @@ from ..motor_file import Uncertainty, load_motor, load_speed_noise, load_uncerta
 from ..progress import ReportProgress, silent
 from ..runtime.compiled import free_memory_maps
 from ..runtime.precision import double_precision
+from ..runtime.threads import one_blas_thread
 from ..simulate.propagator import steps_within
 from .classical import ZIEGLER_NICHOLS_CONTROLLERS, ziegler_nichols
 from .controllers import AbstractController
@@ -134,6 +135,7 @@ class Tuning:
 
 
 @double_precision
+@one_blas_thread
 def tune(
     motor: Motor | str | Path,
     controller: str = "pid",

@@ -15,6 +15,7 @@ from ..progress import ReportProgress, silent
 from ..recordings.recording_file import Runs
 from ..runtime.compiled import free_memory_maps
 from ..runtime.precision import double_precision
+from ..runtime.threads import one_blas_thread
 from .description import (
     detectable_effects,
     effects_found,
@@ -33,6 +34,7 @@ from .selection.naming import Naming
 
 
 @double_precision
+@one_blas_thread
 def diagnose(
     recordings: Runs,
     holdout: Runs = (),

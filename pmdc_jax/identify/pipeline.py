@@ -11,6 +11,7 @@ from ..progress import ReportProgress, silent
 from ..recordings.recording_file import Runs
 from ..runtime.compiled import free_memory_maps
 from ..runtime.precision import double_precision
+from ..runtime.threads import one_blas_thread
 from .fit.generalised_least_squares import last_fit, residuals_of
 from .friction_test import friction_messages, missing_friction
 from .identification import Identification
@@ -22,6 +23,7 @@ from .solve import solve
 
 
 @double_precision
+@one_blas_thread
 def identify(
     recordings: Runs,
     holdout: Runs = (),

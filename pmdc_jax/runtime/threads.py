@@ -1,4 +1,4 @@
-"""Parallel work in threads on all cores."""
+"""Parallel work in threads on all cores: those here, and not those of BLAS."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, wraps
 from typing import Generic, ParamSpec, TypeVar
 
 import jax
+from threadpoolctl import threadpool_limits
 
 A = TypeVar("A")
 P = ParamSpec("P")
@@ -35,6 +36,21 @@ class Task(Generic[T]):
         if getattr(_this_thread, "is_worker", False) and self._future.cancel():
             return self._call()
         return self._future.result()
+
+
+def one_blas_thread(function: Callable[P, T]) -> Callable[P, T]:
+    """Run a public function with BLAS on one thread.
+
+    BLAS divides even small products among threads, and where other work keeps the cores busy each of them waits a time
+    slice for the others: measured, a hundred times as long as on one thread.
+    """
+
+    @wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+        with threadpool_limits(1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return wrapped
 
 
 def map_in_threads(function: Callable[[A], T], items: Iterable[A]) -> list[T]:
