@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...effects import EFFECTS
+from ...effects import EFFECTS, CoggingTorque, TorqueRipple
 from ...effects.base import AbstractEffect
 from ..hypotheses.effect_relations import CONTAINS, FULLER, unbalanced_equation
 from ..hypotheses.library import Curve
@@ -32,6 +32,8 @@ CURVE_SHARE = 0.5
 EFFECT_SHARE = 0.7
 # By simple effect, its fuller form if that has no regression column: only a refit can test it, such as backlash
 REFIT_ONLY = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}
+# Largest difference of a number of periods from a multiple of another, over that one, of a harmonic
+MAX_DETUNING = 0.05
 # The clearest gain left, over what the effects explain, below which nothing more is worth a trial
 NEGLIGIBLE = 2e-3
 # The same for models with a refit-only form, whose fit is never exact because when teeth meet is unpredictable
@@ -137,6 +139,18 @@ class Assessment(NamedTuple):
         """Whether the clearest signal belongs to an effect that the model has."""
         clearest = self.clearest.candidate
         return clearest is not None and clearest.effect in model.effects
+
+    def is_harmonic_of(self, model: Model) -> bool:
+        """Whether what is left is most like a harmonic of an effect of the rotor's angle that the model has."""
+        clearest = self.clearest.candidate
+        if clearest is None or not clearest.own_phase:
+            return False
+        ratios = [
+            clearest.columns[0]["periods"] / float(effect.periods)
+            for effect in model.motor.effects
+            if effect.name == clearest.effect and isinstance(effect, CoggingTorque | TorqueRipple)
+        ]
+        return any(r > 1.5 and abs(r - round(r)) < MAX_DETUNING for r in ratios)
 
     def is_negligible(self, model: Model) -> bool:
         """Whether too little is left for another trial (`NEGLIGIBLE`)."""

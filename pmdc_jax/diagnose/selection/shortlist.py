@@ -38,10 +38,12 @@ def additional_effects(current: Model, assessment: Assessment) -> list[Signal]:
     """The most significant shape of each of the few effects that gain most and are not in the model.
 
     If what is left may be the model-form error of the clearest effect, only effects with `Trial.starts` are tried,
-    which do more than their columns show.
+    which do more than their columns show; and none if it is a harmonic, which the teeth of a gear would imitate.
     """
     ranked = [s for s in clear_signals(assessment) if effect_of(s) not in current.effects]
     if _may_be_form_of_clearest(current, assessment):
+        if assessment.is_harmonic_of(current):
+            return []
         ranked = [s for s in ranked if TRIALS[effect_of(s)].starts]
     # by gain: what may be slow noise has less significance, but is tried for what it explains
     ranked.sort(key=lambda s: -s.gain)
