@@ -35,7 +35,7 @@ from pmdc_jax.control.gains import RANGES
 from pmdc_jax.control.margins import linear_loop, loop_gain, margins, sensitivity_peak
 from pmdc_jax.control.metrics import smooth_overshoot, smooth_settling
 from pmdc_jax.control.spread import drawn_motors, even_spread
-from pmdc_jax.effects import EFFECTS
+from pmdc_jax.effects import EFFECTS, SpeedSensorDelay, SpeedSensorLag
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.motor_file import Uncertainty
 from pmdc_jax.simulate.propagator import steps_within
@@ -451,6 +451,34 @@ def test_margins_match_python_control(delay):
     assert found.delay_margin_s == pytest.approx(np.radians(phase) / crossing, rel=1e-3)
 
 
+@pytest.mark.parametrize("lag", [0.0, 4e-3])
+@pytest.mark.parametrize("late", [0.0, 2.0, 2.4])
+def test_margins_of_a_loop_with_a_slow_speed_sensor_match_python_control(lag, late):
+    """`late`, in samples: between two samples the sensor is interpolated linearly."""
+    step, states = 1e-3, state_space(PAPER)
+    effects = [SpeedSensorLag(time_constant_s=lag)] * (lag > 0)
+    effects += [SpeedSensorDelay(delay_s=late * step)] * (late > 0)
+    law = Law.of(PI(0.1, 5.0, 1.0, 0.01), Hardware(step, 30.0, None, None, 0), MOTOR)
+    motor = ct.ss(states[0], states[1][:, :1], [[0, 1]], 0)
+    sensed = (motor if lag == 0 else ct.series(motor, ct.tf2ss([1], [lag, 1]))).sample(step)
+    whole, share = divmod(late, 1)
+    late_element = ct.tf([1 - share, share], [1, *(0,) * (int(whole) + 1)], step)
+    loop = ct.ss2tf(sensed) * (0.1 + ct.tf([step * 5.0], [1, -1], step)) * late_element
+    angle = np.geomspace(1e-3, np.pi, 2000)
+    gains = loop(np.exp(1j * angle))
+    gain, phase, _, _, crossing, _ = ct.stability_margins(ct.frd(gains, angle / step, smooth=True))
+    peak = np.max(1 / np.abs(1 + gains))
+    sensing = MOTOR.with_effects(effects)
+    found = margins(sensing, law)
+    assert found.stable
+    assert found.gain_margin == pytest.approx(gain, rel=1e-3)
+    assert found.phase_margin_deg == pytest.approx(phase, rel=1e-3)
+    assert found.delay_margin_s == pytest.approx(np.radians(phase) / crossing, rel=1e-3)
+    assert found.sensitivity_peak == pytest.approx(peak, rel=1e-3)
+    at_few_frequencies = float(sensitivity_peak(linear_loop(sensing, law)))
+    assert at_few_frequencies == pytest.approx(peak, rel=2e-2)
+
+
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("delay", [0, 1])
 def test_at_the_gain_margin_the_loop_becomes_unstable(name, delay):
@@ -486,11 +514,13 @@ def test_the_sensitivity_peak_matches_the_loop_gain():
         assert float(sensitivity_peak(loop)) == pytest.approx(direct, rel=1e-8)
 
 
-def test_noise_amplification_matches_a_simulation_with_noise():
+@pytest.mark.parametrize("late", [0.0, 1.3])
+def test_noise_amplification_matches_a_simulation_with_noise(late):
     law = Law.of(LAWS["pid"], Hardware(1e-3, 1000.0, None, None, 1), MOTOR)
+    motor = MOTOR.with_effects([SpeedSensorDelay(delay_s=late * 1e-3)] * (late > 0))
     noise = jnp.asarray(np.random.default_rng(0).standard_normal(40_000))
     steady = Course(jnp.full(40_000, 300.0), jnp.zeros(40_000), noise, 300.0)
-    response, found = run(MOTOR, law, steady), margins(MOTOR, law)
+    response, found = run(motor, law, steady), margins(motor, law)
     assert float(jnp.std(response.voltage)) == pytest.approx(found.voltage_per_noise, rel=0.03)
     assert float(jnp.std(response.speed)) == pytest.approx(found.speed_per_noise, rel=0.05)
 

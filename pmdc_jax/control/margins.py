@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from attrs import frozen
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from ..effects.base import State
-from ..motor import Motor
-from .law import Law, LawState, SampledMotor
+from ..motor import Drive, Motor
+from ..simulate.propagator import make_propagator, state_of
+from .law import Law, LawState
 
 FREQUENCIES = 48  # at which a tuning evaluates the sensitivity
 
@@ -22,13 +23,19 @@ Vector = Float[Array | np.ndarray, " n"]
 
 class Loop(NamedTuple):
     """The loop, opened at the motor's terminals, over one sample: z[k+1] = A z + B v + N n. The law would apply the
-    voltage C z + D n; n is an error of the measured speed."""
+    voltage C z + D n; n is an error of the measured speed Y z.
+
+    All for a sensor without delay. Behind one, the law sees that speed `late` samples later, interpolated linearly:
+    like an error, with N and D, of the difference.
+    """
 
     A: Matrix
     B: Vector
     C: Vector
     N: Vector
     D: Float[Array | np.ndarray, ""]
+    Y: Vector
+    late: Float[Array | np.ndarray, ""] | None
 
     @property
     def closed(self) -> Matrix:
@@ -37,40 +44,72 @@ class Loop(NamedTuple):
 
 
 def linear_loop(motor: Motor, law: Law) -> Loop:
-    """The loop linearised at rest, with the motor's linear part. The law itself is linear until its limits bind, so
-    its derivatives describe it exactly."""
-    model = SampledMotor.of(motor, law.hardware.sample_time)
+    """The loop linearised at rest, with the motor's linear part and its sensors. The law itself is linear until its
+    limits bind, so its derivatives describe it exactly."""
+    step = jnp.asarray(law.hardware.sample_time, float)
+    motor = motor.with_effects(e for e in motor.effects if e.equation == "sensor")
+    transition, drive, *_ = make_propagator(motor, step, Drive())
+    motor_size, delay = len(transition), motor.speed_delay()
     at_rest = State(jnp.zeros(()), jnp.zeros(()), {})
     law_state = law.start(0.0, at_rest, jnp.zeros(()))
     leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, law_state))
 
     def sample(inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
-        current, speed, *law_leaves, voltage, error = inputs
+        x, (*law_leaves, voltage, error) = inputs[:motor_size], inputs[motor_size:]
         state: LawState = jax.tree.unflatten(tree, law_leaves)
+        current, speed = motor.sensors(state_of(motor, tuple(x), {}))
         next_state, decided = law.step(state, 0.0, speed + error, current)
         acting = state.voltage if law.hardware.delay else decided
-        motion = model.next(current, speed, voltage)
-        return jnp.stack([*motion, *jax.tree.leaves(next_state), acting])
+        motion = transition @ x + drive[:, 0] * voltage
+        return jnp.stack([*motion, *jax.tree.leaves(next_state), acting, speed])
 
-    size = 2 + len(leaves)
+    size = motor_size + len(leaves)
     jacobian = jax.jacfwd(sample)(jnp.zeros(size + 2))
-    A, B, N = jacobian[:size, :size], jacobian[:size, size], jacobian[:size, size + 1]
-    return Loop(A, B, jacobian[size, :size], N, jacobian[size, size + 1])
+    of_state, by_voltage, by_error = jacobian[:, :size], jacobian[:, size], jacobian[:, size + 1]
+    return Loop(
+        of_state[:size],
+        by_voltage[:size],
+        of_state[size],
+        by_error[:size],
+        by_error[size],
+        of_state[size + 1],
+        None if delay is None else delay / step,
+    )
 
 
 def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
     """Largest |S| = |1 / (1 + loop gain)| over frequency: 1 / distance of the loop gain from -1.
 
-    S(z) = det(z - A) / det(z - A_closed), as polynomials in z - 1 to avoid cancellation at short sample times.
+    S(z) = det(z - A) / det(z - A_closed), as polynomials in z - 1 to avoid cancellation at short sample times. A delay
+    of the sensor changes both matrices by a multiple of a matrix of rank 1, and the determinants in proportion.
     """
     eye = jnp.eye(loop.A.shape[0])
     angle = jnp.asarray(np.geomspace(1e-3, np.pi, FREQUENCIES))
     z_minus_1 = jnp.exp(1j * angle) - 1
-    opened, closed = (
-        jnp.polyval(_characteristic_polynomial(matrix - eye).astype(z_minus_1.dtype), z_minus_1)
-        for matrix in (loop.A, loop.closed)
-    )
+
+    def determinant(matrix: Matrix) -> Complex[Array, " frequencies"]:
+        polynomial = _characteristic_polynomial(matrix - eye)
+        return jnp.polyval(polynomial.astype(z_minus_1.dtype), z_minus_1)
+
+    def seen_late(matrix: Matrix, by_error: Vector) -> Complex[Array, " frequencies"]:
+        in_time = determinant(matrix)
+        if loop.late is None:
+            return in_time
+        unseen = determinant(matrix - by_error[:, None] * loop.Y)
+        return unseen + _delay(angle, loop.late) * (in_time - unseen)
+
+    opened = seen_late(loop.A, loop.N)
+    closed = seen_late(loop.closed, loop.N + loop.B * loop.D)
     return jnp.max(jnp.abs(opened) / jnp.maximum(jnp.abs(closed), 1e-300))
+
+
+def _delay(
+    angle: Float[Array | np.ndarray, " frequencies"], samples: Float[Array | np.ndarray, ""]
+) -> Complex[Array, " frequencies"]:
+    """Frequency response of a delay of the sensor, linearly interpolated between samples."""
+    whole = jnp.floor(samples)
+    between = 1 + (samples - whole) * (jnp.exp(-1j * angle) - 1)
+    return jnp.exp(-1j * angle * whole) * between
 
 
 def _characteristic_polynomial(matrix: Matrix) -> Float[Array, " n+1"]:
@@ -103,14 +142,15 @@ class Margins:
 
 def margins(motor: Motor, law: Law) -> Margins:
     """Margins of the loop within its limits, and its amplification of white noise on the measured speed."""
-    loop = _without_unused_states(Loop(*map(np.asarray, linear_loop(motor, law))))
+    loop = _without_unused_states(jax.tree.map(np.asarray, linear_loop(motor, law)))
     step = float(law.hardware.sample_time)
-    closed = np.asarray(loop.closed)
+    delayed = _with_delay_line(loop)
+    closed = np.asarray(delayed.closed)
     if np.abs(np.linalg.eigvals(closed)).max() >= 1 - 1e-12:
         return Margins(False, None, None, None, None, None, None)
     angle = np.geomspace(1e-5, np.pi, 20_000)
     gain = loop_gain(loop, angle)
-    covariance = _stationary_covariance(closed, np.asarray(loop.N + loop.B * loop.D))
+    covariance = _stationary_covariance(closed, np.asarray(delayed.N + delayed.B * delayed.D))
     phase, delay = _phase_and_delay_margin(angle, gain, step)
     return Margins(
         stable=True,
@@ -118,7 +158,7 @@ def margins(motor: Motor, law: Law) -> Margins:
         phase_margin_deg=phase,
         delay_margin_s=delay,
         sensitivity_peak=float(np.max(1 / np.abs(1 + gain))),
-        voltage_per_noise=float(np.sqrt(loop.C @ covariance @ loop.C + loop.D**2)),
+        voltage_per_noise=float(np.sqrt(delayed.C @ covariance @ delayed.C + delayed.D**2)),
         speed_per_noise=float(np.sqrt(covariance[1, 1])),
     )
 
@@ -133,16 +173,44 @@ def _without_unused_states(loop: Loop) -> Loop:
     )
     depends = np.linalg.matrix_power(direct, len(direct))
     needed = (depends[:2] > 0).any(axis=0) | ((loop.C != 0) @ depends > 0)
-    A, B, C, N, D = loop
-    return Loop(A[np.ix_(needed, needed)], B[needed], C[needed], N[needed], D)
+    A, B, C, N, D, Y, late = loop
+    return Loop(A[np.ix_(needed, needed)], B[needed], C[needed], N[needed], D, Y[needed], late)
+
+
+def _with_delay_line(loop: Loop) -> Loop:
+    """The loop with the last measured speeds as further states, of which the law sees one, or the mean of two."""
+    if loop.late is None:
+        return loop
+    A, B, C, N, D, Y, _ = loop
+    late = float(loop.late)
+    whole = int(late)
+    # of the measured speeds, the latest first
+    weights = np.zeros(whole + 2)
+    weights[whole:] = 1 - (late - whole), late - whole
+    line, none = np.eye(whole + 1, k=-1), np.zeros(whole + 1)
+    latest = np.outer(np.eye(whole + 1)[0], Y)
+    unseen = (weights[0] - 1) * Y
+    return Loop(
+        np.block([[A + np.outer(N, unseen), np.outer(N, weights[1:])], [latest, line]]),
+        np.append(B, none),
+        np.append(C + D * unseen, D * weights[1:]),
+        np.append(N, none),
+        D,
+        np.append(Y, none),
+        None,
+    )
 
 
 def loop_gain(loop: Loop, angle: np.ndarray) -> np.ndarray:
     """-C (e^j angle - A)^-1 B, the loop gain under negative feedback; `angle` in radians per sample."""
-    A, B, C = (np.asarray(x) for x in loop[:3])
+    A, B, C, N, D, Y = (np.asarray(x) for x in loop[:6])
     resolvent = np.exp(1j * angle)[:, None, None] * np.eye(len(A)) - A
+    if loop.late is not None:
+        unseen = (np.asarray(_delay(angle, loop.late)) - 1)[:, None] * Y
+        resolvent = resolvent - N[:, None] * unseen[:, None, :]
+        C = C + D * unseen
     states = np.linalg.solve(resolvent, np.broadcast_to(B[:, None], (len(angle), len(A), 1)))
-    return -(C @ states)[:, 0]
+    return -np.sum(C * states[:, :, 0], -1)
 
 
 def _gain_margin(gain: np.ndarray) -> float | None:
