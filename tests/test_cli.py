@@ -114,6 +114,13 @@ def test_importing_the_command_line_imports_nothing_heavy():
     assert not set(HEAVY) & set(shown.stdout.split())
 
 
+def test_the_module_returns_the_status_of_the_command():
+    run = [sys.executable, "-m", "pmdc_jax", "identify", "missing.csv"]
+    done = subprocess.run(run, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("pmdc: missing.csv: ")
+
+
 def test_identify_passes_on_every_option(faked, capsys):
     arguments = (
         "identify a.csv b.csv --holdout c.csv --seed 7 --column speed=rpm_meas:rpm --tie Kt=Kb"

@@ -141,6 +141,11 @@ INVALID = {
         json.dumps(VALID | {"format": "pmdc controller 1"}),
         "Give the motor file that pmdc identify --save wrote",
     ),
+    "another unit": (
+        file_with("units", to={"R": "ohm", "L": "mH"}),
+        "the unit of L is 'mH', but values are read in H",
+    ),
+    "units a text": (file_with("units", to="SI"), "units"),
     "status a text": (json.dumps(VALID | {"status": "identified"}), "status"),
 }
 

@@ -16,6 +16,7 @@ from linear_motor import PAPER
 from pmdc_jax import InputError, cli, load_controller, load_uncertainty, save_motor, tune
 from pmdc_jax.control.specification import LoopRequirements
 from pmdc_jax.control.tuning import Tuning, robustness
+from pmdc_jax.effects import CoggingTorque, SpeedSensorDelay
 from pmdc_jax.motor import Motor
 from pmdc_jax.report.notation import NARROW_SPACE
 from pmdc_jax.report.tuning import _current_sentence, summary, tuning_json, write_tuning_report
@@ -142,6 +143,25 @@ def test_slow_sampling_is_noted(sample_time, noted):
     assert any("takes 2.2 samples of 0.02 s" in note for note in notes) == noted
 
 
+SLOW_EFFECTS = {
+    # 20 delays of the sensor; two of the 12 periods in each turn, at half the set point
+    "a late sensor": (SpeedSensorDelay(delay_s=0.02), 300.0, 0.4),
+    "teeth": (CoggingTorque(amplitude_Nm=1e-3, phase_rad=0.0, periods=12.0), 5.0, 0.42),
+}
+
+
+@pytest.mark.parametrize(
+    ("effect", "setpoint", "least"), SLOW_EFFECTS.values(), ids=SLOW_EFFECTS.keys()
+)
+def test_a_loop_is_judged_for_as_long_as_its_effects_last(effect, setpoint, least):
+    requirements = LoopRequirements("pi", setpoint, voltage_limit=30.0, sample_time=1e-3)
+    with jax.enable_x64(True):
+        plain, slow = (
+            requirements.completed(motor) for motor in (MOTOR, MOTOR.with_effects([effect]))
+        )
+    assert 1e-3 * slow.part_samples > least > 1e-3 * plain.part_samples
+
+
 IMPOSSIBLE = {
     "voltage": (
         {"setpoint": 481.0, "voltage_limit": 24.0},
@@ -171,6 +191,7 @@ IMPOSSIBLE = {
         {"setpoint": 481.0, "voltage_limit": 30.0, "sample_time": 1.0},
         "1 s is far longer than the motor's transients, 0.0441 s",
     ),
+    "spread": ({"spread": 5.0}, "a spread of 500 % is not between 0 and 100 %"),
     "controller": ({"controller": "fuzzy"}, "unknown controller 'fuzzy'"),
 }
 

@@ -53,6 +53,10 @@ SECOND_OVERSHOOT_WEIGHT = 0.15
 RATIO_COST_LIMIT = 0.3
 COST_PER_PERCENT = 0.3
 
+# Excess of the sensitivity over its limit costs its ratio to that, and beyond EXCESS_TO_AVOID so many times as much:
+# where nothing settles, as with strong cogging at low speed, that is no reason for a loop that nearly oscillates
+EXCESS_TO_AVOID, AVOIDED_EXCESS_WEIGHT = 0.2, 10.0
+
 # Settling time assigned to a loop that never settles, over that scale: longer than a part of the task.
 UNSETTLED_TIME = 10.0
 # Share of the motors, those of highest cost, whose mean makes half of the cost: covers the tail beyond the 95th
@@ -240,7 +244,8 @@ def cost(task: Task, score: Score, strictness: Strictness) -> Float[Array, ""]:
     if task.max_sensitivity is None:
         return _mean_and_tail(costs)
     excess = score.sensitivity / task.max_sensitivity - strictness.allowed_sensitivity
-    return _mean_and_tail(costs) + jax.nn.relu(excess)
+    avoided = AVOIDED_EXCESS_WEIGHT * jax.nn.relu(excess - EXCESS_TO_AVOID)
+    return _mean_and_tail(costs) + jax.nn.relu(excess) + avoided
 
 
 def overshoot_cost(overshoot: Number, allowed: Number) -> Number:

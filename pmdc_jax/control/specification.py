@@ -15,6 +15,7 @@ from .controllers import CONTROLLERS
 from .feasibility import check_reachable, check_settling, default_load_torque
 from .hardware import Hardware
 from .loop import REMEMBERED_SAMPLES
+from .objective import SECOND_SETPOINT
 from .steady import steady_state
 from .time_optimal import fastest_settling
 
@@ -30,9 +31,10 @@ NO_OVERSHOOT = 0.01  # %; less is none
 # Dead times of a loop in the shortest settling that it can have
 LOOP_DEAD_TIMES = 4
 # Duration of each part of the task: at least 2.5 times the fastest settling, and at least the fastest settling plus 20
-# dead times of the loop.
+# dead times of the loop, and plus two periods of a torque that depends on the angle, at half the set point
 PART_SETTLINGS = 2.5
 PART_DEAD_TIMES = 20
+PART_TORQUE_PERIODS = 2
 MIN_SAMPLES = 32  # in each part of the task
 MAX_SAMPLES = 20_000  # in each part of the task
 
@@ -70,8 +72,11 @@ class LoopRequirements:
             raise InputError("--delay", message, "Choose 0 or 1")
         _check_number("setpoint", self.setpoint, "a nonzero speed", lambda x: x != 0)
         _check_number("load_torque", self.load_torque, "a number", lambda x: True)
-        for name in ("max_overshoot", "speed_noise", "recorded_noise", "spread"):
+        for name in ("max_overshoot", "speed_noise", "recorded_noise"):
             _check_number(name, getattr(self, name), "a number of at least 0", lambda x: x >= 0)
+        if self.spread is not None and not 0 <= self.spread <= 1:
+            message = f"a spread of {100 * self.spread:g} % is not between 0 and 100 %"
+            raise InputError("--spread", message, "Give the standard deviation of each parameter")
         for name in ("voltage_limit", "current_limit", "sample_time", "max_settling", "speed_step"):
             _check_number(name, getattr(self, name), "a positive number", lambda x: x > 0)
         _check_number("max_sensitivity", self.max_sensitivity, "a positive number", lambda x: x > 0)
@@ -111,7 +116,9 @@ class LoopRequirements:
             else self.load_torque,
             fastest_settling=fastest,
             settling_scale=max(fastest, LOOP_DEAD_TIMES * dead_time),
-            part_samples=_part_samples(fastest, dead_time, sample_time),
+            part_samples=_part_samples(
+                fastest, dead_time, _torque_period(motor, setpoint), sample_time
+            ),
             notes=(*limit_notes, *sampling_notes),
         )
 
@@ -199,14 +206,25 @@ def _check_number(
 
 
 def _dead_time(motor: Motor, sample_time: float, delay: int) -> float:
-    """The hold of a loop, its delay and a quarter of the electrical time constant together, s: no loop is much
-    faster."""
-    return float(motor.L / motor.R) / 4 + (1 + delay) * sample_time
+    """The hold of a loop, its delay, that of the speed sensor and a quarter of the electrical time constant together,
+    s: no loop is much faster."""
+    of_sensor = motor.speed_delay()
+    sensed = 0.0 if of_sensor is None else float(of_sensor)
+    return float(motor.L / motor.R) / 4 + (1 + delay) * sample_time + sensed
 
 
-def _part_samples(fastest: float, dead_time: float, sample_time: float) -> int:
+def _torque_period(motor: Motor, setpoint: float) -> float:
+    """The longest period, s, of a torque that depends on the angle, at half the set point; zero without one."""
+    angles = [float(e.repeats_after().get("angle", 0.0)) for e in motor.effects]
+    return max(angles, default=0.0) / (SECOND_SETPOINT * abs(setpoint))
+
+
+def _part_samples(
+    fastest: float, dead_time: float, torque_period: float, sample_time: float
+) -> int:
     """Samples in one part of the task, rounded up to 2^k or 1.5 2^k so that few shapes are compiled."""
-    duration = max(PART_SETTLINGS * fastest, fastest + PART_DEAD_TIMES * dead_time)
+    more = max(PART_DEAD_TIMES * dead_time, PART_TORQUE_PERIODS * torque_period)
+    duration = max(PART_SETTLINGS * fastest, fastest + more)
     needed = max(MIN_SAMPLES, math.ceil(duration / sample_time))
     if needed > MAX_SAMPLES:
         raise InputError(

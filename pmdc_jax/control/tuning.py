@@ -51,6 +51,8 @@ MIN_TUNING_NOISE, MAX_RECORDED_NOISE = 2e-4, 5e-3
 OVERSHOOT_TO_REPORT = 1.2
 SENSITIVITY_TO_REPORT = 1.1
 CURRENT_TO_REPORT = 1.02
+# Kt over Kb, or its inverse, from which one of them must be in another unit: in SI they differ by iron losses
+CONSTANTS_RATIO_TO_REPORT = 3.0
 
 
 @frozen
@@ -351,6 +353,7 @@ def _undetermined_remark(uncertainty: Uncertainty | None) -> Iterator[str]:
 def _remarks(result: Tuning) -> Iterator[str]:
     """Messages on unmet requirements, and warnings."""
     yield from _unmet_requirements(result)
+    yield from _constants_remark(result.motor)
     yield from _small_step_remark(result)
     peak = result.margins.sensitivity_peak
     if peak is not None and peak > SENSITIVITY_TO_REPORT * MAX_SENSITIVITY:
@@ -360,6 +363,16 @@ def _remarks(result: Tuning) -> Iterator[str]:
         yield (
             f"the current reaches {result.peak_current:.3g} A in simulation, beyond its limit of {limit:g} A, because"
             " the controller limits that of the motor without its effects: choose a lower limit"
+        )
+
+
+def _constants_remark(motor: Motor) -> Iterator[str]:
+    """A message where the constants of torque and back-EMF cannot be those of one motor."""
+    ratio = float(motor.Kt / motor.Kb)
+    if max(ratio, 1 / ratio) > CONSTANTS_RATIO_TO_REPORT:
+        yield (
+            f"Kt is {ratio:.2g} times Kb, whereas they are about equal in SI (N m/A and V s/rad): check their units in"
+            " the motor file"
         )
 
 

@@ -12,6 +12,7 @@ from rich.text import Text
 from ..control.controller_file import gains_of, law_content
 from ..control.evaluation import SMALL_STEP, EvaluatedController, Robustness
 from ..control.objective import SECOND_SETPOINT
+from ..control.specification import NO_OVERSHOOT
 from ..control.tuning import CURRENT_TO_REPORT, Tuning
 from .notation import NARROW_SPACE, UNKNOWN, percent, pretty_unit, significant
 from .terminal import plain_table
@@ -110,8 +111,14 @@ def _step_sentence(tuning: Tuning) -> str:
     return (
         f"Settles at {tuning.setpoint:g} rad/s in {_time_text(settling)},"
         f" {significant(ratio)} times the fastest possible with {_limits_text(tuning)}"
-        f" ({_time_text(tuning.fastest_possible_settling)}), with {percent(overshoot)} overshoot."
+        f" ({_time_text(tuning.fastest_possible_settling)}), {_overshoot_words(overshoot)}."
     )
+
+
+def _overshoot_words(overshoot: float | None) -> str:
+    if overshoot is not None and overshoot < NO_OVERSHOOT:
+        return "without overshoot"
+    return f"with {percent(overshoot)} overshoot"
 
 
 def _limits_text(tuning: Tuning) -> str:
