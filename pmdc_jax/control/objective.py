@@ -55,7 +55,7 @@ COST_PER_PERCENT = 0.3
 
 # Excess of the sensitivity over its limit costs its ratio to that, and beyond EXCESS_TO_AVOID so many times as much:
 # where nothing settles, as with strong cogging at low speed, that is no reason for a loop that nearly oscillates
-EXCESS_TO_AVOID, AVOIDED_EXCESS_WEIGHT = 0.2, 10.0
+EXCESS_TO_AVOID, AVOIDED_EXCESS_WEIGHT = 0.5, 10.0
 
 # Settling time assigned to a loop that never settles, over that scale: longer than a part of the task.
 UNSETTLED_TIME = 10.0
