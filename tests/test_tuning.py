@@ -71,6 +71,8 @@ def test_the_tuned_loop_is_robust_over_drawn_motors():
     assert ours.robust.Overshoot_p95 <= 1.0
     assert ours.robust.Overshoot_p95 < textbook.robust.Overshoot_p95
     assert ours.robust.SettlingTime_p95 < textbook.robust.SettlingTime_p95
+    # the law limits the current of the nominal motor, not that of one with less resistance
+    assert 1.0 < ours.robust.PeakCurrent_p95 / example().peak_current < 1.25
     again = robustness(example(), spread=0.05, seed=0)  # the same motors, later
     assert again.overshoot.tolist() == ours.robust.overshoot.tolist()
 
@@ -93,7 +95,8 @@ def test_json_has_the_documented_keys(tmp_path):
         "SteadyStateError",
     }
     assert 0.04 < content["fastest_possible_settling_s"] < 0.05
-    assert set(content["robust"]) == {"samples", "Overshoot_p95", "SettlingTime_p95"}
+    percentiles = {"Overshoot_p95", "SettlingTime_p95", "PeakCurrent_p95"}
+    assert set(content["robust"]) == {"samples", *percentiles}
 
 
 @pytest.mark.slow

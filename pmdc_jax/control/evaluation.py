@@ -32,6 +32,7 @@ class Robustness:
     samples: int
     Overshoot_p95: float | None
     SettlingTime_p95: float | None
+    PeakCurrent_p95: float | None  # A, in the steps and under load
     overshoot: np.ndarray = field(repr=False)  # of each motor, %; infinite if it diverges
     settling: np.ndarray = field(repr=False)  # of each motor, s; infinite where it never settles
 
@@ -125,7 +126,15 @@ def evaluate_robustness(
     score: Score = _exact_score(task, model, motors, controller)
     settling = np.nan_to_num(np.asarray(score.settling), nan=np.inf)
     overshoot = np.nan_to_num(np.asarray(score.overshoot), nan=np.inf)
-    return Robustness(len(settling), _p95(overshoot), _p95(settling), overshoot, settling)
+    current = np.nan_to_num(np.asarray(score.peak_current), nan=np.inf)
+    return Robustness(
+        samples=len(settling),
+        Overshoot_p95=_p95(overshoot),
+        SettlingTime_p95=_p95(settling),
+        PeakCurrent_p95=_p95(current),
+        overshoot=overshoot,
+        settling=settling,
+    )
 
 
 def _p95(values: np.ndarray) -> float | None:

@@ -137,7 +137,8 @@ class Score(NamedTuple):
     `settling`, s, and `overshoot`, %, of the step; `recovery` from the load, s; `second_settling`, s, and
     `second_overshoot`, %, of the second step; `tracking_error`, mean of |w / r - 1| over all parts; `steady_error`, its
     means over the ends of the step and of the load step, summed; `effort`, mean change of voltage from sample to
-    sample, over the voltage limit; `sensitivity`, peak over frequency, with the first motor.
+    sample, over the voltage limit; `peak_current`, A, the largest in all parts; `sensitivity`, peak over frequency,
+    with the first motor.
     """
 
     settling: PerMotor
@@ -148,6 +149,7 @@ class Score(NamedTuple):
     tracking_error: PerMotor
     steady_error: PerMotor
     effort: PerMotor
+    peak_current: PerMotor
     sensitivity: Scalar
 
 
@@ -217,6 +219,7 @@ def _score(
             "tracking_error": jnp.mean(errors),
             "steady_error": jnp.sum(jnp.mean(errors[:2, -steady_instants:], axis=1)),
             "effort": jnp.mean(changes) / task.hardware.voltage_limit,
+            "peak_current": jnp.max(jnp.abs(response.current)),
         }
 
     nominal = jax.tree.map(lambda leaf: leaf[0], motors)

@@ -87,6 +87,7 @@ def _robust_json(robust: Robustness | None) -> dict[str, Any] | None:
         "samples": robust.samples,
         "Overshoot_p95": robust.Overshoot_p95,
         "SettlingTime_p95": robust.SettlingTime_p95,
+        "PeakCurrent_p95": robust.PeakCurrent_p95,
     }
 
 
@@ -95,7 +96,7 @@ def summary(tuning: Tuning) -> list[str]:
     sentences = (
         _step_sentence(tuning),
         _load_sentence(tuning),
-        _robust_sentence(tuning.robust),
+        _robust_sentence(tuning.robust, tuning.requirements.current_limit),
         _margin_sentence(tuning),
         _noise_sentence(tuning),
         _current_sentence(tuning.peak_current, tuning.requirements.current_limit),
@@ -147,15 +148,18 @@ def _load_sentence(tuning: Tuning) -> str:
     )
 
 
-def _robust_sentence(robust: Robustness | None) -> str:
+def _robust_sentence(robust: Robustness | None, current_limit: float | None) -> str:
     if robust is None:
         return ""
+    current = ""
+    if _current_excess(robust.PeakCurrent_p95 or 0.0, current_limit) > CURRENT_TO_REPORT - 1:
+        current = f"; 95 % draw at most {significant(robust.PeakCurrent_p95)} A"
     slow = "more than 5 % do not settle"
     if robust.SettlingTime_p95 is not None:
         slow = f"95 % settle within {_time_text(robust.SettlingTime_p95)}"
     return (
         f"Of {robust.samples} motors drawn from the uncertainty, {slow}"
-        f" and 95 % overshoot by at most {percent(robust.Overshoot_p95)}."
+        f" and 95 % overshoot by at most {percent(robust.Overshoot_p95)}{current}."
     )
 
 

@@ -71,12 +71,14 @@ def other_timings(prepared: Prepared, fit: Fit) -> list[Timing]:
     trials = _Trials(prepared, fit)
     proposed = [*_at_samples(prepared, fit), *_by_electrical_equation(trials)]
     plausible, score = _likelier(trials, proposed), trials.negative_log_likelihood
+    if any(run.load is not None for run in prepared.training):
+        plausible = [
+            t if t.reading else min(t, t._replace(load=True), key=score) for t in plausible
+        ]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     likely = [timing for timing in plausible if not timing.current_mean]
     means = [timing for timing in plausible if timing.current_mean]
     likely += trials.likelier(means, min(map(score, likely), default=np.inf))
-    if any(run.load is not None for run in prepared.training):
-        likely = [t if t.reading else min(t, t._replace(load=True), key=score) for t in likely]
     return sorted(likely, key=score)
 
 
