@@ -113,7 +113,10 @@ def load_motor(path: str | Path) -> Motor:
     **Raises**: `InputError` if the file is missing, is not JSON, or has missing or invalid entries.
     """
     where, content = str(path), _content(path)
-    _check_units(where, content.get("units", {}))
+    for name, unit in content.get("units", {}).items():
+        if unit != PARAMETERS.get(name, unit):
+            what = f"the unit of {name} is {unit!r}, but values are read in {PARAMETERS[name]}"
+            raise InputError(where, what, f"Convert the value to {PARAMETERS[name]}")
     constants = _numbers(where, content["parameters"], PARAMETERS, "parameters")
     return Motor(**constants, effects=_effects(where, content.get("effects", [])))
 
@@ -122,20 +125,10 @@ def _content(path: str | Path) -> dict[str, Any]:
     where, content = str(path), read_object(path, FORMAT, MEND)
     if not isinstance(content.get("parameters"), dict):
         raise InputError(where, 'has no "parameters"', MEND)
-    for name in ("status", "noise"):
+    for name in ("status", "noise", "units"):
         if not isinstance(content.get(name, {}), dict):
             raise InputError(where, f'"{name}" is not an object', MEND)
     return content
-
-
-def _check_units(where: str, units: object) -> None:
-    """Raise an `InputError` if the file states another unit than that in which its values are read."""
-    if not isinstance(units, dict):
-        raise InputError(where, f'"units" is {units!r}, not an object', "Leave it out")
-    for name, unit in units.items():
-        if unit != PARAMETERS.get(name, unit):
-            what = f"the unit of {name} is {unit!r}, but values are read in {PARAMETERS[name]}"
-            raise InputError(where, what, f"Convert the value to {PARAMETERS[name]}")
 
 
 def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:

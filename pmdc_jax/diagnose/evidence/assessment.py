@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...effects import EFFECTS, CoggingTorque, TorqueRipple
+from ...effects import EFFECTS
 from ...effects.base import AbstractEffect
 from ..hypotheses.effect_relations import CONTAINS, FULLER, unbalanced_equation
 from ..hypotheses.library import Curve
@@ -145,10 +145,11 @@ class Assessment(NamedTuple):
         clearest = self.clearest.candidate
         if clearest is None or not clearest.own_phase:
             return False
+        angle = 2 * np.pi / clearest.columns[0]["periods"]
         ratios = [
-            clearest.columns[0]["periods"] / float(effect.periods)
+            float(effect.repeats_after()["angle"]) / angle
             for effect in model.motor.effects
-            if effect.name == clearest.effect and isinstance(effect, CoggingTorque | TorqueRipple)
+            if effect.name == clearest.effect
         ]
         return any(r > 1.5 and abs(r - round(r)) < MAX_DETUNING for r in ratios)
 

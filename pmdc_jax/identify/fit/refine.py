@@ -112,7 +112,8 @@ def _solver(tolerance: Float[Array, ""]) -> optx.LevenbergMarquardt:
 
 
 def _first_state(solver: optx.LevenbergMarquardt, start: Columns) -> Any:
-    model = (start, jnp.zeros(2 * (len(start) + 1,)))
+    rows = len(start) + 1
+    model = (start, jnp.zeros((rows, rows)))
     residuals, _ = jax.eval_shape(_linearised, start, model)
     return solver.init(_linearised, start, model, SOLVER_OPTIONS, residuals, None, frozenset())
 
