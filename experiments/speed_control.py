@@ -19,8 +19,9 @@ from rich.table import Table
 from pmdc_jax.control import fastest_settling, step_metrics
 from pmdc_jax.control.continuous import continuous_loop
 from pmdc_jax.control.evaluation import Robustness
+from pmdc_jax.control.pipeline import VALIDATION_MOTORS, robustness, tune
 from pmdc_jax.control.spread import drawn_motors, even_spread
-from pmdc_jax.control.tuning import VALIDATION_MOTORS, Tuning, robustness, tune
+from pmdc_jax.control.tuning import Tuning
 from pmdc_jax.wheelchair import PRINTED, SETPOINT
 
 KINDS = ("pi", "pid", "state-feedback")

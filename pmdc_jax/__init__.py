@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .control.controller_file import load_controller, save_controller
     from .control.export import export
+    from .control.pipeline import tune
     from .control.time_optimal import fastest_settling
-    from .control.tuning import Tuning, tune
+    from .control.tuning import Tuning
     from .demo import demo
     from .diagnose.diagnosis import Diagnosis
     from .diagnose.pipeline import diagnose
@@ -47,7 +48,7 @@ _HOME = {
     "save_controller": "control.controller_file",
     "save_motor": "motor_file",
     "simulate": "simulate",
-    "tune": "control.tuning",
+    "tune": "control.pipeline",
     "write_recording": "recordings.recording_file",
 }
 

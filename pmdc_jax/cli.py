@@ -227,7 +227,7 @@ def tune(
     from .files import check_outputs
 
     check_outputs({"--save": save, "--json": json, "--report": report}, [motor])
-    from .control.tuning import tune
+    from .control.pipeline import tune
     from .report.terminal import print_messages, progress
 
     with progress() as on_progress:

@@ -36,7 +36,7 @@ def demo(
     """
     folder = result_folder(Path(out), FILES[0])
     from .control.controller_file import save_controller
-    from .control.tuning import tune
+    from .control.pipeline import tune
     from .diagnose import diagnose
     from .motor_file import save_motor
     from .report.diagnosis import write_diagnosis_report

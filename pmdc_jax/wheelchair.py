@@ -92,8 +92,8 @@ class Paper:
 
 def reproduce(progress: ReportProgress | None = None) -> Paper:
     """Reproduce all tables and figures of the paper."""
+    from .control.pipeline import tune
     from .control.time_optimal import fastest_settling
-    from .control.tuning import tune
 
     report = progress or silent
     report("recovering Table 1", fraction=0.0)

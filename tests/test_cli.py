@@ -322,7 +322,7 @@ def faked_tuning(monkeypatch):
     def write(path, content=None):
         Path(path).write_text("")
 
-    replace_function(monkeypatch, "pmdc_jax.control.tuning", "tune", tune)
+    replace_function(monkeypatch, "pmdc_jax.control.pipeline", "tune", tune)
     replace_function(monkeypatch, "pmdc_jax.control.controller_file", "save_controller", write)
     report = "pmdc_jax.report.tuning"
     replace_function(monkeypatch, report, "write_tuning_report", lambda tuning, path: write(path))

@@ -14,8 +14,9 @@ from attrs import evolve
 from linear_motor import PAPER
 
 from pmdc_jax import InputError, cli, load_controller, load_uncertainty, save_motor, tune
+from pmdc_jax.control.pipeline import robustness
 from pmdc_jax.control.specification import LoopRequirements
-from pmdc_jax.control.tuning import Tuning, robustness
+from pmdc_jax.control.tuning import Tuning
 from pmdc_jax.effects import CoggingTorque, SpeedSensorDelay
 from pmdc_jax.motor import Motor
 from pmdc_jax.report.notation import NARROW_SPACE
@@ -266,7 +267,7 @@ def test_the_command_writes_the_requested_files(motor_file, capsys, monkeypatch)
         given.update(motor=motor, controller=controller, **options)
         return example()
 
-    monkeypatch.setattr(importlib.import_module("pmdc_jax.control.tuning"), "tune", fake_tune)
+    monkeypatch.setattr(importlib.import_module("pmdc_jax.control.pipeline"), "tune", fake_tune)
     arguments = (
         "tune motor.json --controller pid --setpoint 481 --voltage-limit 30 --current-limit 60"
         " --sample-time 1e-3 --max-overshoot 0.5 --max-settling 0.2 --load-torque 0.3 --spread 10"
@@ -291,8 +292,8 @@ def test_the_command_writes_the_requested_files(motor_file, capsys, monkeypatch)
 
 @pytest.mark.slow
 def test_json_is_all_that_goes_to_standard_output(motor_file, capsys, monkeypatch):
-    tuning = importlib.import_module("pmdc_jax.control.tuning")
-    monkeypatch.setattr(tuning, "tune", lambda *_, **__: example())
+    pipeline = importlib.import_module("pmdc_jax.control.pipeline")
+    monkeypatch.setattr(pipeline, "tune", lambda *_, **__: example())
     assert cli.main(["tune", "motor.json", "--controller", "pid", "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out) == tuning_json(example())
 

@@ -12,8 +12,9 @@ from rich.text import Text
 from ..control.controller_file import gains_of, law_content
 from ..control.evaluation import SMALL_STEP, EvaluatedController, Robustness
 from ..control.objective import SECOND_SETPOINT
+from ..control.remarks import CURRENT_TO_REPORT
 from ..control.specification import NO_OVERSHOOT
-from ..control.tuning import CURRENT_TO_REPORT, Tuning
+from ..control.tuning import Tuning
 from .notation import NARROW_SPACE, UNKNOWN, percent, pretty_unit, significant
 from .terminal import plain_table
 
