@@ -35,10 +35,7 @@ def applied(excitation: vb.Excitation) -> vb.Excitation:
 
 def in_mixed_units(columns: vb.Columns) -> vb.Columns:
     """The same record as by another logger: mA and rev/min, with other headers."""
-    foreign = {
-        "current_A": ("Current (mA)", 1e3),
-        "speed_rad_s": ("Speed [rpm]", 30.0 / np.pi),
-    }
+    foreign = {"current_A": ("Current (mA)", 1e3), "speed_rad_s": ("Speed [rpm]", 30.0 / np.pi)}
     renamed = {}
     for name, values in columns.items():
         header, factor = foreign.get(name, (name, 1.0))

@@ -42,9 +42,7 @@ def _rows() -> list[Row]:
     runs = vb.standard_runs(np.random.default_rng(0), truth, all_at_1_ms=True)
     columns = {name: c for name, c in list(runs.items()) if name != "load_cycles"}
     recordings = [
-        Recording(
-            name, c["time_s"], c["voltage_V"], c["current_A"], c["speed_rad_s"], c["load_torque_Nm"]
-        )
+        Recording(name, c["time_s"], c["voltage_V"], c["current_A"], c["speed_rad_s"], c["load_torque_Nm"])
         for name, c in columns.items()
     ]
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(recordings))

@@ -54,10 +54,7 @@ def interleaved(rows: Sequence[Row]) -> list[Timed]:
         for row, count, taken in zip(rows, calls, seconds, strict=True):
             if turn < row.repeats:
                 taken.append(_clocked(row.run, count)[0])
-    return [
-        Timed(row, median(taken), *first)
-        for row, taken, first in zip(rows, seconds, firsts, strict=True)
-    ]
+    return [Timed(row, median(taken), *first) for row, taken, first in zip(rows, seconds, firsts, strict=True)]
 
 
 def machine() -> str:

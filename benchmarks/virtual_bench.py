@@ -155,18 +155,13 @@ def _advance(i, w, temp, v, load, mode_i, mode_w, h, p):
     Kb, Kt, coulomb, sharp = p[2], p[3], p[6], p[7]
     for _ in range(16):  # more events than occur in one fine step
         i1, w1, temp1 = _rk4(i, w, temp, v, load, mode_i, mode_w, h, p)
-        if not (
-            _leaves_mode(i1, v - Kb * w1, sharp, mode_i)
-            or _leaves_mode(w1, Kt * i1 - load, coulomb, mode_w)
-        ):
+        if not (_leaves_mode(i1, v - Kb * w1, sharp, mode_i) or _leaves_mode(w1, Kt * i1 - load, coulomb, mode_w)):
             break
         before, after = 0.0, h
         for _ in range(45):  # bisection to the last digits; events are rare
             middle = 0.5 * (before + after)
             i1, w1, temp1 = _rk4(i, w, temp, v, load, mode_i, mode_w, middle, p)
-            if _leaves_mode(i1, v - Kb * w1, sharp, mode_i) or _leaves_mode(
-                w1, Kt * i1 - load, coulomb, mode_w
-            ):
+            if _leaves_mode(i1, v - Kb * w1, sharp, mode_i) or _leaves_mode(w1, Kt * i1 - load, coulomb, mode_w):
                 after = middle
             else:
                 before = middle
@@ -201,9 +196,7 @@ def _simulate(voltage, load, disturbance, dt, start, p):
         states[k, 0], states[k, 1], states[k, 2] = i, w, temp
         for j in range(substeps):
             torque = load[k] + disturbance[k, j]
-            i, w, temp, mode_i, mode_w = _advance(
-                i, w, temp, voltage[k], torque, mode_i, mode_w, h, p
-            )
+            i, w, temp, mode_i, mode_w = _advance(i, w, temp, voltage[k], torque, mode_i, mode_w, h, p)
     return states
 
 
@@ -241,9 +234,7 @@ def simulate(
     return _simulate(voltage, load, disturbance, dt, np.asarray(start, float), motor.packed())
 
 
-def torque_noise(
-    motor: BenchMotor, excitation: Excitation, rng: Generator, noise: Noise
-) -> NDArray[np.float64]:
+def torque_noise(motor: BenchMotor, excitation: Excitation, rng: Generator, noise: Noise) -> NDArray[np.float64]:
     """Ornstein-Uhlenbeck torque (N m) for every fine step, shape (samples, substeps)."""
     dt = float(excitation.time[1] - excitation.time[0])
     substeps = _substeps(motor, dt)
@@ -270,12 +261,7 @@ def record(
     speed = states[:, 1] + noise.speed_rad_s * rng.standard_normal(len(states))
     if noise.speed_quantum_rad_s:
         speed = noise.speed_quantum_rad_s * np.round(speed / noise.speed_quantum_rad_s)
-    columns = {
-        "time_s": excitation.time,
-        "voltage_V": excitation.voltage,
-        "current_A": current,
-        "speed_rad_s": speed,
-    }
+    columns = {"time_s": excitation.time, "voltage_V": excitation.voltage, "current_A": current, "speed_rad_s": speed}
     return columns | ({"load_torque_Nm": excitation.load} if load_known else {})
 
 
@@ -321,9 +307,7 @@ def prbs(
     return Excitation(time, offset + amplitude * _held(signs, time, hold), np.zeros_like(time))
 
 
-def slow_triangle(
-    duration: float = 6.0, dt: float = 1e-3, amplitude: float = 6.0, period: float = 6.0
-) -> Excitation:
+def slow_triangle(duration: float = 6.0, dt: float = 1e-3, amplitude: float = 6.0, period: float = 6.0) -> Excitation:
     """A triangle between +-amplitude that creeps through standstill, no load."""
     time = _clock(duration, dt)
     corners = np.array([0.0, 0.25, 0.75, 1.0]) * period
@@ -367,11 +351,7 @@ def load_cycles(
 
 
 def drive(
-    rng: Generator,
-    duration: float = 4.0,
-    dt: float = 1e-3,
-    amplitude: float = 18.0,
-    load: float = 0.6,
+    rng: Generator, duration: float = 4.0, dt: float = 1e-3, amplitude: float = 18.0, load: float = 0.6
 ) -> Excitation:
     """A smooth mixed drive for hold-out: slow and fast swings, both directions, a moving load."""
     time = _clock(duration, dt)
@@ -404,10 +384,7 @@ def standard_excitations(rng: Generator, all_at_1_ms: bool = False) -> dict[str,
 
 
 def standard_runs(
-    rng: Generator,
-    motor: BenchMotor | None = None,
-    noise: Noise = Noise(),
-    all_at_1_ms: bool = False,
+    rng: Generator, motor: BenchMotor | None = None, noise: Noise = Noise(), all_at_1_ms: bool = False
 ) -> dict[str, Columns]:
     """The standard case recorded from `motor` (the paper's if none is given)."""
     motor = motor or paper_motor()

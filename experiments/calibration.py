@@ -131,9 +131,7 @@ def main() -> None:
     for name in options.noise:
         studies[name] = study(NOISES[name], options.repeats)
         console.print(table({name: studies[name]}))
-        console.print(
-            f"Median time of one identification: {np.median(studies[name].seconds):.2f} s"
-        )
+        console.print(f"Median time of one identification: {np.median(studies[name].seconds):.2f} s")
     console.print(f"Picture: {picture(studies)}")
 
 

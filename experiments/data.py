@@ -9,10 +9,7 @@ OWNERS = {
         "It belongs to A. Janot (ONERA), M. Gautier (LS2N) and M. Brunot: see 'Data Set and "
         "Reference Models of EMPS', Workshop on Nonlinear System Identification Benchmarks, 2019"
     ),
-    "undcmotor": (
-        "It belongs to the makers of the UNDCMotor laboratory motor, who publish it under the MIT "
-        "licence"
-    ),
+    "undcmotor": ("It belongs to the makers of the UNDCMotor laboratory motor, who publish it under the MIT licence"),
 }
 
 

@@ -90,16 +90,13 @@ def report(found, at, by_estimate, by_data, tape: Tape) -> None:
         shown.add_row(name, *cells, f"{by_estimate[0, k] * np.sqrt(covariance[k, k]):.2g}")
     console.print(shown)
     spread = np.sqrt(np.einsum("mi,ij,mj->m", by_estimate, covariance, by_estimate))
-    console.print(
-        f"All together: overshoot +- {spread[0]:.2g} %, settling +- {1e3 * spread[1]:.2g} ms."
-    )
+    console.print(f"All together: overshoot +- {spread[0]:.2g} %, settling +- {1e3 * spread[1]:.2g} ms.")
     sizes = np.sqrt((by_data**2).sum(axis=(3,)))
     for r, name in enumerate(RUNS):
         mine = np.asarray(tape.run) == r
         current, speed = np.sqrt((sizes[0][mine] ** 2).sum(axis=0))
         console.print(
-            f"Overshoot by the samples of {name}: {current:.2g} % per A, {speed:.2g} % per rad/s"
-            " (root sum of squares)"
+            f"Overshoot by the samples of {name}: {current:.2g} % per A, {speed:.2g} % per rad/s (root sum of squares)"
         )
 
 

@@ -52,8 +52,7 @@ def of_undcmotor() -> tuple[Diagnosis, list[str]]:
     first, second = undcmotor.halves()
     found = diagnose([first], [second], unloaded=True)
     errors = [
-        f"free run {one.fit[second.name].speed_rmse / undcmotor.DEGREE:.1f} deg/s"
-        for one in (found.base, found.final)
+        f"free run {one.fit[second.name].speed_rmse / undcmotor.DEGREE:.1f} deg/s" for one in (found.base, found.final)
     ]
     return found, errors
 
@@ -73,8 +72,7 @@ def main() -> None:
         found, (before, after) = RECORDS[name]()
         write_diagnosis_report(found, OUT / f"diagnosis_{name}.html")
         effects = "\n".join(
-            f"{effect.name}: "
-            + ", ".join(f"{field} {e.value:.4g}" for field, e in effect.parameters.items())
+            f"{effect.name}: " + ", ".join(f"{field} {e.value:.4g}" for field, e in effect.parameters.items())
             for effect in found.effects
         )
         closed = "-" if found.closed_fraction is None else f"{found.closed_fraction:.3f}"

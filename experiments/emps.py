@@ -24,11 +24,7 @@ ESTIMATION, VALIDATION = "DATA_EMPS", "DATA_EMPS_PULSES"
 TERMS = ("M", "Fv", "Fc", "offset")
 UNITS = {"M": "kg", "Fv": "N s/m", "Fc": "N", "offset": "N"}
 PUBLISHED = dict(zip(TERMS, (95.109, 203.50, 20.39, -3.165), strict=True))
-CUTOFF_HZ, DECIMATION, TRIM = (
-    100.0,
-    10,
-    50,
-)  # as in the published method, whose numbers they reproduce
+CUTOFF_HZ, DECIMATION, TRIM = (100.0, 10, 50)  # as in the published method, whose numbers they reproduce
 COULOMB = "coulomb_friction.torque_Nm"
 
 
@@ -142,8 +138,7 @@ def error_table(results: dict[str, Identification]) -> Table:
         result = results[fit.name]
         plain = least_squares(runs[0], fit.terms)
         errors = (
-            " / ".join(f"{force_error(run, estimate):.2f}" for run in runs)
-            for estimate in (estimate_of(result), plain)
+            " / ".join(f"{force_error(run, estimate):.2f}" for run in runs) for estimate in (estimate_of(result), plain)
         )
         speed = " / ".join(f"{result.fit[run.name].speed_fit_percent:.1f}" for run in runs)
         table.add_row(fit.name, *errors, speed)

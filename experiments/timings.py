@@ -68,31 +68,21 @@ def random_motor(rng: np.random.Generator) -> RandomMotor:
     return RandomMotor(motor, volts, amperes, speed, time_constant_s, float(f"{sample_time:.1g}"))
 
 
-def voltage(
-    kind: str, motor: RandomMotor, time: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
+def voltage(kind: str, motor: RandomMotor, time: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """An excitation of the given kind, V."""
     volts, time_constant_s = motor.volts, motor.time_constant_s
     if kind == "steps":
         return volts * rng.uniform(-1, 1, 8)[np.minimum(8 * time / time[-1], 7).astype(int)]
     if kind == "prbs":
         hold = max(0.7 * time_constant_s, 3 * motor.sample_time)
-        return (
-            0.8
-            * volts
-            * (2 * rng.integers(0, 2, int(time[-1] / hold) + 2) - 1)[(time / hold).astype(int)]
-        )
+        return 0.8 * volts * (2 * rng.integers(0, 2, int(time[-1] / hold) + 2) - 1)[(time / hold).astype(int)]
     if kind == "chirp":
         return 0.7 * volts * np.sin((0.2 + 1.4 * time / time[-1]) * time / time_constant_s)
-    sines = np.sin(
-        np.geomspace(0.05, 2.5, 6) * time[:, None] / time_constant_s + rng.uniform(0, 6, 6)
-    ).sum(1)
+    sines = np.sin(np.geomspace(0.05, 2.5, 6) * time[:, None] / time_constant_s + rng.uniform(0, 6, 6)).sum(1)
     return volts * (0.25 * sines if kind == "sines" else 0.5 + 0.08 * sines)
 
 
-def motion(
-    motor: RandomMotor, v: np.ndarray, load: np.ndarray, straight: bool, read_after: float
-) -> np.ndarray:
+def motion(motor: RandomMotor, v: np.ndarray, load: np.ndarray, straight: bool, read_after: float) -> np.ndarray:
     """Current, speed, angle and charge from rest, (samples, 4), read after this share of each sample."""
     R, L, Kb, Kt, J, f = (motor.parameters[name] for name in SIX)
     # of current, speed, angle, charge, voltage, load and the slope of the voltage
@@ -109,13 +99,9 @@ def motion(
     return seen
 
 
-def log(
-    motor: RandomMotor, way: str, lead: float, kind: str, loaded: bool, rng: np.random.Generator
-) -> Recording:
+def log(motor: RandomMotor, way: str, lead: float, kind: str, loaded: bool, rng: np.random.Generator) -> Recording:
     """One run, with this kind of log; between samples the voltage acts this share of one earlier than recorded."""
-    samples = int(
-        np.clip(rng.uniform(20, 60) * motor.time_constant_s / motor.sample_time, 600, 8000)
-    )
+    samples = int(np.clip(rng.uniform(20, 60) * motor.time_constant_s / motor.sample_time, 600, 8000))
     time = motor.sample_time * np.arange(samples)
     fine = motor._replace(sample_time=motor.sample_time / FINE)
     v_fine = voltage(kind, motor, fine.sample_time * np.arange(FINE * samples), rng)
@@ -137,9 +123,7 @@ def log(
     before, after = slice(None, -1), slice(1, None)
     driven = after if lead < 0 else before
     measured = after if way == "recorded late" else before
-    return Recording(
-        kind, time[before], v[driven], current[measured], speed[measured], load[before]
-    )
+    return Recording(kind, time[before], v[driven], current[measured], speed[measured], load[before])
 
 
 def errors(seed: int, way: str) -> tuple[float, float]:
@@ -165,11 +149,7 @@ def main() -> None:
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.motors)
     progress = Console(stderr=True)
-    found = {
-        (seed, way): errors(seed, way)
-        for seed in track(seeds, console=progress, transient=True)
-        for way in WAYS
-    }
+    found = {(seed, way): errors(seed, way) for seed in track(seeds, console=progress, transient=True) for way in WAYS}
     shown = Table("motor", *WAYS, title="Largest error in standard errors (and in %, but for f)")
     for seed in seeds:
         cells = (found[seed, way] for way in WAYS)

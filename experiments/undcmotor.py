@@ -80,9 +80,7 @@ def _load(result: Identification) -> str:
 def unseen(name: str, result: Identification) -> str:
     """The parameters that the record does not determine, and why."""
     status = ", ".join(f"{n} {e.status}" for n, e in result.parameters.items())
-    reasons = (
-        f"  {', '.join(d.parameters)}: {d.why}. {d.mend}." for d in result.unidentified_directions
-    )
+    reasons = (f"  {', '.join(d.parameters)}: {d.why}. {d.mend}." for d in result.unidentified_directions)
     return "\n".join((f"{name}: {status}{_load(result)}", *reasons))
 
 

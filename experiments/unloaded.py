@@ -56,8 +56,7 @@ def ratios(motor: vb.BenchMotor, result: Identification) -> str:
     value = {name: estimate.value for name, estimate in result.parameters.items()}
     pairs = (("J", "Kt"), ("f", "Kt"))
     errors = (
-        f"{a}/{b} {100 * (value[a] / value[b] / (getattr(motor, a) / getattr(motor, b)) - 1):+.3f} %"
-        for a, b in pairs
+        f"{a}/{b} {100 * (value[a] / value[b] / (getattr(motor, a) / getattr(motor, b)) - 1):+.3f} %" for a, b in pairs
     )
     return f"Ratios, alone: {', '.join(errors)}"
 

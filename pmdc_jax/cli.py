@@ -80,9 +80,7 @@ app = typer.Typer(
 )
 
 
-@app.command(
-    epilog="Example: pmdc identify step.csv chirp.csv --holdout drive.csv --report motor.html"
-)
+@app.command(epilog="Example: pmdc identify step.csv chirp.csv --holdout drive.csv --report motor.html")
 def identify(
     runs: Runs,
     holdout: Holdout = [],
@@ -123,10 +121,7 @@ def identify(
     return _status(identification)
 
 
-@app.command(
-    epilog="Example: pmdc diagnose *.csv --holdout drive.csv --report diagnosis.html"
-    " --save motor.json"
-)
+@app.command(epilog="Example: pmdc diagnose *.csv --holdout drive.csv --report diagnosis.html --save motor.json")
 def diagnose(
     runs: Runs,
     holdout: Holdout = [],
@@ -163,9 +158,7 @@ def diagnose(
         from .report.experiment import write_experiment
 
         if not write_experiment(diagnosis, experiment):
-            typer.echo(
-                f"note: no experiment was designed, so {experiment} was not written", err=True
-            )
+            typer.echo(f"note: no experiment was designed, so {experiment} was not written", err=True)
     if report:
         from .report.diagnosis import write_diagnosis_report
 
@@ -184,11 +177,7 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
 
     check_outputs({"--out": out}, [motor, input])
     columns = dict(pairs("--column", column))
-    from .recordings.recording_file import (
-        check_recording_suffix,
-        read_recording,
-        write_recording,
-    )
+    from .recordings.recording_file import check_recording_suffix, read_recording, write_recording
     from .simulate import simulate
 
     check_recording_suffix(out)
@@ -196,9 +185,7 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
     write_recording(simulate(motor, driven), out)
 
 
-@app.command(
-    epilog="Example: pmdc tune motor.json --controller pid --setpoint 481 --voltage-limit 30"
-)
+@app.command(epilog="Example: pmdc tune motor.json --controller pid --setpoint 481 --voltage-limit 30")
 def tune(
     motor: MotorFile,
     controller: Controller,

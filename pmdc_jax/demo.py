@@ -25,9 +25,7 @@ class DemoResult(NamedTuple):
     tuning: Tuning
 
 
-def demo(
-    out: str | Path = "demo_out", seed: int = 0, progress: ReportProgress | None = None
-) -> DemoResult:
+def demo(out: str | Path = "demo_out", seed: int = 0, progress: ReportProgress | None = None) -> DemoResult:
     """Diagnose the packaged sample and tune a PID controller for the motor found; write `FILES` to `out`.
 
     **Arguments**: `out`, a folder, made if missing; `seed` of the searches; `progress`, a callback for progress.
@@ -44,22 +42,12 @@ def demo(
     from .report.tuning import write_tuning_report
 
     report, content, motor, page, controller = (folder / name for name in FILES)
-    training, held_out = (
-        [SAMPLE / f"{name}.csv" for name in names] for names in (TRAINING, HOLDOUT)
-    )
+    training, held_out = ([SAMPLE / f"{name}.csv" for name in names] for names in (TRAINING, HOLDOUT))
     diagnosis = diagnose(training, holdout=held_out, seed=seed, progress=progress)
     save_motor(motor, diagnosis.final.motor, diagnosis.final)
     write_json(diagnosis_json(diagnosis), content)
     write_diagnosis_report(diagnosis, report)
-    tuning = tune(
-        motor,
-        "pid",
-        setpoint=200.0,
-        voltage_limit=18.0,
-        current_limit=20.0,
-        seed=seed,
-        progress=progress,
-    )
+    tuning = tune(motor, "pid", setpoint=200.0, voltage_limit=18.0, current_limit=20.0, seed=seed, progress=progress)
     save_controller(controller, tuning.law)
     write_tuning_report(tuning, page)
     return DemoResult(diagnosis, tuning)

@@ -46,9 +46,7 @@ def check_writable(option: str, path: Path) -> None:
         raise InputError(option, f"{path} would not be a {path.suffix} file", mend)
     folder = path.parent
     if not folder.is_dir():
-        raise InputError(
-            option, f"the folder {folder} does not exist", "Create it first, or choose another"
-        )
+        raise InputError(option, f"the folder {folder} does not exist", "Create it first, or choose another")
     writable = os.access(path, os.W_OK) if path.exists() else _takes_files(folder)
     if not writable:
         raise InputError(option, f"{path} cannot be written", "Choose another location")

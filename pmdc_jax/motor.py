@@ -52,9 +52,7 @@ class Motor(eqx.Module):
     f: Scalars
     effects: tuple[AbstractEffect, ...] = ()
 
-    def state_space(
-        self, drive: Drive | None = None
-    ) -> tuple[Float[Array, "2 2 *batch"], Float[Array, "2 2 *batch"]]:
+    def state_space(self, drive: Drive | None = None) -> tuple[Float[Array, "2 2 *batch"], Float[Array, "2 2 *batch"]]:
         """Matrices A, B of dx/dt = A x + B u for the linear motor, equations (7) and (8).
 
         x = (current, speed), u = (driving value, load torque). `drive` says whether voltage (the default), current or
@@ -63,16 +61,11 @@ class Motor(eqx.Module):
         """
         v, c, t, free = drive or Drive()
         zero, inverse_inertia = jnp.zeros_like(self.R), free / self.J
-        A = [
-            [-v * self.R / self.L, -v * self.Kb / self.L],
-            [v * self.Kt * inverse_inertia, -self.f * inverse_inertia],
-        ]
+        A = [[-v * self.R / self.L, -v * self.Kb / self.L], [v * self.Kt * inverse_inertia, -self.f * inverse_inertia]]
         B = [[v / self.L, zero], [(c * self.Kt + t) * inverse_inertia, -inverse_inertia]]
         return _matrix(A), _matrix(B)
 
-    def transfer_function(
-        self,
-    ) -> tuple[dict[str, Float[Array, "order *batch"]], Float[Array, "3 *batch"]]:
+    def transfer_function(self) -> tuple[dict[str, Float[Array, "order *batch"]], Float[Array, "3 *batch"]]:
         """Numerators by "input -> output" and the common denominator, highest power of s first; equation (9).
 
         voltage -> speed is Kt / (L J s^2 + (R J + L f) s + R f + Kt Kb).
@@ -125,11 +118,7 @@ class Motor(eqx.Module):
         return eqx.tree_at(lambda motor: motor.effects, self, tuple(effects))
 
     def initial_state(
-        self,
-        current: Scalars,
-        speed: Scalars,
-        load: Scalars | float = 0.0,
-        angle: Scalars | float = 0.0,
+        self, current: Scalars, speed: Scalars, load: Scalars | float = 0.0, angle: Scalars | float = 0.0
     ) -> State:
         """State at the start of a run with this current (A), speed (rad/s), load (N m) and rotor angle (rad).
 

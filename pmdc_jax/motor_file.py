@@ -23,9 +23,7 @@ MEND = "Give the motor file that pmdc identify --save wrote"
 UNDETERMINED = ("not_identifiable", "at_bound")
 
 
-def save_motor(
-    path: str | Path, motor: Motor, identification: Identification | None = None
-) -> None:
+def save_motor(path: str | Path, motor: Motor, identification: Identification | None = None) -> None:
     """Write a motor as JSON, atomically.
 
     **Arguments**: `motor`, with scalar parameters; `identification`, whose standard errors, statuses, covariance (of
@@ -35,10 +33,7 @@ def save_motor(
         "format": FORMAT,
         "parameters": {name: float(getattr(motor, name)) for name in PARAMETERS},
         "units": dict(PARAMETERS),
-        "effects": [
-            {"name": e.name, "parameters": {f: float(getattr(e, f)) for f in e.ranges}}
-            for e in motor.effects
-        ],
+        "effects": [{"name": e.name, "parameters": {f: float(getattr(e, f)) for f in e.ranges}} for e in motor.effects],
     }
     if identification is not None:
         estimates = identification.parameters
@@ -140,9 +135,7 @@ def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:
         name = entry.get("name") if isinstance(entry, dict) else None
         if not isinstance(name, str):
             raise InputError(
-                where,
-                f"effect {entry!r} is not an object with a name",
-                'Write {"name": ..., "parameters": {...}}',
+                where, f"effect {entry!r} is not an object with a name", 'Write {"name": ..., "parameters": {...}}'
             )
         if name not in EFFECTS:
             raise InputError(where, f"unknown effect {name!r}", f"Choose from {', '.join(EFFECTS)}")
@@ -153,9 +146,7 @@ def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:
     return tuple(effects.values())
 
 
-def _numbers(
-    where: str, given: object, wanted: Mapping[str, Any], of: str
-) -> dict[str, np.ndarray]:
+def _numbers(where: str, given: object, wanted: Mapping[str, Any], of: str) -> dict[str, np.ndarray]:
     if not isinstance(given, dict):
         raise InputError(where, f"{of}: parameters are {given!r}", "Give an object of numbers")
     numbers = {}

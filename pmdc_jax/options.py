@@ -11,30 +11,17 @@ import typer
 from .errors import InputError
 
 Runs = Annotated[
-    list[Path],
-    typer.Argument(metavar="RUN", help="Recordings to fit, one run per file: CSV, Parquet or MAT."),
+    list[Path], typer.Argument(metavar="RUN", help="Recordings to fit, one run per file: CSV, Parquet or MAT.")
 ]
 Holdout = Annotated[
-    list[Path],
-    typer.Option(metavar="RUN", help="A run held out of the fit, to validate it. Repeatable."),
+    list[Path], typer.Option(metavar="RUN", help="A run held out of the fit, to validate it. Repeatable.")
 ]
-Save = Annotated[
-    Path | None,
-    typer.Option(metavar="MOTOR.json", help="Save the motor, for pmdc simulate and tune."),
-]
-Json = Annotated[
-    str | None,
-    typer.Option(metavar="OUT", help="Write the result as JSON; - is standard output."),
-]
-Report = Annotated[
-    Path | None, typer.Option(metavar="OUT.html", help="Write an HTML report with figures.")
-]
+Save = Annotated[Path | None, typer.Option(metavar="MOTOR.json", help="Save the motor, for pmdc simulate and tune.")]
+Json = Annotated[str | None, typer.Option(metavar="OUT", help="Write the result as JSON; - is standard output.")]
+Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML report with figures.")]
 Experiment = Annotated[
     Path | None,
-    typer.Option(
-        metavar="OUT.csv",
-        help="Write the voltage of the next experiment, if the verdict is ambiguous.",
-    ),
+    typer.Option(metavar="OUT.csv", help="Write the voltage of the next experiment, if the verdict is ambiguous."),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Random seed of the search.")]
 Column = Annotated[
@@ -45,51 +32,24 @@ Column = Annotated[
         " For all files with that header. Repeatable.",
     ),
 ]
-Tie = Annotated[
-    list[str],
-    typer.Option(metavar="A=B", help="Two parameters to keep equal, such as Kt=Kb. Repeatable."),
-]
+Tie = Annotated[list[str], typer.Option(metavar="A=B", help="Two parameters to keep equal, such as Kt=Kb. Repeatable.")]
 Known = Annotated[
-    list[str],
-    typer.Option(
-        metavar="NAME=VALUE", help="A parameter to fix at a known value, in SI. Repeatable."
-    ),
+    list[str], typer.Option(metavar="NAME=VALUE", help="A parameter to fix at a known value, in SI. Repeatable.")
 ]
-Unloaded = Annotated[
-    bool, typer.Option("--unloaded", help="Assume no load in runs without a load column.")
-]
+Unloaded = Annotated[bool, typer.Option("--unloaded", help="Assume no load in runs without a load column.")]
 Effect = Annotated[
-    list[str],
-    typer.Option(
-        metavar="NAME", help="An effect to identify as well, such as coulomb_friction. Repeatable."
-    ),
+    list[str], typer.Option(metavar="NAME", help="An effect to identify as well, such as coulomb_friction. Repeatable.")
 ]
 Search = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME",
-        help="Global search: cma_es, paper_ga, differential_evolution or particle_swarm.",
-    ),
+    str, typer.Option(metavar="NAME", help="Global search: cma_es, paper_ga, differential_evolution or particle_swarm.")
 ]
-MotorFile = Annotated[
-    Path, typer.Argument(metavar="MOTOR.json", help="Motor file, from pmdc identify --save.")
-]
-Input = Annotated[
-    Path, typer.Option("--input", metavar="RUN", help="Recording with the input to simulate.")
-]
-Output = Annotated[
-    Path, typer.Option("--out", metavar="RUN_OUT", help="Output file, .csv or .parquet.")
-]
-Controller = Annotated[
-    str,
-    typer.Option(metavar="NAME", help="pi, pid, state-feedback or state-feedback-integral."),
-]
+MotorFile = Annotated[Path, typer.Argument(metavar="MOTOR.json", help="Motor file, from pmdc identify --save.")]
+Input = Annotated[Path, typer.Option("--input", metavar="RUN", help="Recording with the input to simulate.")]
+Output = Annotated[Path, typer.Option("--out", metavar="RUN_OUT", help="Output file, .csv or .parquet.")]
+Controller = Annotated[str, typer.Option(metavar="NAME", help="pi, pid, state-feedback or state-feedback-integral.")]
 Setpoint = Annotated[
     float | None,
-    typer.Option(
-        metavar="RAD_S",
-        help="Set point of the speed; by default 80 % of what the voltage limit reaches.",
-    ),
+    typer.Option(metavar="RAD_S", help="Set point of the speed; by default 80 % of what the voltage limit reaches."),
 ]
 VoltageLimit = Annotated[
     float | None,
@@ -99,61 +59,40 @@ VoltageLimit = Annotated[
         " or 24 V without one.",
     ),
 ]
-CurrentLimit = Annotated[
-    float | None, typer.Option(metavar="A", help="Largest current; unlimited if not given.")
-]
-SampleTime = Annotated[
-    float | None, typer.Option(metavar="S", help="Sample time; by default 1 ms, or less if needed.")
-]
-MaxOvershoot = Annotated[
-    float, typer.Option(min=0, metavar="PCT", help="Largest overshoot, % of the step.")
-]
+CurrentLimit = Annotated[float | None, typer.Option(metavar="A", help="Largest current; unlimited if not given.")]
+SampleTime = Annotated[float | None, typer.Option(metavar="S", help="Sample time; by default 1 ms, or less if needed.")]
+MaxOvershoot = Annotated[float, typer.Option(min=0, metavar="PCT", help="Largest overshoot, % of the step.")]
 MaxSettling = Annotated[float | None, typer.Option(metavar="S", help="Largest settling time.")]
 LoadTorque = Annotated[
     float | None,
     typer.Option(
-        metavar="NM",
-        help="Load torque step to reject; by default half of what can be held at the set point.",
+        metavar="NM", help="Load torque step to reject; by default half of what can be held at the set point."
     ),
 ]
-Delay = Annotated[
-    int, typer.Option(metavar="SAMPLES", help="Delay from measurement to voltage: 0 or 1.")
-]
-SpeedStep = Annotated[
-    float | None, typer.Option(metavar="RAD_S", help="Resolution of the speed sensor.")
-]
+Delay = Annotated[int, typer.Option(metavar="SAMPLES", help="Delay from measurement to voltage: 0 or 1.")]
+SpeedStep = Annotated[float | None, typer.Option(metavar="RAD_S", help="Resolution of the speed sensor.")]
 SpeedNoise = Annotated[
     float | None,
     typer.Option(
-        metavar="RAD_S",
-        help="RMS noise of the speed sensor; by default tuned against that in the motor file.",
+        metavar="RAD_S", help="RMS noise of the speed sensor; by default tuned against that in the motor file."
     ),
 ]
 CurrentSensor = Annotated[bool, typer.Option(help="Whether the controller measures the current.")]
 Spread = Annotated[
     float | None,
-    typer.Option(
-        min=0,
-        metavar="PCT",
-        help="Standard deviation of each parameter; by default from the motor file.",
-    ),
+    typer.Option(min=0, metavar="PCT", help="Standard deviation of each parameter; by default from the motor file."),
 ]
 SaveController = Annotated[
-    Path | None,
-    typer.Option(metavar="CONTROLLER.json", help="Save the controller, for pmdc export."),
+    Path | None, typer.Option(metavar="CONTROLLER.json", help="Save the controller, for pmdc export.")
 ]
 ControllerFile = Annotated[
     Path, typer.Argument(metavar="CONTROLLER.json", help="Controller file, from pmdc tune --save.")
 ]
-HeaderFile = Annotated[
-    Path, typer.Option("--c", metavar="CONTROLLER.h", help="C header file to write.")
-]
+HeaderFile = Annotated[Path, typer.Option("--c", metavar="CONTROLLER.h", help="C header file to write.")]
 Folder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results.")]
 
 
-def fit_options(
-    tie: list[str], known: list[str], unloaded: bool, search: str, seed: int
-) -> dict[str, Any]:
+def fit_options(tie: list[str], known: list[str], unloaded: bool, search: str, seed: int) -> dict[str, Any]:
     """The keyword arguments that `identify` and `diagnose` have in common."""
     return {
         "tie": tuple(pairs("--tie", tie)),
@@ -175,9 +114,7 @@ def _pair(option: str, text: str) -> tuple[str, str]:
     if not (name and equals and value):
         examples = {"--column": "speed=rpm_meas:rpm", "--tie": "Kt=Kb", "--known": "R=0.157"}
         raise InputError(
-            f"{option} {text}",
-            "this is not of the form A=B",
-            f"Write for example {option} {examples[option]}",
+            f"{option} {text}", "this is not of the form A=B", f"Write for example {option} {examples[option]}"
         )
     return name, value
 

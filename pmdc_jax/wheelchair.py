@@ -72,10 +72,7 @@ class Recovered:
     @property
     def errors(self) -> dict[str, float]:
         """Relative error of each parameter, %."""
-        return {
-            name: 100 * (float(getattr(self.motor, name)) / getattr(PRINTED, name) - 1)
-            for name in PARAMETERS
-        }
+        return {name: 100 * (float(getattr(self.motor, name)) / getattr(PRINTED, name) - 1) for name in PARAMETERS}
 
 
 @frozen
@@ -102,12 +99,7 @@ def reproduce(progress: ReportProgress | None = None) -> Paper:
     for k, kind in enumerate(TABLE_2):
         report(f"tuning {kind}", fraction=0.4 + 0.15 * k)
         tunings[kind] = tune(
-            PRINTED,
-            kind,
-            setpoint=SETPOINT,
-            voltage_limit=SUFFICIENT_VOLTAGE,
-            sample_time=1e-3,
-            max_overshoot=0.5,
+            PRINTED, kind, setpoint=SETPOINT, voltage_limit=SUFFICIENT_VOLTAGE, sample_time=1e-3, max_overshoot=0.5
         )
     fastest = {
         volts: fastest_settling(PRINTED, SETPOINT, volts) or float("nan")
@@ -179,10 +171,7 @@ def load_errors(motor: Motor) -> dict[str, np.ndarray]:
     speed, printed_speed = (np.asarray(m.steady_speed(VOLTAGE, LOADS)) for m in (motor, PRINTED))
     current = np.asarray(motor.steady_current(speed, LOADS))
     printed_current = np.asarray(PRINTED.steady_current(printed_speed, LOADS))
-    return {
-        "speed": 100 * (speed / printed_speed - 1),
-        "current": 100 * (current / printed_current - 1),
-    }
+    return {"speed": 100 * (speed / printed_speed - 1), "current": 100 * (current / printed_current - 1)}
 
 
 def step_up_and_down(tuning: Tuning) -> Response:

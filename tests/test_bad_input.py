@@ -134,18 +134,12 @@ def cases() -> Iterator[Case]:
     yield Case("one sample", csv(HEADER, *rows(1)), "at least 10")
     yield Case("nine samples", csv(HEADER, *rows(9)), "9 samples")
     yield Case("no header", csv(*rows()), "line 1: the first line holds numbers")
-    yield Case(
-        "no time column", csv("index,voltage_V,current_A,speed_rad_s", *rows()), "no time column"
-    )
-    yield Case(
-        "nothing useful", csv("time_s,a,b,c", *rows()), "columns in the file: time_s, a, b, c"
-    )
+    yield Case("no time column", csv("index,voltage_V,current_A,speed_rad_s", *rows()), "no time column")
+    yield Case("nothing useful", csv("time_s,a,b,c", *rows()), "columns in the file: time_s, a, b, c")
     yield Case("voltage alone", csv("time_s,voltage_V", *rows(columns=2)), "too few columns")
     yield Case("speed alone", csv("time_s,speed_rad_s", *rows(columns=2)), "too few columns")
     yield Case("blanks separate", csv("time_s voltage_V speed_rad_s", "0 1 2"), "separate them by")
-    yield Case(
-        "text in a column", with_line(7, "0.05,1,oops,2"), "line 7, column current_A: 'oops' is not"
-    )
+    yield Case("text in a column", with_line(7, "0.05,1,oops,2"), "line 7, column current_A: 'oops' is not")
     yield Case(
         "line of wrong units",
         csv("time,voltage,current,speed", "s,V,A,furlong", *rows()),
@@ -154,9 +148,7 @@ def cases() -> Iterator[Case]:
     yield Case("clock time", with_line(2, "12:00:01,1,2,3"), "line 2, column time_s: '12:00:01'")
     yield Case(
         "days or months",
-        csv(
-            "time,voltage_V,speed_rpm", *[f"03/0{1 + k // 6}/2026 12:00:{k},1,2" for k in range(12)]
-        ),
+        csv("time,voltage_V,speed_rpm", *[f"03/0{1 + k // 6}/2026 12:00:{k},1,2" for k in range(12)]),
         "line 2, column time: '03/01/2026 12:00:0' may begin with the day or the month",
     )
     yield Case(
@@ -185,11 +177,7 @@ def cases() -> Iterator[Case]:
     yield Case("gzip named csv", raw(gzip.compress(b"time_s" * 99)), "run.csv")
     yield Case("unknown suffix", raw(b"PK\x03\x04", "run.xlsx"), "unknown file type '.xlsx'")
     yield Case("no suffix", csv(HEADER, *rows(), name="run"), "unknown file type ''")
-    yield Case(
-        "duplicate columns",
-        csv("time_s,voltage_V,speed_rad_s,speed_rad_s", *rows()),
-        "'speed_rad_s' 2 times",
-    )
+    yield Case("duplicate columns", csv("time_s,voltage_V,speed_rad_s,speed_rad_s", *rows()), "'speed_rad_s' 2 times")
     yield Case(
         "two columns for one quantity",
         csv("time_s,voltage_V,speed_rad_s,Speed [rpm]", *rows()),
@@ -200,31 +188,13 @@ def cases() -> Iterator[Case]:
         csv("time_s,voltage_V,current_A,speed [furlong]", *rows()),
         "column speed [furlong]: unknown unit 'furlong'",
     )
-    yield Case(
-        "speed in kg",
-        csv("time_s,voltage_V,current_A,speed [kg]", *rows()),
-        "'kg' does not measure speed",
-    )
-    yield Case(
-        "speed in Hz",
-        csv("time_s,voltage_V,current_A,speed [1/s]", *rows()),
-        "'1/s' does not measure speed",
-    )
-    yield Case(
-        "time goes backwards", with_line(12, "0.02,1,2,3"), "line 12, column time_s: time goes"
-    )
-    yield Case(
-        "two runs in one file",
-        csv(HEADER, *rows(15), *rows(15)),
-        "line 17, column time_s: time goes backwards",
-    )
+    yield Case("speed in kg", csv("time_s,voltage_V,current_A,speed [kg]", *rows()), "'kg' does not measure speed")
+    yield Case("speed in Hz", csv("time_s,voltage_V,current_A,speed [1/s]", *rows()), "'1/s' does not measure speed")
+    yield Case("time goes backwards", with_line(12, "0.02,1,2,3"), "line 12, column time_s: time goes")
+    yield Case("two runs in one file", csv(HEADER, *rows(15), *rows(15)), "line 17, column time_s: time goes backwards")
     yield Case("repeated time", with_line(4, "0.01,1,2,3"), "line 4, column time_s: the time stamp")
-    yield Case(
-        "time rounded away", csv(HEADER, *rows(step=0.0)), "line 3, column time_s: the time stamp"
-    )
-    yield Case(
-        "wrong last time", with_line(21, "1e12,1,2,3"), "line 21, column time_s: a gap of 1e+12 s"
-    )
+    yield Case("time rounded away", csv(HEADER, *rows(step=0.0)), "line 3, column time_s: the time stamp")
+    yield Case("wrong last time", with_line(21, "1e12,1,2,3"), "line 21, column time_s: a gap of 1e+12 s")
     yield Case(
         "a long gap",
         csv(HEADER, *rows(30), *rows(30, start=2500.0)),
@@ -238,14 +208,8 @@ def cases() -> Iterator[Case]:
         with_line(5, "0.03,1,2,NA", header="time_s,voltage_V,speed_rad_s,load_torque_Nm"),
         "line 5, column load_torque_Nm",
     )
-    yield Case(
-        "infinite speed", with_line(10, "0.08,1,2,inf"), "line 10, column speed_rad_s: 1 inf"
-    )
-    yield Case(
-        "speed mostly missing",
-        nan_share(0.3, 3),
-        "column speed_rad_s: 30 of 100 values are missing",
-    )
+    yield Case("infinite speed", with_line(10, "0.08,1,2,inf"), "line 10, column speed_rad_s: 1 inf")
+    yield Case("speed mostly missing", nan_share(0.3, 3), "column speed_rad_s: 30 of 100 values are missing")
     yield Case(
         "driving current missing",
         with_line(6, "0.04,,3", header="time_s,current_A,speed_rad_s"),
@@ -262,9 +226,7 @@ def cases() -> Iterator[Case]:
         "column speed_rpm: it contains dates",
     )
     yield Case(
-        "numbers named timestamp",
-        csv("timestamp,voltage_V,current_A,speed_rpm", *rows()),
-        "there is no time column",
+        "numbers named timestamp", csv("timestamp,voltage_V,current_A,speed_rpm", *rows()), "there is no time column"
     )
     yield from mapping_cases()
     yield from binary_cases()
@@ -280,9 +242,7 @@ def mapping_cases() -> Iterator[Case]:
     yield Case("map in no unit", mapped(*three, "speed=c:rpn"), "unknown unit 'rpn'")
     for unit in ("A/-1", "A-", "A/0", "0*A", "--A"):
         yield Case(f"map in {unit}", mapped(*three, f"current=c:{unit}"), "for current (A)")
-    yield Case(
-        "map one to two", mapped(*three, "speed=c:rpm", "current=c:A"), "both speed and current"
-    )
+    yield Case("map one to two", mapped(*three, "speed=c:rpm", "current=c:A"), "both speed and current")
     yield Case("map nothing", mapped(*three, "speed="), "no column ''")
 
 
@@ -300,21 +260,13 @@ def binary_cases() -> Iterator[Case]:
         mat(**good_mat(speed_rad_s=np.arange(40.0))),
         "variables speed_rad_s and time_s: 40 and 50 samples",
     )
-    yield Case(
-        "mat with two speeds",
-        mat(a=good_mat(), b={"speed_rpm": np.arange(50.0)}),
-        "both mean speed",
-    )
+    yield Case("mat with two speeds", mat(a=good_mat(), b={"speed_rpm": np.arange(50.0)}), "both mean speed")
     yield Case("mat with NaN in time", mat(**good_mat(time_s=np.full(50, np.nan))), "column time_s")
-    yield Case(
-        "text named parquet", raw(b"time_s,voltage_V\n" * 20, "run.parquet"), "not a Parquet"
-    )
+    yield Case("text named parquet", raw(b"time_s,voltage_V\n" * 20, "run.parquet"), "not a Parquet")
     t = [k / 10 for k in range(20)]
     words = ["fast"] * 20
     yield Case(
-        "parquet with texts",
-        frame(time_s=t, voltage_V=t, speed_rad_s=words),
-        "column speed_rad_s: it contains String",
+        "parquet with texts", frame(time_s=t, voltage_V=t, speed_rad_s=words), "column speed_rad_s: it contains String"
     )
     yield Case(
         "parquet with time backwards",
@@ -428,9 +380,7 @@ def test_damaged_text_is_read_or_refused_without_another_error(tmp_path):
     for _ in range(200):
         text = bytearray(good)
         for place in rng.integers(len(good) - 40, size=2):
-            piece = bytes(
-                rng.choice(list(b',;\n"#\t -eE.\r9x'), rng.integers(0, 4)).astype(np.uint8)
-            )
+            piece = bytes(rng.choice(list(b',;\n"#\t -eE.\r9x'), rng.integers(0, 4)).astype(np.uint8))
             text[place : place + rng.integers(0, 4)] = piece
         path.write_bytes(bytes(text))
         try:

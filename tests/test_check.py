@@ -265,18 +265,11 @@ FAULTS = [
     ("angle the other way", lambda run: with_angle(run, -1), "angle", "wrong sign"),
     ("impossible speed", lambda run: evolve(run, speed=1e3 * run.speed), "speed", "too fast"),
     ("voltage in mV", lambda run: evolve(run, voltage=1e3 * run.voltage), "voltage", "too high"),
-    (
-        "current in µA",
-        lambda run: evolve(run, current=1e6 * run.current),
-        "current",
-        "less than any",
-    ),
+    ("current in µA", lambda run: evolve(run, current=1e6 * run.current), "current", "less than any"),
 ]
 
 
-@pytest.mark.parametrize(
-    ("inject", "column", "what"), [pytest.param(*fault, id=name) for name, *fault in FAULTS]
-)
+@pytest.mark.parametrize(("inject", "column", "what"), [pytest.param(*fault, id=name) for name, *fault in FAULTS])
 def test_each_fault_is_found(inject, column, what):
     for seed in (1, 7, 13):
         run = good_run(seed, "prbs", noise=1e-3)

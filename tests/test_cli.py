@@ -80,8 +80,7 @@ def refused(capsys, *arguments: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "command",
-    [(), *((c,) for c in ["identify", "diagnose", "simulate", "demo", "tune", "export", "paper"])],
+    "command", [(), *((c,) for c in ["identify", "diagnose", "simulate", "demo", "tune", "export", "paper"])]
 )
 def test_help_shows_an_example(capsys, command):
     assert cli.main([*command, "--help"]) == 0
@@ -146,13 +145,7 @@ def test_identify_prints_parameters_and_runs(faked, capsys):
     faked.result = partial_identification()
     assert cli.main(["identify", "a.csv"]) == 0
     out, err = capsys.readouterr()
-    for word in (
-        *faked.result.parameters,
-        *faked.result.fit,
-        "at bound",
-        "not identifiable",
-        "157.20",
-    ):
+    for word in (*faked.result.parameters, *faked.result.fit, "at bound", "not identifiable", "157.20"):
         assert word in out
     assert "NaN" not in out
     assert "saturated at 60 A" in err
@@ -170,11 +163,7 @@ def test_json_is_all_that_goes_to_standard_output(faked, capsys):
 def test_outputs_are_written(faked, capsys, tmp_path):
     arguments = "identify a.csv --save motor.json --json fit.json --report fit.html"
     assert cli.main(arguments.split()) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "fit.html",
-        "fit.json",
-        "motor.json",
-    ]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.html", "fit.json", "motor.json"]
     assert json.loads((tmp_path / "fit.json").read_text())["converged"] is True
 
 
@@ -264,10 +253,7 @@ def test_bad_arguments_are_refused_before_anything_is_read(faked, capsys, argume
 @pytest.mark.parametrize(
     ("problem", "text"),
     [
-        (
-            InputError("a.csv, line 3", "time runs backwards", "Sort the rows"),
-            "a.csv, line 3: time",
-        ),
+        (InputError("a.csv, line 3", "time runs backwards", "Sort the rows"), "a.csv, line 3: time"),
         (FileNotFoundError(2, "No such file or directory", "a.csv"), "a.csv: No such file"),
         (OSError(28, "No space left on device"), "No space left"),
     ],
@@ -415,8 +401,7 @@ def test_only_the_command_keeps_compiled_code(faked, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("code", "kept"),
-    [("import pmdc_jax, pmdc_jax.cli", False), ("from pmdc_jax.cli import main; main()", True)],
+    ("code", "kept"), [("import pmdc_jax, pmdc_jax.cli", False), ("from pmdc_jax.cli import main; main()", True)]
 )
 def test_jax_keeps_what_the_command_compiles(tmp_path, code, kept):
     code = f"{code}\nimport jax; jax.jit(lambda x: x + 1)(1.0)"

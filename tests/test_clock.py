@@ -44,9 +44,7 @@ def state_matrix() -> np.ndarray:
 
 def record(time: np.ndarray, rng: np.random.Generator, noise: np.ndarray = NOISE) -> Recording:
     """A run with steps of voltage and load, held from stamp to stamp."""
-    voltage = np.repeat(rng.uniform(-15, 15, len(time)), rng.integers(8, 40, len(time)))[
-        : len(time)
-    ]
+    voltage = np.repeat(rng.uniform(-15, 15, len(time)), rng.integers(8, 40, len(time)))[: len(time)]
     load = np.repeat(rng.uniform(-0.1, 0.1, len(time)), 150)[: len(time)]
     values, vectors = np.linalg.eig(state_matrix())
     back, states = np.linalg.inv(vectors), np.zeros((len(time), 2))

@@ -39,9 +39,7 @@ class KeptPrograms:
         self.monkeypatch, self.folder, self.compilations = monkeypatch, folder, []
         compile_ = compiled._compile
         monkeypatch.setenv(PROGRAMS, str(folder))
-        monkeypatch.setattr(
-            compiled, "_compile", lambda *args: self.compilations.append(args) or compile_(*args)
-        )
+        monkeypatch.setattr(compiled, "_compile", lambda *args: self.compilations.append(args) or compile_(*args))
         self.begin_another_process()
 
     def begin_another_process(self) -> None:
@@ -67,8 +65,7 @@ def test_a_program_is_traced_once_across_processes(tmp_path):
     run = [sys.executable, "-c", code]
     here = Path(__file__).parent
     first, second = (
-        subprocess.run(run, check=True, capture_output=True, text=True, env=environment, cwd=here)
-        for _ in range(2)
+        subprocess.run(run, check=True, capture_output=True, text=True, env=environment, cwd=here) for _ in range(2)
     )
     assert first.stdout == "traced\n" + second.stdout
     assert second.stdout.startswith("Eigenvalues(")

@@ -112,16 +112,12 @@ def test_the_fastest_settling_includes_braking_within_the_band():
         return rest + transition @ -rest
 
     times = np.linspace(0, 1e-3, 100_001)
-    switch = brentq(
-        lambda t: speeds(after(t), -volts, times).max() - 1.02 * target, 1e-4, 8e-4, xtol=1e-12
-    )
+    switch = brentq(lambda t: speeds(after(t), -volts, times).max() - 1.02 * target, 1e-4, 8e-4, xtol=1e-12)
     braking = speeds(after(switch), -volts, times)
     best = switch + np.interp(0.98 * target, braking[: braking.argmax()], times[: braking.argmax()])
     found = fastest_settling(MOTOR, target, volts)
     assert found == pytest.approx(best, rel=3e-4)  # twice its resolution in time
-    without_braking = brentq(
-        lambda t: speeds(np.zeros(2), volts, [t])[0] - 0.98 * target, 1e-4, 8e-4
-    )
+    without_braking = brentq(lambda t: speeds(np.zeros(2), volts, [t])[0] - 0.98 * target, 1e-4, 8e-4)
     assert best > without_braking * 1.01
 
 
@@ -372,9 +368,7 @@ def test_a_loop_with_a_slow_sensor_or_backlash_reaches_its_set_point(name, param
     law = Law.of(gentle, Hardware(1e-3, 30.0, 100.0, None, 1), motor)
     response = run(motor, law, course(400), int(steps_within(motor, 1e-3, jnp.asarray(100.0))))
     assert float(response.speed[-1]) == pytest.approx(SETPOINT, abs=0.01)
-    assert float(response.voltage[-1]) == pytest.approx(
-        float(steady_state(motor, SETPOINT)[1]), abs=1e-3
-    )
+    assert float(response.voltage[-1]) == pytest.approx(float(steady_state(motor, SETPOINT)[1]), abs=1e-3)
 
 
 def test_a_loop_with_a_delayed_speed_matches_a_loop_in_numpy():

@@ -128,11 +128,7 @@ INVALID = {
     "type a list": (("type",), [], "type"),
     "gain of four hundred digits": (("gains", "integral"), 10**400, "integral"),
     "of a later version": (("format",), "pmdc controller 2", "Update pmdc_jax"),
-    "a motor": (
-        ("format",),
-        "pmdc motor 1",
-        "Give the controller file that pmdc tune --save wrote",
-    ),
+    "a motor": (("format",), "pmdc motor 1", "Give the controller file that pmdc tune --save wrote"),
     "a result": (("seconds",), {}, "result of --json. .* tune --save wrote"),
 }
 

@@ -23,12 +23,7 @@ from pmdc_jax.diagnose.evidence.periodic import common_line, spectrum
 from pmdc_jax.diagnose.evidence.quantisation import ROUNDING_DRAWS, rounding_errors
 from pmdc_jax.diagnose.evidence.regression import Block, gather_evidence
 from pmdc_jax.diagnose.evidence.rows import _batches
-from pmdc_jax.diagnose.evidence.signals import (
-    Screen,
-    Signal,
-    gain_common_to_waves,
-    log_p_value,
-)
+from pmdc_jax.diagnose.evidence.signals import Screen, Signal, gain_common_to_waves, log_p_value
 from pmdc_jax.diagnose.experiment import difference_between
 from pmdc_jax.diagnose.hypotheses.candidates import Scales
 from pmdc_jax.diagnose.hypotheses.effect_relations import FULLER, are_rivals, is_simpler_form
@@ -64,12 +59,7 @@ def assessment_of(gains: dict[str, float], unexplained: float) -> Assessment:
         Signal(gain, -1e3 + k, candidate, Mock(spec=Block))
         for k, (gain, candidate) in enumerate(zip(gains.values(), candidates, strict=True))
     ]
-    found = Mock(
-        spec=Assessment,
-        candidate_signals=signals,
-        curve_signals=signals[:1],
-        unexplained=unexplained,
-    )
+    found = Mock(spec=Assessment, candidate_signals=signals, curve_signals=signals[:1], unexplained=unexplained)
     found.screen = Mock(spec=Screen, candidates=candidates)
     found.clearest = max(signals, key=lambda s: s.gain)
     return found
@@ -133,9 +123,7 @@ class UndecidedSelection(StepwiseSelection):
     """A selection from two models, each of which fits better than the other by the filter of that."""
 
     def __init__(self):
-        self.base, self.one, self.other = (
-            Mock(spec=Model, is_possible=True, effects=()) for _ in range(3)
-        )
+        self.base, self.one, self.other = (Mock(spec=Model, is_possible=True, effects=()) for _ in range(3))
         self.superseded, self.equivalents, self.trials = set(), {}, 0
         self.comparison = Mock(ranked=lambda models, white: [Mock(spec=Fitted, model=models[-1])])
         self.assess = Mock(return_value=assessment_of({"quadratic_drag": 1.0}, np.inf))
@@ -196,9 +184,7 @@ def test_a_decisive_effect_on_other_axes_is_no_model_form_error(added, misfit, i
     better = Mock(spec=Model, effects=("brush_voltage_drop", added), fit=Mock(fitness=misfit))
     selection = StepwiseSelection.__new__(StepwiseSelection)
     selection._leaves_little = lambda current, better: False
-    selection.assess = lambda model: Mock(
-        spec=Assessment, exceeds_model_form_error=lambda model: False
-    )
+    selection.assess = lambda model: Mock(spec=Assessment, exceeds_model_form_error=lambda model: False)
     assert selection._is_genuine_improvement(current, better) == is_genuine
     # the first effect has no other beside it, whose formula may be wrong
     current.effects = ()
@@ -209,24 +195,14 @@ def test_a_decisive_effect_on_other_axes_is_no_model_form_error(added, misfit, i
 def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(leaves_little):
     """Friction and drag, for which viscous friction compensates: no single effect gains much, but each more than
     predicted."""
-    gains = {
-        "torque_constant_saturation": 74.0,
-        "stribeck_friction": 60.0,
-        "brush_voltage_drop": 5.0,
-    }
+    gains = {"torque_constant_saturation": 74.0, "stribeck_friction": 60.0, "brush_voltage_drop": 5.0}
     found = assessment_of(gains, unexplained=np.inf)
-    found.p_value, found.may_be_model_form_error, found.is_sensor_error = (
-        0.0,
-        lambda model: False,
-        lambda: False,
-    )
+    found.p_value, found.may_be_model_form_error, found.is_sensor_error = (0.0, lambda model: False, lambda: False)
     selection = UndecidedSelection()
     tried = Mock(spec=Model, effects=("stribeck_friction",))
     refits = Mock(spec=Refits, with_signals=Mock(return_value=[tried]))
     selection.proposals.by_evidence = lambda current: []
-    selection.proposals.by_largest_gain = Proposals(
-        refits, lambda model: found, set()
-    ).by_largest_gain
+    selection.proposals.by_largest_gain = Proposals(refits, lambda model: found, set()).by_largest_gain
     selection._better = lambda current, models: models[-1] if models else None
     selection._leaves_little = lambda current, better: leaves_little
     better = selection._step(Mock(spec=Model, effects=()))
@@ -236,9 +212,7 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
 
 
 @pytest.mark.parametrize(("count", "p_value", "exchanges"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])
-def test_a_full_set_exchanges_the_effect_in_the_same_equation(
-    monkeypatch, count, p_value, exchanges
-):
+def test_a_full_set_exchanges_the_effect_in_the_same_equation(monkeypatch, count, p_value, exchanges):
     """Of dry friction, a delay and an offset the first, if Stribeck friction has the largest expected gain."""
     effects = ("asymmetric_friction", "speed_sensor_delay", "current_sensor_offset")[:count]
     peak = Mock(spec=Signal, candidate=Mock(effect="stribeck_friction"), gain=1.0)
@@ -254,9 +228,7 @@ def test_a_full_set_exchanges_the_effect_in_the_same_equation(
         screen=Mock(spec=Screen, white="white"),
     )
     current = Mock(spec=Model, effects=effects)
-    assert Proposals(refits, lambda model: found, set()).by_exchange(current) == (
-        [exchanged] * exchanges
-    )
+    assert Proposals(refits, lambda model: found, set()).by_exchange(current) == ([exchanged] * exchanges)
     assert refits.without.call_count == exchanges
     if exchanges:
         refits.without.assert_called_with(current, "asymmetric_friction", "white")
@@ -333,9 +305,7 @@ def test_a_richer_form_starts_with_the_values_of_the_simple_one(simple):
 def evidence_of(J, own, X, r):
     """The evidence from rows that come in two parts."""
     runs = (np.hstack([j, x, y[:, None], o]) for j, o, x, y in zip(J, own, X, r, strict=True))
-    return gather_evidence(
-        ((rows[:150], rows[150:]) for rows in runs), J[0].shape[1], own[0].shape[1]
-    )
+    return gather_evidence(((rows[:150], rows[150:]) for rows in runs), J[0].shape[1], own[0].shape[1])
 
 
 def random_evidence(seed: int, runs: int = 3, rows: int = 400):
@@ -422,25 +392,19 @@ def test_the_approximate_tail_matches_the_exact_one(freedom):
         ("constant_load", "torque_Nm", (1e-3, 0.8), False),
     ],
 )
-def test_an_amplitude_with_an_interval_down_to_zero_may_be_none(
-    effect, field, interval, may_be_zero
-):
+def test_an_amplitude_with_an_interval_down_to_zero_may_be_none(effect, field, interval, may_be_zero):
     estimate = Estimate(0.35, 0.1, interval, "", "identified")
     found = Mock(spec=Identification, parameters={f"{effect}.{field}": estimate})
     assert may_be_absent(found, effect, field) is may_be_zero
 
 
-@pytest.mark.parametrize(
-    ("damping_ratio", "implausible"), [(0.05, None), (3.0, "shaft_compliance")]
-)
+@pytest.mark.parametrize(("damping_ratio", "implausible"), [(0.05, None), (3.0, "shaft_compliance")])
 def test_a_shaft_that_cannot_ring_is_implausible(damping_ratio, implausible):
     """The ends of s J and (1 - s) J oscillate at sqrt(k / (s (1 - s) J)), damped by d / (2 s (1 - s) J)."""
     stiffness, share = 2.0, 0.6
     reduced = share * (1 - share) * PAPER["J"]
     rate = np.sqrt(stiffness / reduced)
-    shaft = ShaftCompliance(
-        *map(np.asarray, (stiffness, damping_ratio * 2 * rate * reduced, share))
-    )
+    shaft = ShaftCompliance(*map(np.asarray, (stiffness, damping_ratio * 2 * rate * reduced, share)))
     motor = Motor(**{n: np.asarray(x) for n, x in PAPER.items()}, effects=(shaft,))
     assert implausible_effect(motor) == implausible
 
@@ -476,17 +440,9 @@ def test_rounding_errors_of_a_coarse_reading_are_no_evidence():
             for x in (speed[..., None], np.ones((len(speed), 1, 1)), np.round(speed) - speed, speed)
         )
         errors = rounding_errors(RunSeries(shared, own, residual, simulated), seed)
-        parts = (
-            shared.values,
-            (speed * np.abs(speed))[..., None],
-            errors,
-            residual.values[..., None],
-        )
+        parts = (shared.values, (speed * np.abs(speed))[..., None], errors, residual.values[..., None])
         rows = np.concatenate([*parts, own.values], -1)[:, 0] * np.sqrt(12)
-        evidence, drag = (
-            gather_evidence([[rows]], 1, 1, rounding_errors=ROUNDING_DRAWS),
-            Block((1,)),
-        )
+        evidence, drag = (gather_evidence([[rows]], 1, 1, rounding_errors=ROUNDING_DRAWS), Block((1,)))
         gain = evidence.regress().squares - evidence.regress([drag]).squares
         noise = evidence.rounding_dispersion(drag)
         false_alarms["as if white"] += stats.chi2.sf(gain, 1) < 0.01
@@ -508,15 +464,12 @@ def test_rounding_errors_of_a_coarse_reading_are_no_evidence():
 def test_only_rounding_without_dither_is_coarse(read, coarse):
     exact, known = np.linspace(0, 20, 2000)[:, None], np.ones(2000, bool)
     left, simulated = (
-        Series(0.5 * x, known, (1e-3, (0,)))
-        for x in (read(exact, np.random.default_rng(0)) - exact, exact)
+        Series(0.5 * x, known, (1e-3, (0,))) for x in (read(exact, np.random.default_rng(0)) - exact, exact)
     )
     errors = rounding_errors(RunSeries(simulated, simulated, left, simulated), 0)
     assert bool(errors.any()) is coarse
     assert np.abs(errors).max() <= 0.25 + 1e-12
-    assert np.array_equal(
-        errors, rounding_errors(RunSeries(simulated, simulated, left, simulated), 0)
-    )
+    assert np.array_equal(errors, rounding_errors(RunSeries(simulated, simulated, left, simulated), 0))
 
 
 # ---------------------------------------------------------------------------------- the noise
@@ -558,9 +511,7 @@ def test_the_filter_omits_rows_that_need_missing_samples():
 # ------------------------------------------------------------------------- lines in the spectrum
 
 
-def spectra_with_oscillations(
-    hertz: Sequence[float], drive_hertz: float | None = None, size: float = 1.5
-):
+def spectra_with_oscillations(hertz: Sequence[float], drive_hertz: float | None = None, size: float = 1.5):
     """Spectra of runs of 4, 6, 8, ... s of coloured noise, each with an oscillation of a given frequency."""
     found = []
     for k, f in enumerate(hertz):
@@ -603,9 +554,7 @@ def test_a_line_of_the_drive_is_ignored():
 def test_a_line_to_which_a_controller_reacts_is_found():
     """It is in the voltage, too, but far weaker. Two runs are enough if it is far clearer in one of them."""
     free, controlled = spectra_with_oscillations([7.3] * 2, size=6.0)
-    controlled = controlled._replace(
-        driving=np.maximum(controlled.driving, controlled.residual / 20)
-    )
+    controlled = controlled._replace(driving=np.maximum(controlled.driving, controlled.residual / 20))
     line = common_line([free, controlled])
     assert line.low < 7.3 < line.high
     driven = controlled._replace(driving=controlled.residual)
@@ -687,9 +636,7 @@ def test_the_response_lasts_while_the_rotor_coasts(x64):
     drag = EFFECTS["quadratic_drag"](drag_Nms2_rad2=jnp.asarray(1e-9))
     bare = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()})
     own = RunUnknowns.as_recorded(tape)
-    without, with_it = (
-        free_run(bare.with_effects(e), tape, own) for e in ([brushes], [brushes, drag])
-    )
+    without, with_it = (free_run(bare.with_effects(e), tape, own) for e in ([brushes], [brushes, drag]))
     path = path_of(without, tape, jnp.zeros(1), False, True)
     motor = bare.with_effects([drag])
     found = respond(bare, tape, path, kicks(motor, bare, tape, path)[..., None])[..., 0]

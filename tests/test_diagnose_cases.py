@@ -22,27 +22,18 @@ from pmdc_jax.report.diagnosis_sentences import verdict_sentences
 
 def excitations(rng: np.random.Generator) -> dict[str, vb.Excitation]:
     """Three short runs, in both directions."""
-    return {
-        "prbs": vb.prbs(rng, 2.0),
-        "triangle": vb.slow_triangle(2.0),
-        "loaded": vb.loaded(rng, 2.0),
-    }
+    return {"prbs": vb.prbs(rng, 2.0), "triangle": vb.slow_triangle(2.0), "loaded": vb.loaded(rng, 2.0)}
 
 
 def recorded(motor: vb.BenchMotor, seed: int, noise: vb.Noise) -> list[Recording]:
     """Runs of the virtual bench, which shares no code with the package."""
     rng = np.random.default_rng(seed)
-    return [
-        recording(name, vb.record(motor, excitation, rng, noise))
-        for name, excitation in excitations(rng).items()
-    ]
+    return [recording(name, vb.record(motor, excitation, rng, noise)) for name, excitation in excitations(rng).items()]
 
 
 NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5)
 QUIET = vb.Noise(current_A=0.012, speed_rad_s=0.2)
-WITH_TORQUE_NOISE = vb.Noise(
-    current_A=0.1, speed_rad_s=0.5, torque_Nm=0.01, torque_correlation_s=0.02
-)
+WITH_TORQUE_NOISE = vb.Noise(current_A=0.1, speed_rad_s=0.5, torque_Nm=0.01, torque_correlation_s=0.02)
 
 
 @pytest.mark.slow
@@ -56,9 +47,7 @@ def test_a_noise_free_simulation_has_no_missing_effect():
 
 
 @pytest.mark.parametrize(
-    "noise",
-    [pytest.param(NOISE, marks=pytest.mark.slow), WITH_TORQUE_NOISE],
-    ids=["white", "coloured"],
+    "noise", [pytest.param(NOISE, marks=pytest.mark.slow), WITH_TORQUE_NOISE], ids=["white", "coloured"]
 )
 def test_hidden_friction_is_named_and_closes_the_gap(noise):
     truth = vb.BenchMotor(**PAPER, coulomb_Nm=0.08)
@@ -85,15 +74,11 @@ def test_hidden_friction_is_named_and_closes_the_gap(noise):
 @pytest.mark.slow
 def test_heating_is_named_although_a_run_begins_warm():
     """With all runs cold at the start, heating would leave twice the noise in the current of one of them."""
-    truth = vb.BenchMotor(
-        **PAPER, copper_alpha_per_K=0.00393, thermal_resistance_K_per_W=0.3, thermal_time_s=2.0
-    )
+    truth = vb.BenchMotor(**PAPER, copper_alpha_per_K=0.00393, thermal_resistance_K_per_W=0.3, thermal_time_s=2.0)
     rng = np.random.default_rng(29)
     runs = [
         recording(name, vb.record(truth, excitation, rng, NOISE, (0.0, 0.0, warmer_K)))
-        for (name, excitation), warmer_K in zip(
-            excitations(rng).items(), (0.0, 25.0, 5.0), strict=True
-        )
+        for (name, excitation), warmer_K in zip(excitations(rng).items(), (0.0, 25.0, 5.0), strict=True)
     ]
     found = diagnose(runs)
     assert found.verdict == "named"
@@ -231,9 +216,7 @@ def test_a_constant_load_is_not_detectable_beside_an_unknown_load():
 def test_coulomb_friction_is_named_in_the_packaged_sample():
     """As in `pmdc demo`: 12 mN m, with torque noise."""
     folder = resources.files("pmdc_jax") / "sample"
-    runs = [
-        read_recording(folder / f"{n}.csv") for n in ("staircase", "prbs", "triangle", "loaded")
-    ]
+    runs = [read_recording(folder / f"{n}.csv") for n in ("staircase", "prbs", "triangle", "loaded")]
     found = diagnose(runs, [read_recording(folder / "drive.csv")])
     assert found.verdict == "named"
     (effect,) = found.effects
@@ -275,9 +258,7 @@ def test_stribeck_friction_too_weak_to_detect_remains_a_rival_of_coulomb_frictio
 def test_a_weak_effect_beside_a_strong_one_is_named():
     """A dead zone explains hundreds of times as much, but none of the misfit of the mechanical equation."""
     coulomb = 0.008
-    plant = Plant(
-        **PAPER, dead_zone_V=1.0, friction_forward_Nm=coulomb, friction_backward_Nm=coulomb
-    )
+    plant = Plant(**PAPER, dead_zone_V=1.0, friction_forward_Nm=coulomb, friction_backward_Nm=coulomb)
     held_out, *training = recorded_from(plant, 12, NOISE)
     found = diagnose(training, [held_out])
     assert found.verdict == "named"
@@ -346,9 +327,7 @@ def test_a_load_that_exceeds_friction_is_named_with_it():
     filter estimated from such short runs takes the difference for noise."""
     motor = {"R": 4.0, "L": 2e-3, "Kb": 0.012, "Kt": 0.012, "J": 1e-6, "f": 1.5e-6}
     coulomb, weight = 3e-3, 4e-3
-    plant = Plant(
-        **motor, friction_forward_Nm=coulomb, friction_backward_Nm=coulomb, load_Nm=weight
-    )
+    plant = Plant(**motor, friction_forward_Nm=coulomb, friction_backward_Nm=coulomb, load_Nm=weight)
     rng, time, runs = np.random.default_rng(31), 0.01 * np.arange(600), []
     for name, voltage in {
         "steps": np.repeat(rng.choice([0.0, 3.6, 6.0, 8.4, 10.8], 24), 25),
@@ -360,9 +339,7 @@ def test_a_load_that_exceeds_friction_is_named_with_it():
     found = diagnose(runs, unloaded=True, tie=[("Kt", "Kb")])
     assert found.verdict == "named"
     by_name = {effect.name: effect.parameters["torque_Nm"].value for effect in found.effects}
-    assert by_name == pytest.approx(
-        {"coulomb_friction": coulomb, "constant_load": weight}, rel=0.01
-    )
+    assert by_name == pytest.approx({"coulomb_friction": coulomb, "constant_load": weight}, rel=0.01)
     assert found.final.missed == {}  # the residuals are the noise of encoder and current sensor
 
 
@@ -391,13 +368,7 @@ def test_an_eccentric_weight_behind_a_gear_is_not_in_the_library():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "factor", "friction"),
-    [
-        ("Kb", 0.97, 0.0),
-        ("R", 1.1, 0.08),
-        ("J", 1.6, 0.0),
-        ("f", 1.5, 0.0),
-    ],
+    ("name", "factor", "friction"), [("Kb", 0.97, 0.0), ("R", 1.1, 0.08), ("J", 1.6, 0.0), ("f", 1.5, 0.0)]
 )
 def test_a_parameter_that_differs_in_one_run_is_told(name, factor, friction):
     """The residuals are far above the noise, but no term that the runs share explains them."""

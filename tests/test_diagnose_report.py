@@ -135,9 +135,7 @@ def test_a_wrong_formula_is_considered_if_residuals_exceed_the_noise():
 def test_sentences_for_a_named_effect():
     text = words(named())
     location = "disagree in the mechanical equation, below 20.0 rad/s, in both directions."
-    found = (
-        "Stribeck friction (coulomb 61.20 mN·m, static 148.00 mN·m, speed 11.00 rad/s; p < 0.001)"
-    )
+    found = "Stribeck friction (coulomb 61.20 mN·m, static 148.00 mN·m, speed 11.00 rad/s; p < 0.001)"
     assert location in text
     assert f"Missing: {found}. Added to the model." in text
     assert "Hold-out error from 4.90 to 1.02 times the noise: 99.80 % of the gap is closed." in text
@@ -221,10 +219,7 @@ def test_sentences_for_an_effect_that_is_not_in_the_library():
     assert "over speed, most significant with −30.0 mN·m at 40.0 rad/s" in text
     partial = words(evolve(not_in_library(), effects=named().effects))
     assert "Stribeck friction (" in partial
-    assert (
-        "explains part of this and was added to the model; no effect of the library explains the rest."
-        in partial
-    )
+    assert "explains part of this and was added to the model; no effect of the library explains the rest." in partial
     gap = {"train": Gap(4.0, 1.0, 1.0), "holdout": Gap(5.0, 3.0, 1.0)}
     held_out = words(evolve(not_in_library(), effects=named().effects, gap=gap))
     assert "explains part of this and was added to the model." in held_out
@@ -258,27 +253,15 @@ def test_a_small_rest_of_a_large_hold_out_gap_does_not_refute_an_effect(before, 
     [
         ("speed", [(-20.0, 0.0), (0.0, 18.0)], 100.0, "below 20.0 rad/s, in both directions"),
         ("speed", [(-99.0, 99.0)], 100.0, "at every speed, in both directions"),
-        (
-            "speed",
-            [(-60.0, -30.0), (32.0, 60.0)],
-            None,
-            "from 30.0 to 60.0 rad/s, in both directions",
-        ),
+        ("speed", [(-60.0, -30.0), (32.0, 60.0)], None, "from 30.0 to 60.0 rad/s, in both directions"),
         ("speed", [(5.0, 20.0), (20.0, 30.0)], None, "from 5.00 to 30.0 rad/s"),
-        (
-            "speed",
-            [(-100.0, -50.0), (5.0, 20.0)],
-            None,
-            "from −100 to −50.0 rad/s and from 5.00 to 20.0 rad/s",
-        ),
+        ("speed", [(-100.0, -50.0), (5.0, 20.0)], None, "from −100 to −50.0 rad/s and from 5.00 to 20.0 rad/s"),
         ("current", [(3.0, 4.0)], None, "at a current from 3.00 to 4.00 A"),
         ("time", [(0.25, 0.5)], None, "from 25.0 % to 50.0 % of the run"),
     ],
 )
 def test_intervals_in_words(variable, intervals, reach, text):
-    assert (
-        intervals_in_words(variable, intervals, reach).replace(notation.NARROW_SPACE, " ") == text
-    )
+    assert intervals_in_words(variable, intervals, reach).replace(notation.NARROW_SPACE, " ") == text
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
@@ -298,15 +281,7 @@ def test_json_has_the_documented_keys(case):
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert found["verdict"] == case
     assert found["summary"] == verdict_sentences(diagnosis)
-    assert set(found) >= {
-        "parameters",
-        "unidentified_directions",
-        "fit",
-        "noise",
-        "converged",
-        "seed",
-        "seconds",
-    }
+    assert set(found) >= {"parameters", "unidentified_directions", "fit", "noise", "converged", "seed", "seconds"}
     assert set(found["gap"]) == {"train", "holdout", "closed_fraction"}
     for effect in found["effects"]:
         assert set(effect) == {"name", "equation", "parameters", "p_value", "also_possible"}
@@ -329,9 +304,7 @@ def test_json_contains_the_values():
     assert diagnosis_json(not_in_library())["curves"][0]["value"] == [0.0, 0.001, -0.03, 0.0]
 
 
-@pytest.mark.parametrize(
-    ("effect", "warns"), [("speed_sensor_delay", False), ("coulomb_friction", True)]
-)
+@pytest.mark.parametrize(("effect", "warns"), [("speed_sensor_delay", False), ("coulomb_friction", True)])
 def test_a_warning_is_not_repeated_for_a_motor_with_the_effect_of_which_it_warns(effect, warns):
     finding = Finding("run", "speed", "warning", "late", "at edges", "shift", LATE_SPEED)
     values = dict.fromkeys(EFFECTS[effect].ranges, 0.01)

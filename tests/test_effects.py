@@ -23,14 +23,7 @@ from pmdc_jax.effects.sine import cosine, sine
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import Motor
 from pmdc_jax.recordings.recording import OVER_BOTH, OVER_LAST, Averaging, Recording
-from pmdc_jax.simulate import (
-    UNKNOWNS_PER_RUN,
-    RunUnknowns,
-    Tape,
-    free_run,
-    sensitivities,
-    squared_errors,
-)
+from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, free_run, sensitivities, squared_errors
 
 STARTS = ((5.0, 60.0), (-3.0, -8.0), (0.0, 0.0))  # current A, speed rad/s of each run
 
@@ -106,10 +99,7 @@ def rates_with_ripple(x, v, load, values):
 def rates_with_saturation(x, v, load, values):
     flux = 1 / (1 + values["per_A2"] * x[0] ** 2)
     emf = 1 - values["emf_share"] * (1 - flux)
-    return [
-        current_rate(x[0], emf * x[1], v),
-        acceleration(x[0], x[1], load, Kt=PAPER["Kt"] * flux),
-    ]
+    return [current_rate(x[0], emf * x[1], v), acceleration(x[0], x[1], load, Kt=PAPER["Kt"] * flux)]
 
 
 def rates_of_two_inertias(x, v, load, values, torque):
@@ -148,10 +138,7 @@ WAVE = {"phase_rad": 0.7, "periods": 6.0}
 
 CASES = {
     "coulomb_friction": Case(
-        {"torque_Nm": 0.15},
-        "torque_Nm",
-        bench=lambda p: {"coulomb_Nm": p["torque_Nm"]},
-        tolerance=2e-3,
+        {"torque_Nm": 0.15}, "torque_Nm", bench=lambda p: {"coulomb_Nm": p["torque_Nm"]}, tolerance=2e-3
     ),
     "stribeck_friction": Case(
         {"coulomb_Nm": 0.1, "static_Nm": 0.2, "speed_rad_s": 15.0},
@@ -196,25 +183,14 @@ CASES = {
         dissipates=False,
     ),
     "gear_backlash": Case(
-        {
-            "gap_rad": 0.1,
-            "stiffness_Nm_rad": 10.0,
-            "damping_Nms_rad": 3e-3,
-            "load_share": 0.5,
-        },
+        {"gap_rad": 0.1, "stiffness_Nm_rad": 10.0, "damping_Nms_rad": 3e-3, "load_share": 0.5},
         "",
         rates=rates_with_backlash,
-        start=lambda w, load, p: [
-            w,
-            load / p["stiffness_Nm_rad"] + np.sign(load) * p["gap_rad"] / 2,
-        ],
+        start=lambda w, load, p: [w, load / p["stiffness_Nm_rad"] + np.sign(load) * p["gap_rad"] / 2],
         dissipates=False,
     ),
     "brush_voltage_drop": Case(
-        {"voltage_V": 1.2},
-        "voltage_V",
-        bench=lambda p: {"brush_drop_V": p["voltage_V"]},
-        tolerance=1e-3,
+        {"voltage_V": 1.2}, "voltage_V", bench=lambda p: {"brush_drop_V": p["voltage_V"]}, tolerance=1e-3
     ),
     "resistance_heating": Case(
         {"rise_per_W": 1e-2, "time_constant_s": 0.3},
@@ -223,10 +199,7 @@ CASES = {
         start=lambda w, load, p: [0.0],
     ),
     "torque_constant_saturation": Case(
-        {"per_A2": 3e-4, "emf_share": 0.4},
-        "per_A2",
-        rates=rates_with_saturation,
-        dissipates=False,
+        {"per_A2": 3e-4, "emf_share": 0.4}, "per_A2", rates=rates_with_saturation, dissipates=False
     ),
     "inductance_saturation": Case(
         {"per_A2": 5e-4},
@@ -241,9 +214,7 @@ CASES = {
     "input_dead_zone": Case(
         {"width_V": 1.5},
         "width_V",
-        rates=lambda x, v, load, p: linear_rates(
-            x, np.sign(v) * max(abs(v) - p["width_V"], 0.0), load, p
-        ),
+        rates=lambda x, v, load, p: linear_rates(x, np.sign(v) * max(abs(v) - p["width_V"], 0.0), load, p),
     ),
     "speed_sensor_lag": Case(
         {"time_constant_s": 5e-3},
@@ -254,11 +225,7 @@ CASES = {
         dissipates=False,
     ),
     "speed_sensor_delay": Case(
-        {"delay_s": 3.4e-3},
-        "delay_s",
-        rates=linear_rates,
-        reported=lambda x, p: x[:2],
-        dissipates=False,
+        {"delay_s": 3.4e-3}, "delay_s", rates=linear_rates, reported=lambda x, p: x[:2], dissipates=False
     ),
     "current_sensor_offset": Case(
         {"offset_A": 4.0},
@@ -273,8 +240,7 @@ every_effect = pytest.mark.parametrize("name", EFFECTS)
 # one that sticks, one of the winding, one with a state of its own: the others take minutes to compile
 FAST_TO_COMPILE = {"coulomb_friction", "brush_voltage_drop", "resistance_heating"}
 each_simulated = pytest.mark.parametrize(
-    "name",
-    [n if n in FAST_TO_COMPILE else pytest.param(n, marks=pytest.mark.slow) for n in EFFECTS],
+    "name", [n if n in FAST_TO_COMPILE else pytest.param(n, marks=pytest.mark.slow) for n in EFFECTS]
 )
 
 
@@ -311,8 +277,7 @@ RUNS = recordings()
 def averaged(runs: list[Recording], *means: Averaging | None) -> list[Recording]:
     """The runs with speeds that are such means; beside a mean over the last sample, so is the current."""
     return [
-        evolve(run, averaging=mean, current_averaged=mean == OVER_LAST)
-        for run, mean in zip(runs, means, strict=True)
+        evolve(run, averaging=mean, current_averaged=mean == OVER_LAST) for run, mean in zip(runs, means, strict=True)
     ]
 
 
@@ -320,10 +285,7 @@ def simulated(motor: Motor, runs: list[Recording]) -> list[np.ndarray]:
     """Current and speed of every run, (samples, 2)."""
     tape = Tape.from_recordings(runs)
     outputs = free_run(motor, tape)
-    return [
-        np.stack([tape.samples_of(k, outputs[:, c], len(run)) for c in range(2)], 1)
-        for k, run in enumerate(runs)
-    ]
+    return [np.stack([tape.samples_of(k, outputs[:, c], len(run)) for c in range(2)], 1) for k, run in enumerate(runs)]
 
 
 def reference(name: str, run: Recording) -> np.ndarray:
@@ -333,9 +295,7 @@ def reference(name: str, run: Recording) -> np.ndarray:
     start = (run.current[0], run.speed[0])
     if case.bench:
         motor = dataclasses.replace(vb.paper_motor(), **case.bench(values))
-        return vb.simulate(motor, vb.Excitation(run.time, run.voltage, run.load), (*start, 0.0))[
-            :, :2
-        ]
+        return vb.simulate(motor, vb.Excitation(run.time, run.voltage, run.load), (*start, 0.0))[:, :2]
     if case.friction:
         return integrated_with_sticking(case, run)
     own = case.start(run.speed[0], run.load[0], values) if case.start else []
@@ -413,9 +373,7 @@ def _integrate_to_next_change(case, t, end, x, v, load, inside, sampled):
 
     start, event = t, slips if sticks else stops
     event.terminal, event.direction = True, 1 if sticks else -1
-    solved = solve_ivp(
-        rates, (t, end), x, events=event, dense_output=True, max_step=2e-3, **PRECISE
-    )
+    solved = solve_ivp(rates, (t, end), x, events=event, dense_output=True, max_step=2e-3, **PRECISE)
     now = (inside >= t - 1e-12) & (inside < solved.t[-1] + 1e-12)
     if now.any():
         sampled[:, now] = solved.sol(np.maximum(inside[now], t))
@@ -452,9 +410,7 @@ def mean_reference(name: str, run: Recording) -> np.ndarray:
     """Mean currents and speeds of a run, (samples, 2), NaN where they are no means: from differences of charge and
     angle, which are integrated by the trapezoidal rule in fine steps."""
     step = run.sample_time / FINE_STEPS
-    finely = {
-        c: np.repeat(getattr(run, c), FINE_STEPS) for c in ("voltage", "load", "current", "speed")
-    }
+    finely = {c: np.repeat(getattr(run, c), FINE_STEPS) for c in ("voltage", "load", "current", "speed")}
     fine = Recording("fine", step * np.arange(FINE_STEPS * len(run)), **finely)
     outputs = reference(name, fine)
     integral = cumulative_trapezoid(outputs, dx=step, axis=0, initial=0.0)[::FINE_STEPS]
@@ -468,9 +424,7 @@ def mean_reference(name: str, run: Recording) -> np.ndarray:
 @pytest.mark.parametrize(
     "name",
     [
-        n
-        if n in FAST_TO_COMPILE | {"speed_sensor_delay", "constant_load"}
-        else pytest.param(n, marks=pytest.mark.slow)
+        n if n in FAST_TO_COMPILE | {"speed_sensor_delay", "constant_load"} else pytest.param(n, marks=pytest.mark.slow)
         for n in EFFECTS
     ],
 )
@@ -478,9 +432,7 @@ def test_means_agree_with_an_independent_integrator(x64, name):
     """Means over the last sample or two, as from encoder counts; at 2 ms, within which the acceleration changes."""
     runs = averaged(recordings(2e-3), OVER_LAST, OVER_BOTH, OVER_LAST)
     expected = np.concatenate([mean_reference(name, run) for run in runs])
-    found, sampled = (
-        np.concatenate(simulated(with_effect(name), of)) for of in (runs, recordings(2e-3))
-    )
+    found, sampled = (np.concatenate(simulated(with_effect(name), of)) for of in (runs, recordings(2e-3)))
     size = np.nanmax(np.abs(expected), axis=0)
     differing, error = (np.nanmax(np.abs(x - expected), axis=0) / size for x in (sampled, found))
     assert (differing > 0.02).all(), "the means hardly differ from samples"
@@ -499,10 +451,7 @@ def test_a_torque_wave_with_about_one_period_or_more_per_sample(x64, name, max_r
     fast = recordings(voltage=24.0, load=0.0, current=2.4, speed=480.0)
     start, turning = np.array([2.4, 480.0, 0.0]), CASES[name]._replace(values=values)
     expected = np.concatenate([integrated(turning, run, start, run.time)[1] for run in fast])
-    plain, found = (
-        np.concatenate(simulated(motor, fast))[:, 1]
-        for motor in (LINEAR, with_effect(name, values))
-    )
+    plain, found = (np.concatenate(simulated(motor, fast))[:, 1] for motor in (LINEAR, with_effect(name, values)))
     assert np.std(found - expected) < max_ratio * np.std(plain - expected)
 
 
@@ -533,8 +482,7 @@ def test_a_locked_rotor_stays_at_rest(x64, name):
 def test_slow_sampling_is_as_accurate(x64, name):
     """At 10 ms, five times L / R, in equal steps of at most a millisecond; a delay is a fraction of a sample."""
     runs = [
-        Recording(r.name, *(c[:64] for c in (r.time, r.voltage, r.current, r.speed, r.load)))
-        for r in recordings(1e-2)
+        Recording(r.name, *(c[:64] for c in (r.time, r.voltage, r.current, r.speed, r.load))) for r in recordings(1e-2)
     ]
     found = relative_errors(simulated(with_effect(name), runs), [reference(name, r) for r in runs])
     assert found[0] < CASES[name].tolerance, found
@@ -552,8 +500,7 @@ def test_a_strongly_saturated_inductance_is_nearly_as_accurate(x64):
 
 
 @pytest.mark.parametrize(
-    ("gap_rad", "drag"),
-    [(1e-3, 0.0), (0.07, 0.0), pytest.param(0.07, 6e-5, marks=pytest.mark.slow)],
+    ("gap_rad", "drag"), [(1e-3, 0.0), (0.07, 0.0), pytest.param(0.07, 6e-5, marks=pytest.mark.slow)]
 )
 def test_stiff_teeth_are_nearly_as_accurate(x64, gap_rad, drag):
     """They ring at 840 Hz, about once per sample, as those of real gears do; also with drag, which is not linear."""
@@ -602,9 +549,7 @@ def test_a_run_may_begin_with_a_twisted_shaft(x64, name):
     case, tape, twist = CASES[name], Tape.from_recordings(RUNS), 0.02
     expected = []
     for run in RUNS:
-        start = np.array(
-            [run.current[0], run.speed[0], *case.start(run.speed[0], run.load[0], case.values)]
-        )
+        start = np.array([run.current[0], run.speed[0], *case.start(run.speed[0], run.load[0], case.values)])
         start[-1] += twist
         expected.append(integrated(case, run, start, run.time)[:2])
     twisted = RunUnknowns.as_recorded(tape)._replace(twist=jnp.full(tape.runs, twist))
@@ -615,24 +560,19 @@ def test_a_run_may_begin_with_a_twisted_shaft(x64, name):
             assert np.max(np.abs(found - right[channel])) < case.tolerance * np.max(right[channel])
 
 
-@pytest.mark.parametrize(
-    "name", ["shaft_compliance", pytest.param("gear_backlash", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("name", ["shaft_compliance", pytest.param("gear_backlash", marks=pytest.mark.slow)])
 def test_a_constant_load_acts_on_the_same_inertia_as_a_recorded_one(x64, name):
     """On the load's side of the shaft or gear, which it twists already before a run begins."""
     weight, motor = 0.1, with_effect(name)
     loaded = motor.with_effects([*motor.effects, EFFECTS["constant_load"](jnp.asarray(weight))])
     tape, heavier = (
-        Tape.from_recordings([evolve(run, load=run.load + more) for run in RUNS])
-        for more in (0.0, weight)
+        Tape.from_recordings([evolve(run, load=run.load + more) for run in RUNS]) for more in (0.0, weight)
     )
     found = free_run(loaded, tape, RunUnknowns.as_recorded(tape))
     expected = free_run(motor, heavier, RunUnknowns.as_recorded(heavier))
     for k, run in enumerate(RUNS):
         for channel in range(2):
-            both, one = (
-                tape.samples_of(k, outputs[:, channel], len(run)) for outputs in (found, expected)
-            )
+            both, one = (tape.samples_of(k, outputs[:, channel], len(run)) for outputs in (found, expected))
             np.testing.assert_allclose(both, one, rtol=1e-9, atol=1e-9)
 
 
@@ -701,11 +641,7 @@ def test_sensitivities_match_central_differences(x64, name):
             assert not jacobian[..., column].any()
             continue
         error = np.linalg.norm(jacobian[..., column] - expected) / np.linalg.norm(expected)
-        assert error < CASES[name].slope_tolerance, (
-            column,
-            parameters.names[column : column + 1],
-            error,
-        )
+        assert error < CASES[name].slope_tolerance, (column, parameters.names[column : column + 1], error)
 
 
 @each_simulated
@@ -722,9 +658,7 @@ def test_squared_errors_of_the_search_match_the_free_run(x64, name):
 STIFF = "R or L several times that of the linear part, on a stiff motor: diverges"
 CHAOS = "1 kN m at 200 periods a turn: the sensitivity of a block's end to its start overflows"
 STIFF_TEETH = "teeth that ring hundreds of times in the shortest of steps: diverges"
-STIFF_DRAG = (
-    "a ship's drag on a small motor stops it within a millionth of the shortest step: diverges"
-)
+STIFF_DRAG = "a ship's drag on a small motor stops it within a millionth of the shortest step: diverges"
 STIFF_DAMPING = "a ship's damping without a spring, on a small motor: its exponential overflows"
 NOT_FINITE = {
     "quadratic_drag": STIFF_DRAG,

@@ -29,12 +29,8 @@ def fitted(current_mean_samples: int = 1, voltage_noise: float = 0.0) -> Model:
     rng, runs = np.random.default_rng(11), []
     excitations = {"prbs": vb.prbs(rng, 2.0), "triangle": vb.slow_triangle(2.0)}
     for name, excitation in excitations.items():
-        applied = excitation.voltage * (
-            1 + voltage_noise * rng.standard_normal(len(excitation.time))
-        )
-        columns = vb.record(
-            vb.BenchMotor(**MOTOR), excitation._replace(voltage=applied), rng, SLOW_TORQUE
-        )
+        applied = excitation.voltage * (1 + voltage_noise * rng.standard_normal(len(excitation.time)))
+        columns = vb.record(vb.BenchMotor(**MOTOR), excitation._replace(voltage=applied), rng, SLOW_TORQUE)
         columns["voltage_V"] = excitation.voltage
         average = np.ones(current_mean_samples) / current_mean_samples
         columns["current_A"] = lfilter(average, 1.0, columns["current_A"])
@@ -94,11 +90,7 @@ def test_a_hidden_shaft_causes_no_electrical_misfit():
 def test_brushes_whose_drop_sets_in_gradually_cause_no_electrical_misfit():
     """With only a drop of constant size it would be 1.6."""
     small = {"R": 1.2, "L": 1.5e-3, "Kb": 0.022, "Kt": 0.022, "J": 8.4e-6, "f": 6e-6}
-    plant, rng, runs = (
-        Plant(**small, brush_V=0.85, brush_onset_A=0.12),
-        np.random.default_rng(3),
-        [],
-    )
+    plant, rng, runs = (Plant(**small, brush_V=0.85, brush_onset_A=0.12), np.random.default_rng(3), [])
     for name in ("first", "second"):
         steps = np.repeat(rng.uniform(-10, 10, 50), 40)
         excitation = vb.Excitation(1e-3 * np.arange(2000), steps, np.zeros(2000))

@@ -7,26 +7,18 @@ import pytest
 from experiments import emps, undcmotor
 from experiments.data import available
 
-needs_emps = pytest.mark.skipif(
-    not available("emps"), reason="the EMPS records are absent (see experiments/data.py)"
-)
+needs_emps = pytest.mark.skipif(not available("emps"), reason="the EMPS records are absent (see experiments/data.py)")
 needs_undcmotor = pytest.mark.skipif(
     not available("undcmotor"), reason="the UNDCMotor records are absent (see experiments/data.py)"
 )
 # The force is fed back from position, so unmodelled effects bias an output-error fit.
 free_run = pytest.mark.xfail(
-    reason="free-run error of speed is minimised, not the error of force",
-    raises=AssertionError,
-    strict=True,
+    reason="free-run error of speed is minimised, not the error of force", raises=AssertionError, strict=True
 )
 
 VISCOUS_ONLY, COULOMB_AND_OFFSET = "viscous only", "Coulomb + offset"
 # Force errors of plain least squares, %, on the estimation and the validation record, from the README of the data
-FORCE_ERRORS = {
-    "viscous only": (17.9, 17.8),
-    "viscous + offset": (17.0, 16.9),
-    "Coulomb + offset": (4.04, 5.94),
-}
+FORCE_ERRORS = {"viscous only": (17.9, 17.8), "viscous + offset": (17.0, 16.9), "Coulomb + offset": (4.04, 5.94)}
 
 
 @cache

@@ -32,12 +32,7 @@ from pmdc_jax.identify.fit.refine import Optimum, refine
 from pmdc_jax.identify.fit.run_unknowns import fit_run_unknowns
 from pmdc_jax.identify.identification import CONVERGED_DISTANCE, Identification
 from pmdc_jax.identify.noise.noise_model import fit_whitener
-from pmdc_jax.identify.noise.sensor_noise import (
-    common_divisor,
-    is_coarse,
-    quantum,
-    white_noise,
-)
+from pmdc_jax.identify.noise.sensor_noise import common_divisor, is_coarse, quantum, white_noise
 from pmdc_jax.identify.noise.whitening import Whitening
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.prepare import prepare
@@ -76,10 +71,7 @@ def unloaded(seed: int, motor=PAPER) -> list[Recording]:
     """Two runs without load, whose recordings have no load column."""
     rng = np.random.default_rng(seed)
     excitations = {"first": vb.prbs(rng, 1.0), "second": vb.prbs(rng, 1.0, offset=-4.0)}
-    return [
-        recording(name, vb.record(motor, e, rng, NOISE, load_known=False))
-        for name, e in excitations.items()
-    ]
+    return [recording(name, vb.record(motor, e, rng, NOISE, load_known=False)) for name, e in excitations.items()]
 
 
 def assert_accurate(
@@ -238,9 +230,7 @@ def test_without_a_known_load_the_scale_of_all_torques_changes_nothing(x64):
     coordinates = np.array((parameters.lower + parameters.upper) / 2)
     coordinates[parameters.names.index("constant_load.torque_Nm")] = -0.01
     scaled = parameters.with_torques_scaled(coordinates, 1.7)
-    assert parameters.value("Kt", scaled) == pytest.approx(
-        1.7 * parameters.value("Kt", coordinates)
-    )
+    assert parameters.value("Kt", scaled) == pytest.approx(1.7 * parameters.value("Kt", coordinates))
     before, after = (np.asarray(free_run(parameters(x), tape)) for x in (coordinates, scaled))
     np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-9)
 
@@ -251,9 +241,7 @@ def test_friction_hidden_in_the_unknown_load_is_pointed_out(both_ways, noted):
     rng, runs = np.random.default_rng(12), []
     for name in ("first", "second"):
         excitation = vb.prbs(rng, 1.0, amplitude=8.0, offset=0.0 if both_ways else 14.0)
-        columns = vb.record(
-            replace(PAPER, coulomb_Nm=0.1), excitation, rng, NOISE, load_known=False
-        )
+        columns = vb.record(replace(PAPER, coulomb_Nm=0.1), excitation, rng, NOISE, load_known=False)
         runs.append(recording(name, {q: values[300:] for q, values in columns.items()}))
     notes = [note for note in identify(runs).messages if "unknown load" in note]
     assert len(notes) == (noted is not None)
@@ -402,9 +390,7 @@ def run_of_coil(voltage: np.ndarray, step: float, noise: np.ndarray, **columns) 
     return Recording("held", step * np.arange(len(voltage)), voltage, current + noise, **columns)
 
 
-@pytest.mark.parametrize(
-    "columns", [{"speed": np.zeros(SAMPLES)}, {"angle": np.full(SAMPLES, 0.3)}, {"held": True}]
-)
+@pytest.mark.parametrize("columns", [{"speed": np.zeros(SAMPLES)}, {"angle": np.full(SAMPLES, 0.3)}, {"held": True}])
 def test_a_locked_rotor_identifies_the_electrical_half(columns):
     found = identify([locked_rotor(3, **columns)])
     for name, true in (("R", PAPER.R), ("L", PAPER.L)):
@@ -414,9 +400,7 @@ def test_a_locked_rotor_identifies_the_electrical_half(columns):
     assert found.converged
 
 
-@pytest.mark.parametrize(
-    ("step", "samples"), [(2e-4, 150), pytest.param(5e-6, 2000, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("step", "samples"), [(2e-4, 150), pytest.param(5e-6, 2000, marks=pytest.mark.slow)])
 def test_a_single_rise_of_the_current_identifies_the_electrical_half(step, samples):
     """As recorded by an oscilloscope: a few time constants long, which are far longer than a sample."""
     voltage = np.where(np.arange(samples) < samples // 6, 0.0, 3.0)
@@ -450,9 +434,7 @@ def driven_by_torque(name: str, rng: np.random.Generator) -> Recording:
         angle.append(angle[-1] + final * step + (speed - final) * (1 - decay) / rate)
         speed = final + (speed - final) * decay
     measured = np.array(angle) + 2e-4 * rng.standard_normal(SAMPLES)
-    return Recording(
-        name, step * np.arange(SAMPLES), torque=torque, angle=measured, load=0 * torque
-    )
+    return Recording(name, step * np.arange(SAMPLES), torque=torque, angle=measured, load=0 * torque)
 
 
 def test_torque_and_angle_identify_inertia_and_friction():
@@ -642,9 +624,7 @@ def test_a_converged_fit_is_a_local_optimum(x64, runs):
     best, evaluation = polished.optimum, polished.evaluation
     assert best.converged
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(polished.noise))
-    info = information(
-        evaluation.residuals, evaluation.jacobian, problem.tape.run, np.ones(6, bool), 2
-    )
+    info = information(evaluation.residuals, evaluation.jacobian, problem.tape.run, np.ones(6, bool), 2)
     lowest = squares(problem, best.unknowns)
     for k, spread in enumerate(np.sqrt(np.diag(info.covariance))):
         for sign in (-1, 1):
@@ -783,10 +763,7 @@ def test_a_simulation_with_huge_derivatives_counts_as_failed(x64, runs, monkeypa
     assert np.isfinite(residuals[1:]).all()
 
 
-COVERAGE = {
-    "white": NOISE,
-    "coloured torque": replace(NOISE, torque_Nm=0.02, torque_correlation_s=0.01),
-}
+COVERAGE = {"white": NOISE, "coloured torque": replace(NOISE, torque_Nm=0.02, torque_correlation_s=0.01)}
 
 
 @pytest.mark.parametrize("noise", COVERAGE.values(), ids=COVERAGE.keys())
@@ -798,9 +775,7 @@ def test_standard_errors_match_the_spread_of_the_errors(x64, noise):
         end = refine(problem, start_at(problem))
         polished = polish(problem, end)
         evaluation, unknowns = polished.evaluation, polished.unknowns
-        info = information(
-            evaluation.residuals, evaluation.jacobian, problem.tape.run, np.ones(6, bool), 2
-        )
+        info = information(evaluation.residuals, evaluation.jacobian, problem.tape.run, np.ones(6, bool), 2)
         error = np.asarray(unknowns.coordinates - start_at(problem).coordinates)
         scores.append(error / np.sqrt(np.diag(info.covariance)))
     spread = np.sqrt(np.mean(np.square(scores)))
@@ -887,9 +862,7 @@ def test_an_interrupted_search_still_gives_a_result(runs):
 
 def test_progress_is_reported(runs):
     reports = []
-    identify(
-        runs, progress=lambda what, fitness=None, share=None: reports.append((what, fitness, share))
-    )
+    identify(runs, progress=lambda what, fitness=None, share=None: reports.append((what, fitness, share)))
     shares = [share for _, _, share in reports if share is not None]
     fitness = [f for _, f, share in reports if share is not None]
     assert shares == sorted(shares)
@@ -913,9 +886,7 @@ def test_bounds_of_effects_are_scaled_to_the_recordings(runs):
 
 def test_bounds_are_the_ranges_of_an_effect_if_its_quantity_was_not_recorded(runs):
     """Runs that are driven by torque have no voltage."""
-    driven = [
-        Recording(r.name, r.time, None, None, r.speed, torque=PAPER.Kt * r.current) for r in runs
-    ]
+    driven = [Recording(r.name, r.time, None, None, r.speed, torque=PAPER.Kt * r.current) for r in runs]
     given = EFFECTS["brush_voltage_drop"].ranges["voltage_V"]
     bounds = effect_bounds([EFFECTS["brush_voltage_drop"]], driven)
     assert bounds["brush_voltage_drop.voltage_V"] == (given.lower, given.upper)
@@ -927,18 +898,9 @@ def test_a_run_may_begin_with_a_warm_winding(warmer_K):
     """The bench heats by an integrator of its own. If all began cold, R would be 2.5 % too large, and the heating found
     a quarter too small."""
     alpha, resistance_K_per_W = 0.00393, 0.3
-    motor = replace(
-        PAPER,
-        copper_alpha_per_K=alpha,
-        thermal_resistance_K_per_W=resistance_K_per_W,
-        thermal_time_s=2.0,
-    )
+    motor = replace(PAPER, copper_alpha_per_K=alpha, thermal_resistance_K_per_W=resistance_K_per_W, thermal_time_s=2.0)
     rng = np.random.default_rng(23)
-    driven = {
-        "prbs": vb.prbs(rng, 3.0),
-        "loaded": vb.loaded(rng, 3.0),
-        "held out": vb.prbs(rng, 2.0),
-    }
+    driven = {"prbs": vb.prbs(rng, 3.0), "loaded": vb.loaded(rng, 3.0), "held out": vb.prbs(rng, 2.0)}
     *runs, holdout = (
         recording(name, vb.record(motor, excitation, rng, NOISE, (0.0, 0.0, warmer)))
         for (name, excitation), warmer in zip(driven.items(), warmer_K, strict=True)
@@ -986,13 +948,7 @@ def test_white_noise_does_not_widen_intervals():
         noise = rng.standard_normal((20, 2, 128))
         J = jacobian[..., :2].reshape(-1, 2)
         estimate = np.linalg.lstsq(J, noise.reshape(-1), rcond=None)[0]
-        info = information(
-            noise - jacobian[..., :2] @ estimate,
-            jacobian,
-            np.repeat([0, 1], 10),
-            np.ones(2, bool),
-            2,
-        )
+        info = information(noise - jacobian[..., :2] @ estimate, jacobian, np.repeat([0, 1], 10), np.ones(2, bool), 2)
         factors.append(info.interval_factor)
         inflations.append(info.inflation)
         covered.append(np.abs(estimate) < info.interval_factor * np.sqrt(np.diag(info.covariance)))
@@ -1005,8 +961,7 @@ def test_white_noise_does_not_widen_intervals():
 
 
 @pytest.mark.parametrize(
-    ("coefficient", "samples"),
-    [(-0.5, 4000), (0.0, 4000), (0.5, 4000), (0.9, 20_000), (0.97, 20_000)],
+    ("coefficient", "samples"), [(-0.5, 4000), (0.0, 4000), (0.5, 4000), (0.9, 20_000), (0.97, 20_000)]
 )
 def test_long_run_variance_of_an_autoregression(coefficient, samples):
     """The sum of n terms of x_k = a x_(k-1) + e_k has variance n / (1 - a)^2."""
@@ -1089,9 +1044,7 @@ def behind_a_gear(
     named = [truth[name.removeprefix("gear_backlash.")] for name in given.problem.parameters.names]
     logarithmic = np.asarray(given.problem.parameters.logarithmic)
     coordinates = np.where(logarithmic, np.log(named), named)
-    return given.problem, Unknowns(
-        jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1)))
-    )
+    return given.problem, Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1))))
 
 
 @pytest.mark.slow
@@ -1124,9 +1077,7 @@ def test_a_run_may_begin_anywhere_in_the_backlash(twist):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "options", [{}, {"tie": [("Kt", "Kb")], "known": {"R": PAPER.R}, "Kt": PAPER.Kb}]
-)
+@pytest.mark.parametrize("options", [{}, {"tie": [("Kt", "Kb")], "known": {"R": PAPER.R}, "Kt": PAPER.Kb}])
 def test_a_population_finds_backlash_that_a_gradient_misses(options):
     factors = {"gap_rad": 10.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2}
     error = {"gap_rad": 0.3, "stiffness_Nm_rad": 0.2, "damping_Nms_rad": 3.0, "load_share": 1.5}
@@ -1168,7 +1119,6 @@ def test_a_hold_out_may_begin_at_any_angle(share_of_period):
         exact = start._replace(runs=start.runs._replace(angle=jnp.array([0.0, angle])))
         end = fit_run_unknowns(problem, start)[1]
         fitted, least = (
-            float(jnp.square(evaluation.residuals).sum())
-            for evaluation in (end, evaluate(problem, exact))
+            float(jnp.square(evaluation.residuals).sum()) for evaluation in (end, evaluate(problem, exact))
         )
     assert fitted < 1.01 * least

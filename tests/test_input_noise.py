@@ -26,9 +26,7 @@ def wave(samples: int = 2000) -> np.ndarray:
 
 
 # with a larger `CONFIDENCE_HALF_WIDTH` only a quarter of the noise remained on steps, but bends were rounded
-@pytest.mark.parametrize(
-    ("signal", "remaining"), [(steps(), 0.27), (wave(), 0.6)], ids=["steps", "sine"]
-)
+@pytest.mark.parametrize(("signal", "remaining"), [(steps(), 0.27), (wave(), 0.6)], ids=["steps", "sine"])
 def test_denoising_removes_noise_and_keeps_steps(signal, remaining):
     seen = signal + NOISE * np.random.default_rng(3).standard_normal(len(signal))
     error = denoised(seen) - signal
@@ -49,9 +47,7 @@ def recorded(applied_noise: float, sensor_noise: float) -> list[Recording]:
     runs = {"prbs": vb.prbs(rng, 3.0), "loaded": vb.loaded(rng, 3.0), "stairs": vb.staircase(3.0)}
     found = []
     for name, excitation in runs.items():
-        driven = excitation._replace(
-            voltage=excitation.voltage + applied_noise * noise(rng, excitation)
-        )
+        driven = excitation._replace(voltage=excitation.voltage + applied_noise * noise(rng, excitation))
         columns = vb.record(vb.paper_motor(), driven, rng, vb.Noise(0.1, 0.5))
         columns["voltage_V"] = columns["voltage_V"] + sensor_noise * noise(rng, excitation)
         found.append(recording(name, columns))
@@ -65,12 +61,7 @@ def noise(rng, excitation) -> np.ndarray:
 def errors(found) -> np.ndarray:
     """Errors of the six parameters in standard errors."""
     truth = vb.paper_motor()
-    return np.array(
-        [
-            (found.parameters[n].value - getattr(truth, n)) / found.parameters[n].stderr
-            for n in vb.SIX
-        ]
-    )
+    return np.array([(found.parameters[n].value - getattr(truth, n)) / found.parameters[n].stderr for n in vb.SIX])
 
 
 @pytest.mark.slow
@@ -127,10 +118,7 @@ def run_in_a_speed_loop() -> Recording:
         for _ in range(substeps):
             current_rate = (voltage[k] - motor.R * current - motor.Kb * speed) / motor.L
             acceleration = (motor.Kt * current - motor.f * speed - load[k]) / motor.J
-            current, speed = (
-                current + current_rate * dt / substeps,
-                speed + acceleration * dt / substeps,
-            )
+            current, speed = (current + current_rate * dt / substeps, speed + acceleration * dt / substeps)
     return Recording("loop", dt * np.arange(len(wanted)), voltage, *seen.T)
 
 

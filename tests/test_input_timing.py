@@ -104,10 +104,7 @@ def test_a_smooth_voltage_is_followed_between_its_samples(x64):
     exact = outputs_of_sines(1, 500, run.load)[:, :2]
     by_lines = largest_error(simulated(run, motor_with()), exact)
     rate = TRUE["R"] / TRUE["L"]
-    assert (
-        largest_error(simulated(run, motor_with(), FIRST_ORDER_HOLD._replace(smooth=rate)), exact)
-        < 0.04 * by_lines
-    )
+    assert largest_error(simulated(run, motor_with(), FIRST_ORDER_HOLD._replace(smooth=rate)), exact) < 0.04 * by_lines
 
 
 def test_smooth_voltages_may_jump(x64):
@@ -215,9 +212,7 @@ def test_a_population_is_read_within_a_sample(x64):
     for effects in ((), (EFFECTS["coulomb_friction"](torque_Nm=jnp.zeros(4)),)):
         found = squared_errors(population.with_effects(effects), tape)
         for c, errors in enumerate(found):
-            np.testing.assert_allclose(
-                errors, np.sum(seen[:, c] ** 2 * tape.weight[:, c]), rtol=1e-9
-            )
+            np.testing.assert_allclose(errors, np.sum(seen[:, c] ** 2 * tape.weight[:, c]), rtol=1e-9)
 
 
 # ways in which voltages act and are logged, and the message for each
@@ -325,9 +320,7 @@ def test_what_looks_like_another_inductance_is_found(read, message, truth):
         if read.endswith("early"):
             current, speed = outputs_within(run, int(read[0]), truth)[:, :2].T
         time = STEP * np.arange(len(current))
-        current, speed = (
-            x + s * rng.standard_normal(len(x)) for x, s in ((current, 0.02), (speed, 0.2))
-        )
+        current, speed = (x + s * rng.standard_normal(len(x)) for x, s in ((current, 0.02), (speed, 0.2)))
         runs.append(Recording(run.name, time, voltage, current, speed, load=load))
     found = identify(runs)
     assert message is None or any(message in reported for reported in found.messages)
@@ -339,10 +332,7 @@ def test_what_looks_like_another_inductance_is_found(read, message, truth):
         assert estimate.stderr < (0.3 if name == "L" else 0.02) * truth[name], name
 
 
-@pytest.mark.parametrize(
-    ("tenths", "effects"),
-    [(3, []), (7, ["brush_voltage_drop"])],
-)
+@pytest.mark.parametrize(("tenths", "effects"), [(3, []), (7, ["brush_voltage_drop"])])
 @pytest.mark.slow
 def test_the_timing_of_a_voltage_is_found_beside_brushes(tenths, effects):
     """The electrical equation shows it, although a fit without the drop of the brushes is poor at any timing."""

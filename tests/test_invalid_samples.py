@@ -22,9 +22,7 @@ def test_valid_recordings_are_unchanged(seed):
         assert without_unmeasured([run])[0] is run
 
 
-@pytest.mark.parametrize(
-    ("column", "value"), [("speed", 0.0), ("speed", 65535.0), ("current", 400.0)]
-)
+@pytest.mark.parametrize(("column", "value"), [("speed", 0.0), ("speed", 65535.0), ("current", 400.0)])
 def test_spikes_become_missing_and_are_noted(column, value):
     run = good_run(3, "staircase")
     signal = getattr(run, column).copy()
@@ -122,9 +120,7 @@ def test_a_quantised_speed_that_dwells_at_its_maximum_is_not_clipped(seed):
     levels = np.repeat([20.1, 61.05, 108.95, 81.0, 40.1, 95.4, 70.6, 30.5], 150)
     counts = lfilter([0.1], [1, -0.9], levels) + 0.2 * rng.standard_normal(len(levels))
     time = 1e-3 * np.arange(len(levels))
-    run = Recording(
-        "counts", time, levels / 5, levels / 50 + rng.standard_normal(), np.round(counts)
-    )
+    run = Recording("counts", time, levels / 5, levels / 50 + rng.standard_normal(), np.round(counts))
     assert without_unmeasured([run])[0] is run
     clipped = attrs.evolve(run, speed=np.minimum(counts, 105.0))
     assert any("looks clipped" in note.what for note in without_unmeasured([clipped])[0].notes)

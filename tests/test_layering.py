@@ -27,37 +27,9 @@ ALLOWED_IMPORTS = {
     "motor": {"effects"},
     "motor_file": {"effects", "errors", "files", "json_file", "motor"},
     "simulate": {"effects", "errors", "motor", "motor_file", "recordings", "runtime"},
-    "control": {
-        "effects",
-        "errors",
-        "files",
-        "json_file",
-        "motor",
-        "motor_file",
-        "progress",
-        "runtime",
-        "simulate",
-    },
-    "identify": {
-        "checks",
-        "effects",
-        "errors",
-        "motor",
-        "progress",
-        "recordings",
-        "runtime",
-        "simulate",
-        "words",
-    },
-    "diagnose": {
-        "effects",
-        "identify",
-        "motor",
-        "progress",
-        "recordings",
-        "runtime",
-        "simulate",
-    },
+    "control": {"effects", "errors", "files", "json_file", "motor", "motor_file", "progress", "runtime", "simulate"},
+    "identify": {"checks", "effects", "errors", "motor", "progress", "recordings", "runtime", "simulate", "words"},
+    "diagnose": {"effects", "identify", "motor", "progress", "recordings", "runtime", "simulate"},
     "report": {
         "control",
         "diagnose",
@@ -73,11 +45,7 @@ ALLOWED_IMPORTS = {
 }
 # the parts that compute results, and their modules that only define results; of `control`, only its pipeline computes
 COMPUTING_PARTS = {"diagnose", "identify", "simulate"}
-RESULT_MODULES = {
-    "diagnose/diagnosis.py",
-    "diagnose/hypotheses/effect_relations.py",
-    "identify/identification.py",
-}
+RESULT_MODULES = {"diagnose/diagnosis.py", "diagnose/hypotheses/effect_relations.py", "identify/identification.py"}
 
 
 def part_of(path: Path) -> str:
@@ -127,15 +95,11 @@ def modules_imported(path: Path) -> set[Path]:
 def test_reports_import_results_only():
     for module in (PACKAGE / "report").rglob("*.py"):
         computing = {
-            path
-            for path in modules_imported(module)
-            if part_of(path) in COMPUTING_PARTS or path.name == "pipeline.py"
+            path for path in modules_imported(module) if part_of(path) in COMPUTING_PARTS or path.name == "pipeline.py"
         }
         names = {path.relative_to(PACKAGE).as_posix() for path in computing}
         assert names <= RESULT_MODULES, module.name
-        assert not re.search(
-            r"^\s*(from|import) jax\b", module.read_text(encoding="utf-8"), re.MULTILINE
-        )
+        assert not re.search(r"^\s*(from|import) jax\b", module.read_text(encoding="utf-8"), re.MULTILINE)
 
 
 def test_there_are_no_import_cycles():

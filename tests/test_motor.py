@@ -37,9 +37,7 @@ def plant(m: dict[str, float]) -> control.StateSpace:
         [
             electrical,
             mechanical,
-            control.ss(
-                [], [], [], [[1, -m["Kb"]]], inputs=["voltage", "speed"], outputs="armature"
-            ),
+            control.ss([], [], [], [[1, -m["Kb"]]], inputs=["voltage", "speed"], outputs="armature"),
             control.ss([], [], [], [[m["Kt"], -1]], inputs=["current", "load"], outputs="torque"),
         ],
         inputs=["voltage", "load"],
@@ -54,10 +52,7 @@ OMEGA = np.logspace(-3, 6, 50)
 def test_state_space_matches_the_block_diagram(x64, m):
     A, B = motor(**m).state_space()
     ours = control.ss(A, B, np.eye(2), np.zeros((2, 2)))
-    ours, reference = (
-        ours.frequency_response(OMEGA).frdata,
-        plant(m).frequency_response(OMEGA).frdata,
-    )
+    ours, reference = (ours.frequency_response(OMEGA).frdata, plant(m).frequency_response(OMEGA).frdata)
     np.testing.assert_allclose(ours, reference, rtol=1e-9)
 
 
@@ -78,9 +73,7 @@ def test_the_motor_of_table_1_settles_at_480_rad_per_s(x64):
     A, B = (np.asarray(x) for x in motor().state_space())
     current, speed = np.linalg.solve(A, -B @ [24.0, 0.0])
     assert speed == pytest.approx(480.0, abs=0.05)
-    assert speed == pytest.approx(
-        PAPER["Kt"] * 24 / (PAPER["R"] * PAPER["f"] + PAPER["Kt"] * PAPER["Kb"]), rel=1e-12
-    )
+    assert speed == pytest.approx(PAPER["Kt"] * 24 / (PAPER["R"] * PAPER["f"] + PAPER["Kt"] * PAPER["Kb"]), rel=1e-12)
     assert current == pytest.approx(PAPER["f"] * speed / PAPER["Kt"], rel=1e-12)
     numerators, denominator = motor().transfer_function()
     gain = numerators["voltage -> speed"][-1] / denominator[-1]

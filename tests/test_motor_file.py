@@ -13,10 +13,7 @@ from pmdc_jax.effects import EFFECTS
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.motor_file import load_speed_noise, load_uncertainty
 
-VALID = {
-    "parameters": PAPER,
-    "effects": [{"name": "coulomb_friction", "parameters": {"torque_Nm": 0.1}}],
-}
+VALID = {"parameters": PAPER, "effects": [{"name": "coulomb_friction", "parameters": {"torque_Nm": 0.1}}]}
 
 
 def fields(motor: Motor) -> dict[str, float]:
@@ -26,9 +23,7 @@ def fields(motor: Motor) -> dict[str, float]:
 def test_a_motor_with_every_effect_round_trips_exactly(tmp_path):
     rng = np.random.default_rng(1)
     effects = tuple(
-        effect(
-            **{field: np.asarray(r.lower * rng.uniform(1, 2)) for field, r in effect.ranges.items()}
-        )
+        effect(**{field: np.asarray(r.lower * rng.uniform(1, 2)) for field, r in effect.ranges.items()})
         for effect in EFFECTS.values()
     )
     constants = {name: np.asarray(x * rng.uniform(1, 2)) for name, x in PAPER.items()}
@@ -113,19 +108,10 @@ INVALID = {
     "effect named by a list": (file_with("effects", 0, "name", to=["coulomb_friction"]), "effect"),
     "effect as a text": (file_with("effects", 0, to="coulomb_friction"), "coulomb_friction"),
     "effect as a number": (file_with("effects", 0, to=3), "effect"),
-    "effect without parameters": (
-        file_with("effects", 0, to={"name": "coulomb_friction"}),
-        "torque_Nm",
-    ),
+    "effect without parameters": (file_with("effects", 0, to={"name": "coulomb_friction"}), "torque_Nm"),
     "effect's parameters in a list": (file_with("effects", 0, "parameters", to=[0.1]), "coulomb"),
-    "effect's parameter a text": (
-        file_with("effects", 0, "parameters", "torque_Nm", to="x"),
-        "torque_Nm",
-    ),
-    "effect of negative size": (
-        file_with("effects", 0, "parameters", "torque_Nm", to=-1.0),
-        "torque_Nm",
-    ),
+    "effect's parameter a text": (file_with("effects", 0, "parameters", "torque_Nm", to="x"), "torque_Nm"),
+    "effect of negative size": (file_with("effects", 0, "parameters", "torque_Nm", to=-1.0), "torque_Nm"),
     "effect of no size": (file_with("effects", 0, "parameters", "torque_Nm", to=0), "torque_Nm"),
     "more than the whole inertia behind a shaft": (
         file_with("effects", to=[effect("shaft_compliance", 50.0, 1e-3, 1.5)]),
@@ -141,10 +127,7 @@ INVALID = {
         json.dumps(VALID | {"format": "pmdc controller 1"}),
         "Give the motor file that pmdc identify --save wrote",
     ),
-    "another unit": (
-        file_with("units", to={"R": "ohm", "L": "mH"}),
-        "the unit of L is 'mH', but values are read in H",
-    ),
+    "another unit": (file_with("units", to={"R": "ohm", "L": "mH"}), "the unit of L is 'mH', but values are read in H"),
     "units a text": (file_with("units", to="SI"), "units"),
     "status a text": (json.dumps(VALID | {"status": "identified"}), "status"),
 }
@@ -193,9 +176,7 @@ def assert_refused(tmp_path, entry: str, value: object, load) -> None:
 
 def test_a_covariance_is_read(tmp_path):
     path = tmp_path / "motor.json"
-    path.write_text(
-        json.dumps(VALID | {"covariance": COVARIANCE, "status": {"L": "not_identifiable"}})
-    )
+    path.write_text(json.dumps(VALID | {"covariance": COVARIANCE, "status": {"L": "not_identifiable"}}))
     found = load_uncertainty(path)
     assert (found.names, found.undetermined) == (("R", "Kb"), ("L",))
     assert found.covariance.tolist() == COVARIANCE["matrix"]
@@ -206,9 +187,7 @@ def test_an_invalid_covariance_is_refused(tmp_path, covariance):
     assert_refused(tmp_path, "covariance", covariance, load_uncertainty)
 
 
-@pytest.mark.parametrize(
-    ("noise", "read"), [({}, None), ({"speed_rad_s": None}, None), ({"speed_rad_s": 0.3}, 0.3)]
-)
+@pytest.mark.parametrize(("noise", "read"), [({}, None), ({"speed_rad_s": None}, None), ({"speed_rad_s": 0.3}, 0.3)])
 def test_the_noise_of_the_speed_is_read(tmp_path, noise, read):
     path = tmp_path / "motor.json"
     path.write_text(json.dumps(VALID))

@@ -59,9 +59,7 @@ def reference_slope(t, x, v, load, p):
     shaft = p.stiffness * twist + p.damping * (w - w_load)
     if p.gap_rad:
         over = twist - np.clip(twist, -p.gap_rad / 2, p.gap_rad / 2)
-        shaft = np.sign(over) * max(
-            0, np.sign(over) * (p.stiffness * over + p.damping * (w - w_load))
-        )
+        shaft = np.sign(over) * max(0, np.sign(over) * (p.stiffness * over + p.damping * (w - w_load)))
     if p.stiffness:
         rotor, accelerated = p.J * (1 - p.load_share), (shaft - load_torque) / (p.J * p.load_share)
         coupling_torque, slip = shaft, w - w_load
@@ -189,9 +187,7 @@ def test_a_dead_zone_reduces_voltages_of_either_sign_by_its_width():
     for v in (0.39, 5.0, -5.0):
         expected = np.sign(v) * max(0.0, abs(v) - 0.4)
         found = simulate(p, time, np.full(200, v), 0 * time)
-        np.testing.assert_allclose(
-            found, simulate(PAPER, time, np.full(200, expected), 0 * time), atol=1e-9
-        )
+        np.testing.assert_allclose(found, simulate(PAPER, time, np.full(200, expected), 0 * time), atol=1e-9)
 
 
 def test_pulses_have_the_mean_of_the_command_and_cause_ripple():
@@ -253,9 +249,7 @@ def test_a_case_is_reproducible_from_its_seed():
 
 
 def test_suites_cover_their_effects_and_noises():
-    plans = {
-        s: [plan(k, np.random.default_rng(k)) for k in range(60)] for s, plan in SUITES.items()
-    }
+    plans = {s: [plan(k, np.random.default_rng(k)) for k in range(60)] for s, plan in SUITES.items()}
     assert {p.hidden[0].name for p in plans["singles"]} == set(LIBRARY)
     assert {p.hidden[0].label for p in plans["formulas"]} == set(FORMULAS)
     assert {p.hidden[0].label for p in plans["outside"]} == set(STRANGERS)
@@ -382,9 +376,7 @@ def recorded(plant, seed=0):
 
 
 def test_stepwise_refits_motor_and_effect_in_simulation():
-    truth = PAPER._replace(
-        friction_forward_Nm=0.05, friction_backward_Nm=0.05, R=0.2, Kb=0.055, Kt=0.055, J=6e-4
-    )
+    truth = PAPER._replace(friction_forward_Nm=0.05, friction_backward_Nm=0.05, R=0.2, Kb=0.055, Kt=0.055, J=6e-4)
     bench = stepwise.Bench(recorded(truth))
     np.testing.assert_allclose(bench.noise, [0.1, 0.5], rtol=0.3)
     bare = stepwise.baseline(bench)

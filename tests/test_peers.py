@@ -102,9 +102,7 @@ def test_roofline_with_effects_matches_numpy(case):
     np.testing.assert_allclose(errors, expected, rtol=1e-8)
 
 
-@pytest.mark.parametrize(
-    "identify", [scipy_identify.identify, scipy_identify.identify_by_least_squares]
-)
+@pytest.mark.parametrize("identify", [scipy_identify.identify, scipy_identify.identify_by_least_squares])
 def test_the_scipy_script_identifies_the_motor(identify):
     rng = np.random.default_rng(1)
     motor = vb.drawn_motor(rng)

@@ -34,9 +34,7 @@ NUMBER = {"allow_nan": False, "allow_infinity": False, "width": 64}
 
 
 def table(header, *columns, separator=","):
-    lines = [
-        separator.join(f"{x!r}" for x in map(float, row)) for row in zip(*columns, strict=True)
-    ]
+    lines = [separator.join(f"{x!r}" for x in map(float, row)) for row in zip(*columns, strict=True)]
     return "\n".join([header, *lines]) + "\n"
 
 
@@ -50,9 +48,7 @@ def read_text(folder, text, columns=None, name="run.csv", encoding="utf-8"):
 def recordings(draw):
     count = draw(st.integers(10, 40))
     # less alike, they would have a gap too long for an even clock
-    steps = draw(st.floats(1e-6, 1e3)) * draw(
-        arrays(float, count, elements=st.floats(0.5, 10.0, **NUMBER))
-    )
+    steps = draw(st.floats(1e-6, 1e3)) * draw(arrays(float, count, elements=st.floats(0.5, 10.0, **NUMBER)))
     start = draw(st.floats(-1e3, 1e3, **NUMBER))
     channel = arrays(float, count, elements=st.floats(-1e12, 1e12, **NUMBER))
     optional = ("current", "load", "angle", "temperature", "torque")
@@ -72,9 +68,7 @@ def test_written_recordings_are_read_back_exactly(recording, suffix):
         assert [file.name for file in Path(folder).iterdir()] == [path.name]
     assert read_back.name == "run" and not read_back.ignored
     has_temperature = recording.temperature is not None
-    assert [n.what for n in read_back.notes] == [
-        "a recorded temperature is not used"
-    ] * has_temperature
+    assert [n.what for n in read_back.notes] == ["a recorded temperature is not used"] * has_temperature
     assert set(read_back.columns()) == set(recording.columns())
     for quantity, values in recording.columns().items():
         np.testing.assert_array_equal(read_back.columns()[quantity], values)
@@ -188,9 +182,7 @@ def test_a_torque_column_of_unknown_name_is_noted(tmp_path):
     assert note.column == "M_Nm" and "looks like load" in note.what
 
 
-@pytest.mark.parametrize(
-    "header", ["M_brake (mNm)", "Brake torque [Nm]", "M_Last [Nm]", "dyno torque / Nm"]
-)
+@pytest.mark.parametrize("header", ["M_brake (mNm)", "Brake torque [Nm]", "M_Last [Nm]", "dyno torque / Nm"])
 def test_a_torque_named_after_a_load_is_the_load(tmp_path, header):
     run = read_text(tmp_path, table(f"time_s,voltage_V,n_rpm,i_A,{header}", T, T, T, T, T))
     assert run.load is not None
@@ -201,10 +193,7 @@ def test_a_torque_named_after_a_load_is_the_load(tmp_path, header):
 
 @pytest.mark.parametrize("header", ["M_blast [Nm]", "brake_limit [Nm]", "brake [A]"])
 def test_other_columns_are_not_taken_for_a_load(tmp_path, header):
-    assert (
-        read_text(tmp_path, table(f"time_s,voltage_V,n_rpm,i_A,{header}", T, T, T, T, T)).load
-        is None
-    )
+    assert read_text(tmp_path, table(f"time_s,voltage_V,n_rpm,i_A,{header}", T, T, T, T, T)).load is None
 
 
 def test_columns_are_recognised_by_their_unit_alone(tmp_path):
@@ -252,9 +241,7 @@ def test_columns_without_a_unit_are_taken_as_si_and_noted(tmp_path):
     assert "rad/s assumed" in note.what
 
 
-@pytest.mark.parametrize(
-    "units", ["ms,V,,rpm\n", "(ms),(V),(),(rpm)\n\n", "\n[ms],[V],-,[1/min]\n# begin\n"]
-)
+@pytest.mark.parametrize("units", ["ms,V,,rpm\n", "(ms),(V),(),(rpm)\n\n", "\n[ms],[V],-,[1/min]\n# begin\n"])
 def test_a_second_line_may_hold_the_units(tmp_path, units):
     head, *numbers = table("Time,voltage_V,flag,speed", 1000 * T, T, T, 60 + T).splitlines()
     run = read_text(tmp_path, f"{head}\n{units}" + "\n".join(numbers))
@@ -265,14 +252,7 @@ def test_a_second_line_may_hold_the_units(tmp_path, units):
 
 
 @pytest.mark.parametrize(
-    "form",
-    [
-        "%Y-%m-%dT%H:%M:%S.%f",
-        "%Y-%m-%d %H:%M:%S.%f",
-        "%d.%m.%Y %H:%M:%S.%f",
-        "%H:%M:%S.%f",
-        "parquet",
-    ],
+    "form", ["%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S.%f", "%H:%M:%S.%f", "parquet"]
 )
 def test_dates_become_seconds_since_the_first(tmp_path, form):
     stamps = [datetime(2026, 2, 28, 23, 59, 59, 950_000) + timedelta(seconds=t) for t in T]
@@ -287,9 +267,7 @@ def test_dates_become_seconds_since_the_first(tmp_path, form):
     assert run.notes == ()
 
 
-@pytest.mark.parametrize(
-    "header", ["timestamp", "datetime", "Date/Time", "Date", "time_ms", "Zeit [µs]"]
-)
+@pytest.mark.parametrize("header", ["timestamp", "datetime", "Date/Time", "Date", "time_ms", "Zeit [µs]"])
 def test_dates_are_the_time_in_seconds_whatever_their_header_says(tmp_path, header):
     lines = [f"2026-03-01T12:00:00.{k:02},{k},{k}" for k in range(12)]
     run = read_text(tmp_path, "\n".join([f"{header},voltage_V,speed_rpm", *lines]))
@@ -298,8 +276,7 @@ def test_dates_are_the_time_in_seconds_whatever_their_header_says(tmp_path, head
 
 
 @pytest.mark.parametrize(
-    ("form", "day"),
-    [("%m/%d/%Y", 27), ("%d/%m/%Y", 27), ("%d-%m-%Y", 27), ("%m/%d/%Y", 2), ("%d-%m-%Y", 2)],
+    ("form", "day"), [("%m/%d/%Y", 27), ("%d/%m/%Y", 27), ("%d-%m-%Y", 27), ("%m/%d/%Y", 2), ("%d-%m-%Y", 2)]
 )
 def test_days_and_months_are_told_apart_where_they_can_be_or_need_not_be(tmp_path, form, day):
     """From the 27th to the 28th; within the 2nd."""
@@ -326,9 +303,7 @@ def test_an_unused_column_that_resembles_a_quantity_is_noted(tmp_path):
         ("time_s,i_A,voltage_V,speed_rpm,flag", None),
     ],
 )
-def test_columns_that_are_not_understood_are_noted_once_where_a_quantity_is_missing(
-    tmp_path, headers, missing
-):
+def test_columns_that_are_not_understood_are_noted_once_where_a_quantity_is_missing(tmp_path, headers, missing):
     run = read_text(tmp_path, table(headers, T, T, T, T, T))
     found = [note for note in run.notes if "not understood" in note.what]
     assert len(found) == (missing is not None)
@@ -417,9 +392,7 @@ def test_decimal_commas_are_read(tmp_path, separator):
 def test_padded_and_quoted_numbers_are_read(tmp_path):
     text = table("time_s, voltage_V ,speed_rad_s", T, T, T).replace(",", " , ")
     np.testing.assert_array_equal(read_text(tmp_path, text).speed, T)
-    quoted = "\n".join(
-        ",".join(f'"{cell.strip()}"' for cell in line.split(",")) for line in text.splitlines()
-    )
+    quoted = "\n".join(",".join(f'"{cell.strip()}"' for cell in line.split(",")) for line in text.splitlines())
     np.testing.assert_array_equal(read_text(tmp_path, quoted).speed, T)
 
 
@@ -488,9 +461,7 @@ def test_the_drive_of_a_run_follows_from_its_columns(quantities, drive):
 @pytest.mark.parametrize("nested", [False, True])
 def test_matlab_vectors_of_any_orientation_are_read(tmp_path, shape, nested):
     variables = {"t": T, "voltage_V": T, "Speed_rpm": T, "gain": 35.15, "note": "hello"}
-    variables = {
-        k: v.reshape(shape) if k in "t voltage_V Speed_rpm" else v for k, v in variables.items()
-    }
+    variables = {k: v.reshape(shape) if k in "t voltage_V Speed_rpm" else v for k, v in variables.items()}
     savemat(tmp_path / "run.mat", {"log": {"run1": variables}} if nested else variables)
     run = read_recording(tmp_path / "run.mat")
     np.testing.assert_allclose(run.speed, T * RPM)
@@ -505,9 +476,7 @@ def _structures(*fields: dict) -> np.ndarray:
 
 
 def _simulink(*signals: tuple[np.ndarray, str]) -> dict:
-    signals = _structures(
-        *({"values": v, "dimensions": 1.0, "label": label} for v, label in signals)
-    )
+    signals = _structures(*({"values": v, "dimensions": 1.0, "label": label} for v, label in signals))
     return {"time": T[:, None], "signals": signals, "blockName": "model/To Workspace"}
 
 
@@ -517,23 +486,16 @@ def _simulink(*signals: tuple[np.ndarray, str]) -> dict:
         # Simulink's "structure with time": labelled signals, one for each, and without labels
         ({"simout": _simulink((T, "voltage_V"), (T, "Speed [rpm]"))}, {}),
         ({"voltage_V": _simulink((T, "")), "Speed_rpm": _simulink((T, ""))}, {}),
-        (
-            {"yout": _simulink((np.stack([T, T], 1), ""))},
-            {"voltage": "yout(:,1)", "speed": "yout(:,2):rpm"},
-        ),
+        ({"yout": _simulink((np.stack([T, T], 1), ""))}, {"voltage": "yout(:,1)", "speed": "yout(:,2):rpm"}),
         # its block "To File" has a row for each signal
-        (
-            {"ans": np.stack([T, T, T])},
-            {"time": "ans(1,:)", "voltage": "ans(2,:)", "speed": "ans(3,:):rpm"},
-        ),
+        ({"ans": np.stack([T, T, T])}, {"time": "ans(1,:)", "voltage": "ans(2,:)", "speed": "ans(3,:):rpm"}),
         # dSPACE ControlDesk
         (
             {
                 "exp_001": {
                     "X": _structures({"Name": "time", "Data": T, "Unit": "s"}),
                     "Y": _structures(
-                        {"Name": "voltage", "Data": T, "Unit": "V"},
-                        {"Name": "Speed", "Data": T, "Unit": "rpm"},
+                        {"Name": "voltage", "Data": T, "Unit": "V"}, {"Name": "Speed", "Data": T, "Unit": "rpm"}
                     ),
                 }
             },

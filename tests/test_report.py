@@ -89,13 +89,7 @@ def fake_identification(samples: int = 3000, **changes) -> Identification:
     relative = dict(zip(TRUTH, (0.0026, 0.031, 0.0004, 0.006, 0.0061, 0.043), strict=True))
     deviation = np.array(list(relative.values()))
     correlation = np.eye(6)
-    for row, column, value in (
-        (3, 4, 0.96),
-        (3, 5, 0.55),
-        (4, 5, 0.52),
-        (0, 1, -0.31),
-        (0, 2, -0.44),
-    ):
+    for row, column, value in ((3, 4, 0.96), (3, 5, 0.55), (4, 5, 0.52), (0, 1, -0.31), (0, 2, -0.44)):
         correlation[row, column] = correlation[column, row] = value
     fields = {
         "motor": Motor(**TRUTH),
@@ -131,11 +125,7 @@ def partial_identification() -> Identification:
     no_voltage = {"voltage": None, "current_simulated": None, "current_rmse": None}
     no_current = {"current": None, "current_rmse": None, "current_fit_percent": None}
     return fake_identification(
-        parameters={
-            **complete.parameters,
-            **dict.fromkeys(("Kt", "J", "f"), hidden),
-            "L": bound,
-        },
+        parameters={**complete.parameters, **dict.fromkeys(("Kt", "J", "f"), hidden), "L": bound},
         unidentified_directions=(
             Direction(
                 ("Kt", "J", "f"),
@@ -144,18 +134,12 @@ def partial_identification() -> Identification:
             ),
         ),
         fit={
-            "coast <down> & out": evolve(
-                complete.fit["prbs"], current_fit_percent=None, **no_voltage
-            ),
+            "coast <down> & out": evolve(complete.fit["prbs"], current_fit_percent=None, **no_voltage),
             "speed only": evolve(complete.fit["drive"], role="train", **no_current),
         },
         noise={"current_A": None, "speed_rad_s": 0.6},
         distance=np.inf,
-        findings=(
-            Finding(
-                "prbs", "current_A", "warning", "saturated at 60 A", "2.31 s to 2.35 s", "Widen it"
-            ),
-        ),
+        findings=(Finding("prbs", "current_A", "warning", "saturated at 60 A", "2.31 s to 2.35 s", "Widen it"),),
         messages=("Runs without voltage were used for the mechanical half only.",),
         search=Search("genetic", 0, np.zeros(0), np.zeros(0), np.zeros(0), 0),
         covariance=np.zeros((6, 6)),
@@ -253,16 +237,9 @@ def test_hold_out_runs_are_shown_first(tmp_path):
 def test_missing_quantities_are_left_out_of_the_figure():
     fits = partial_identification().fit
     no_voltage = figures.run_figure(fits["coast <down> & out"], {}, 1000)
-    assert [trace.name for trace in no_voltage.data] == [
-        "measured",
-        "simulated",
-        "measured",
-        "residual",
-    ]
+    assert [trace.name for trace in no_voltage.data] == ["measured", "simulated", "measured", "residual"]
     no_current = figures.run_figure(fits["speed only"], {}, 1000)
-    assert [trace.name for trace in no_current.data] == [
-        *("measured", "simulated", "simulated", "applied", "residual")
-    ]
+    assert [trace.name for trace in no_current.data] == [*("measured", "simulated", "simulated", "applied", "residual")]
 
 
 def test_long_runs_are_thinned_and_the_page_stays_small(tmp_path):
@@ -383,9 +360,7 @@ def test_json_has_the_documented_keys():
 
 
 def test_json_has_null_for_unknown_values(tmp_path, capsys):
-    unknown = Estimate(
-        np.float64(0.2), float("nan"), (float("nan"), 1.0), "ohm", "not_identifiable"
-    )
+    unknown = Estimate(np.float64(0.2), float("nan"), (float("nan"), 1.0), "ohm", "not_identifiable")
     found = identification_json(fake_identification(parameters={"R": unknown}))
     assert found["parameters"]["R"]["stderr"] is None
     assert found["parameters"]["R"]["ci95"] is None
@@ -438,20 +413,11 @@ def test_an_output_that_is_an_input_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("estimate", "expected"),
     [
-        (
-            Estimate(0.157312, 4.1e-4, (0.1565, 0.1581), "ohm", "identified"),
-            ("157.31", "0.41", "mΩ"),
-        ),
+        (Estimate(0.157312, 4.1e-4, (0.1565, 0.1581), "ohm", "identified"), ("157.31", "0.41", "mΩ")),
         (Estimate(8.4e-5, None, None, "H", "at_bound"), ("84.00", "–", "µH")),
-        (
-            Estimate(1.21e-3, 7e-6, None, "kg m^2", "identified"),
-            ("1.2100", "0.0070", "×10⁻³ kg·m²"),
-        ),
+        (Estimate(1.21e-3, 7e-6, None, "kg m^2", "identified"), ("1.2100", "0.0070", "×10⁻³ kg·m²")),
         (Estimate(12.0, 3.0, None, "N m/A", "identified"), ("12.0", "3.0", "N·m/A")),
-        (
-            Estimate(0.0, 1e-6, None, "N m s/rad", "identified"),
-            ("0.000000", "0.000001", "N·m·s/rad"),
-        ),
+        (Estimate(0.0, 1e-6, None, "N m s/rad", "identified"), ("0.000000", "0.000001", "N·m·s/rad")),
         (Estimate(-0.002, 4e-5, None, "A", "identified"), ("−2.000", "0.040", "mA")),
         (Estimate(1.0, 0.0, (1.0, 1.0), "ohm", "known"), ("1.000", "–", "Ω")),
     ],
@@ -462,8 +428,7 @@ def test_engineering_notation(estimate, expected):
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
-    [(2.1e-6, "2.10×10⁻⁶"), (-8.64e7, "−8.64×10⁷"), (0.0123, "0.0123"), (0.0, "0.00")],
+    ("value", "text"), [(2.1e-6, "2.10×10⁻⁶"), (-8.64e7, "−8.64×10⁷"), (0.0123, "0.0123"), (0.0, "0.00")]
 )
 def test_powers_of_ten(value, text):
     assert notation.significant(value) == text
@@ -480,8 +445,7 @@ def test_formulas_are_written_in_greek():
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
-    [(99.412, "99.41 %"), (12.34, "12.3 %"), (0.04, "0.040 %"), (-250.0, "−250 %"), (None, "–")],
+    ("value", "text"), [(99.412, "99.41 %"), (12.34, "12.3 %"), (0.04, "0.040 %"), (-250.0, "−250 %"), (None, "–")]
 )
 def test_percent_notation(value, text):
     assert notation.percent(value).replace(notation.NARROW_SPACE, " ") == text

@@ -27,15 +27,7 @@ from pmdc_jax.recordings.clock import is_even
 from pmdc_jax.recordings.recording import OVER_LAST, Recording
 from pmdc_jax.recordings.recording_file import write_recording
 from pmdc_jax.runtime.threads import map_in_threads, one_blas_thread
-from pmdc_jax.simulate import (
-    RunUnknowns,
-    Tape,
-    free_run,
-    reference_solution,
-    sensitivities,
-    squared_errors,
-    uniform,
-)
+from pmdc_jax.simulate import RunUnknowns, Tape, free_run, reference_solution, sensitivities, squared_errors, uniform
 from pmdc_jax.simulate.exponential import phi_functions
 
 BLOCKS = 4  # every tape below has this shape, so that few are compiled
@@ -182,13 +174,7 @@ def outputs_by_scipy(run: Recording, start) -> np.ndarray:
     states = [np.array(start, float)]
     for v, load in zip(run.voltage[:-1], run.load[:-1], strict=True):
         held = solve_ivp(
-            rates_with_heating,
-            (0, run.sample_time),
-            states[-1],
-            "DOP853",
-            args=(v, load),
-            rtol=1e-11,
-            atol=1e-11,
+            rates_with_heating, (0, run.sample_time), states[-1], "DOP853", args=(v, load), rtol=1e-11, atol=1e-11
         )
         states.append(held.y[:, -1])
     return np.array(states)[:, :2]
@@ -215,9 +201,7 @@ def test_converges_with_order_four(x64, heating):
         found = simulated_alone(heated, sampled_more_often(run, times), (5.0, 10.0))[::times]
         errors.append(largest_error(found, expected))
     # a sample of 4 ms is four steps of 1 ms
-    assert largest_error(simulated_alone(heated, run, (5.0, 10.0)), expected) == pytest.approx(
-        errors[0], rel=1e-3
-    )
+    assert largest_error(simulated_alone(heated, run, (5.0, 10.0)), expected) == pytest.approx(errors[0], rel=1e-3)
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
     assert errors[-1] < 1e-5
     assert np.all(np.abs(orders - 4) < 0.4), (errors, orders)
@@ -286,9 +270,7 @@ def test_runs_on_one_tape_match_runs_simulated_alone(x64):
     own = RunUnknowns.as_recorded(tape)._replace(load_offset=jnp.asarray(offsets))
     outputs = free_run(m, tape, own)
     for k, (run, offset) in enumerate(zip(runs, offsets, strict=True)):
-        loaded = Recording(
-            run.name, run.time, run.voltage, run.current, run.speed, run.load + offset
-        )
+        loaded = Recording(run.name, run.time, run.voltage, run.current, run.speed, run.load + offset)
         together = np.stack([tape.samples_of(k, outputs[:, c], len(run)) for c in range(2)], 1)
         # the slowest run determines for all into how many steps a sample is divided
         separate = simulated_alone(m, loaded, longest=tape.longest)
@@ -312,9 +294,7 @@ def test_a_tape_is_cut_into_parts_between_runs(x64, count):
 # ---------------------------------------------------------------------------- other drives
 
 
-def speed_by_closed_form(
-    drive: np.ndarray, load: np.ndarray, step: float, start: float
-) -> np.ndarray:
+def speed_by_closed_form(drive: np.ndarray, load: np.ndarray, step: float, start: float) -> np.ndarray:
     """Speed under a held torque: J dw/dt = drive - f w - load has a closed form over each sample."""
     rate, gain = np.exp(-PAPER["f"] / PAPER["J"] * step), 1 / PAPER["f"]
     speed = [start]
@@ -360,10 +340,7 @@ CANDIDATES = 32
 @pytest.fixture(scope="module")
 def candidates():
     rng = np.random.default_rng(5)
-    return [
-        {n: x * np.exp(0.3 * rng.standard_normal()) for n, x in PAPER.items()}
-        for _ in range(CANDIDATES)
-    ]
+    return [{n: x * np.exp(0.3 * rng.standard_normal()) for n, x in PAPER.items()} for _ in range(CANDIDATES)]
 
 
 def test_squared_errors_match_the_free_run(x64, candidates):
@@ -372,9 +349,7 @@ def test_squared_errors_match_the_free_run(x64, candidates):
     tape = Tape.from_recordings([run])
     current, speed = squared_errors(population(candidates), tape)
     for k, m in enumerate(candidates):
-        error = simulated_alone(motor(**m), run, tape.initial[0]) - np.stack(
-            [run.current, run.speed], 1
-        )
+        error = simulated_alone(motor(**m), run, tape.initial[0]) - np.stack([run.current, run.speed], 1)
         expected = np.nansum(error**2, 0)
         np.testing.assert_allclose([current[k], speed[k]], expected, rtol=1e-8)
 
@@ -387,14 +362,7 @@ def test_squared_errors_add_up_over_runs_of_different_rates(x64, candidates):
     np.testing.assert_allclose(together, separate[0] + separate[1], rtol=1e-10)
 
 
-INVALID_VALUES = {
-    "R": np.nan,
-    "L": 0.0,
-    "Kb": 1e200,
-    "Kt": -1e6,
-    "J": 1e-300,
-    "f": -1e9,
-}
+INVALID_VALUES = {"R": np.nan, "L": 0.0, "Kb": 1e200, "Kt": -1e6, "J": 1e-300, "f": -1e9}
 
 
 def test_an_invalid_candidate_has_huge_errors_and_affects_no_other(x64, candidates):
@@ -415,9 +383,7 @@ def test_an_invalid_candidate_has_huge_errors_and_affects_no_other(x64, candidat
 
 def test_nearly_even_samples_are_not_resampled():
     run = recording(step=1e-3)
-    noisy = Recording(
-        "r", run.time + 1e-7 * np.sin(np.arange(SAMPLES)), run.voltage, speed=run.speed
-    )
+    noisy = Recording("r", run.time + 1e-7 * np.sin(np.arange(SAMPLES)), run.voltage, speed=run.speed)
     even = uniform(noisy)
     np.testing.assert_array_equal(even.voltage, run.voltage)
     np.testing.assert_array_equal(even.speed, run.speed)
@@ -434,9 +400,7 @@ def test_resampling_keeps_the_integrals_of_voltage_and_load(steps, seed):
     rng = np.random.default_rng(seed)
     time = 7.0 + 1e-3 * np.append(0.0, np.cumsum(steps))
     assume(not is_even(time))  # such stamps count as rounded, and are not resampled
-    run = Recording(
-        "r", time, rng.normal(size=len(time)), speed=np.cos(time), load=rng.normal(size=len(time))
-    )
+    run = Recording("r", time, rng.normal(size=len(time)), speed=np.cos(time), load=rng.normal(size=len(time)))
     even = uniform(run)
     assert np.ptp(np.diff(even.time)) < 1e-9
     for before, after in ((run.voltage, even.voltage), (run.load, even.load)):
@@ -508,9 +472,7 @@ def test_simulate_keeps_the_time_stamps_and_the_initial_state():
     """Also at uneven stamps, and without a change of JAX's precision."""
     rng, heavy = np.random.default_rng(7), PAPER | {"J": 0.01}
     time = 2.0 + 1e-3 * np.cumsum(rng.uniform(0.9, 1.1, 300))
-    run = Recording(
-        "r", time, np.full(300, 12.0), np.full(300, 4.0), np.full(300, 9.0), np.zeros(300)
-    )
+    run = Recording("r", time, np.full(300, 12.0), np.full(300, 4.0), np.full(300, 9.0), np.zeros(300))
     assert not jax.config.jax_enable_x64
     found = pmdc_jax.simulate(motor(**heavy), run)
     assert not jax.config.jax_enable_x64
@@ -535,9 +497,7 @@ def test_simulate_accepts_a_motor_of_plain_numbers():
 def test_simulate_accepts_a_motor_file(tmp_path):
     run, path = recording(), tmp_path / "motor.json"
     pmdc_jax.save_motor(path, motor())
-    np.testing.assert_array_equal(
-        pmdc_jax.simulate(path, run).speed, pmdc_jax.simulate(motor(), run).speed
-    )
+    np.testing.assert_array_equal(pmdc_jax.simulate(path, run).speed, pmdc_jax.simulate(motor(), run).speed)
 
 
 def test_a_simulation_that_diverges_blames_the_motor():

@@ -11,11 +11,7 @@ from scipy.interpolate import CubicSpline
 from benchmarks.naming.plant import Plant, simulate
 from benchmarks.virtual_bench import prbs, staircase
 from pmdc_jax import diagnose, identify
-from pmdc_jax.identify.corrections.speed_averaging import (
-    _in_counts,
-    averaging_of_counts,
-    averaging_of_differences,
-)
+from pmdc_jax.identify.corrections.speed_averaging import _in_counts, averaging_of_counts, averaging_of_differences
 from pmdc_jax.identify.noise.sensor_noise import quantum
 from pmdc_jax.recordings.recording import OVER_BOTH, OVER_LAST, Recording
 
@@ -50,9 +46,7 @@ def recorded(kind: str, lines: int = LINES, **changed: float) -> list[Recording]
         if kind == "angle alone":
             motion = {"angle": count * 2 * np.pi / lines}
         current = outputs[:, 0] + 0.1 * rng.standard_normal(len(speed))
-        run = Recording(
-            name, excitation.time, excitation.voltage, current, load=excitation.load, **motion
-        )
+        run = Recording(name, excitation.time, excitation.voltage, current, load=excitation.load, **motion)
         found.append(run)
     return found
 
@@ -72,14 +66,10 @@ MEAN_OVER = {
 def test_a_speed_that_is_a_mean_is_recognised(kind):
     found = identify(recorded(kind), tie=[("Kt", "Kb")])
     means = [m for m in found.messages if "is a mean over" in m]
-    assert [f"over {MEAN_OVER[kind]}," in m for m in means] == [True] * (
-        MEAN_OVER[kind] is not None
-    )
+    assert [f"over {MEAN_OVER[kind]}," in m for m in means] == [True] * (MEAN_OVER[kind] is not None)
     for name in ("R", "L", "Kb", "J"):
         estimate = found.parameters[name]
-        assert abs(estimate.value - FAST_MOTOR[name]) < max(
-            3.5 * estimate.stderr, 2e-3 * FAST_MOTOR[name]
-        )
+        assert abs(estimate.value - FAST_MOTOR[name]) < max(3.5 * estimate.stderr, 2e-3 * FAST_MOTOR[name])
 
 
 @pytest.mark.slow

@@ -48,16 +48,11 @@ def run_with_chirp(seed: int) -> Recording:
     A, B = exact_step(TRUE, STEP / fine)
     seen = dlsim((A, B[:, :1], np.eye(2), np.zeros((2, 1)), STEP / fine), voltage)[1][::fine]
     seen += NOISE * np.random.default_rng(seed).standard_normal(seen.shape)
-    return Recording(
-        "chirp", STEP * np.arange(SAMPLES), at_samples[::fine], *seen.T, load=0 * seen[:, 0]
-    )
+    return Recording("chirp", STEP * np.arange(SAMPLES), at_samples[::fine], *seen.T, load=0 * seen[:, 0])
 
 
 def runs(*, synchronous: bool) -> list[Recording]:
-    return [
-        run_with_steps(seed, synchronous=synchronous, load=load)
-        for seed, load in ((1, 0.0), (2, 0.15))
-    ]
+    return [run_with_steps(seed, synchronous=synchronous, load=load) for seed, load in ((1, 0.0), (2, 0.15))]
 
 
 def error_of(found: Identification, name: str) -> float:

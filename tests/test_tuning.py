@@ -139,9 +139,7 @@ def test_a_small_step_is_tuned_for_what_the_sampling_allows():
 
 @pytest.mark.parametrize(("sample_time", "noted"), [(1e-3, False), (0.02, True)])
 def test_slow_sampling_is_noted(sample_time, noted):
-    requirements = LoopRequirements(
-        "pi", setpoint=481.0, voltage_limit=30.0, sample_time=sample_time
-    )
+    requirements = LoopRequirements("pi", setpoint=481.0, voltage_limit=30.0, sample_time=sample_time)
     with jax.enable_x64(True):
         notes = requirements.completed(MOTOR).notes
     assert any("takes 2.2 samples of 0.02 s" in note for note in notes) == noted
@@ -154,15 +152,11 @@ SLOW_EFFECTS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("effect", "setpoint", "least"), SLOW_EFFECTS.values(), ids=SLOW_EFFECTS.keys()
-)
+@pytest.mark.parametrize(("effect", "setpoint", "least"), SLOW_EFFECTS.values(), ids=SLOW_EFFECTS.keys())
 def test_a_loop_is_judged_for_as_long_as_its_effects_last(effect, setpoint, least):
     requirements = LoopRequirements("pi", setpoint, voltage_limit=30.0, sample_time=1e-3)
     with jax.enable_x64(True):
-        plain, slow = (
-            requirements.completed(motor) for motor in (MOTOR, MOTOR.with_effects([effect]))
-        )
+        plain, slow = (requirements.completed(motor) for motor in (MOTOR, MOTOR.with_effects([effect])))
     assert 1e-3 * slow.part_samples > least > 1e-3 * plain.part_samples
 
 
@@ -187,10 +181,7 @@ IMPOSSIBLE = {
     "negative voltage": ({"voltage_limit": -3.0}, "-3 is not a positive number"),
     "delay": ({"delay": 2}, "a delay of 2 samples is not supported"),
     "overshoot": ({"max_overshoot": math.nan}, "nan is not a number of at least 0"),
-    "sampling": (
-        {"setpoint": 481.0, "voltage_limit": 30.0, "sample_time": 1e-6},
-        "1e-06 s needs",
-    ),
+    "sampling": ({"setpoint": 481.0, "voltage_limit": 30.0, "sample_time": 1e-6}, "1e-06 s needs"),
     "milliseconds": (
         {"setpoint": 481.0, "voltage_limit": 30.0, "sample_time": 1.0},
         "1 s is far longer than the motor's transients, 0.0441 s",
@@ -220,9 +211,7 @@ def test_the_command_refuses_an_impossible_specification_in_one_line(motor_file,
     assert cli.main(arguments.split()) == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
-    assert (
-        "481 rad/s cannot be reached with 24 V (at most 480.0 rad/s). Raise --voltage-limit" in err
-    )
+    assert "481 rad/s cannot be reached with 24 V (at most 480.0 rad/s). Raise --voltage-limit" in err
 
 
 @pytest.mark.parametrize(

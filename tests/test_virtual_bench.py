@@ -8,11 +8,7 @@ from scipy.integrate import solve_ivp
 
 from benchmarks import virtual_bench as vb
 
-HOT = {
-    "copper_alpha_per_K": 0.0039,
-    "thermal_resistance_K_per_W": 4.0,
-    "thermal_time_s": 0.5,
-}
+HOT = {"copper_alpha_per_K": 0.0039, "thermal_resistance_K_per_W": 4.0, "thermal_time_s": 0.5}
 SMOOTH = {
     "linear": {},
     "load": {"constant_load_Nm": 0.2},
@@ -137,9 +133,7 @@ def test_speed_is_quantised():
 
 def test_standard_runs_are_reproducible_and_have_33_000_samples():
     for all_at_1_ms in (False, True):
-        first, second = (
-            vb.standard_runs(np.random.default_rng(7), all_at_1_ms=all_at_1_ms) for _ in range(2)
-        )
+        first, second = (vb.standard_runs(np.random.default_rng(7), all_at_1_ms=all_at_1_ms) for _ in range(2))
         assert len(first) == 7
         assert sum(c["time_s"].size for c in first.values()) == 33_000
         for name in first:

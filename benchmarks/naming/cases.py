@@ -33,15 +33,7 @@ from numpy.random import Generator
 from benchmarks import virtual_bench as vb
 from benchmarks.naming import foreign
 from benchmarks.naming.excitations import BLIND, HOLDOUT, Excitations, jittered, standard
-from benchmarks.naming.hidden import (
-    FORMULAS,
-    LIBRARY,
-    NAMES,
-    STRANGERS,
-    Hidden,
-    Parameters,
-    log_uniform,
-)
+from benchmarks.naming.hidden import FORMULAS, LIBRARY, NAMES, STRANGERS, Hidden, Parameters, log_uniform
 from benchmarks.naming.plant import Plant, ornstein_uhlenbeck, simulate, substeps
 from benchmarks.naming.strength import Gauge, Outputs, Response, amplitude_for, linear
 from benchmarks.virtual_bench import Columns, Excitation, Noise
@@ -212,9 +204,7 @@ class Tuner:
         pairs = zip(_ideal(plant, self.excitations), self.without, strict=True)
         return self.gauge([a - b for a, b in pairs])
 
-    def tuned(
-        self, hidden: Hidden, rng: Generator, wanted: float, of: Callable[[Response], float]
-    ) -> Parameters:
+    def tuned(self, hidden: Hidden, rng: Generator, wanted: float, of: Callable[[Response], float]) -> Parameters:
         """Parameters drawn at random, at the amplitude that makes `of` the response `wanted`."""
         drawn = hidden.draw(rng, self.plant)
 
@@ -311,9 +301,7 @@ def build(suite: str, index: int, plan: Plan, rng: Generator) -> Case:
             drawn.append(tuner.tuned(hidden, rng, wanted, plan.of))
             complete = hidden.put_into(complete, drawn[-1])
         response = tuner.response(complete)
-    records = {
-        name: record(complete, e, rng, bench.noises[name], bench) for name, e in excitations.items()
-    }
+    records = {name: record(complete, e, rng, bench.noises[name], bench) for name, e in excitations.items()}
     if not plan.load_known:
         records = {n: {k: c[k] for k in c if k not in UNLOADED} for n, c in records.items()}
     found = list(zip(plan.hidden, drawn, strict=True))
@@ -397,9 +385,7 @@ def _outside(index: int, rng: Generator) -> Plan:
     return Plan(noise, "outside", (STRANGERS[label],), (_clear(rng, CLEAR[0], 10.0),), detail=label)
 
 
-_BLIND_ROWS = tuple(
-    (label, drive, name) for label, (drive, names) in BLIND.items() for name in names
-)
+_BLIND_ROWS = tuple((label, drive, name) for label, (drive, names) in BLIND.items() for name in names)
 
 
 def _blind(index: int, rng: Generator) -> Plan:

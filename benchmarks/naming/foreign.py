@@ -126,15 +126,7 @@ def _eight_levels(rng: Generator, samples: int) -> NDArray[np.float64]:
     return np.repeat(rng.uniform(-1.0, 1.0, 8), -(-samples // 8))[:samples]
 
 
-VOLTAGES: tuple[Voltage, ...] = (
-    _steps,
-    _two_levels,
-    _chirp,
-    _sines,
-    _trapezoid,
-    _staircase,
-    _speed_loop,
-)
+VOLTAGES: tuple[Voltage, ...] = (_steps, _two_levels, _chirp, _sines, _trapezoid, _staircase, _speed_loop)
 HELD_OUT: tuple[Voltage, ...] = (_steps, _two_levels, _sines)
 
 
@@ -177,10 +169,7 @@ def sensors(kind: str, plant: Plant, driven: Excitation) -> dict[str, float]:
         "encoder": {"encoder_lines": round(math.pi / (LINE_SHARE * size.speed * dt))},
         "angle": {"angle_lines": 4096.0},
         "noisy_voltage": {"voltage_V": 0.004 * size.volt},
-        "converter": {
-            "voltage_quantum_V": size.volt / 1024,
-            "current_quantum_A": size.current / 256,
-        },
+        "converter": {"voltage_quantum_V": size.volt / 1024, "current_quantum_A": size.current / 256},
     }[kind]
 
 
@@ -200,11 +189,7 @@ def _stribeck(rng: Generator, plant: Plant) -> Parameters:
     size, dry = Size.of(plant), log_uniform(rng, 0.02, 0.05)
     static = dry * rng.uniform(1.8, 3.0)
     speed = log_uniform(rng, 0.02, 0.06) * size.speed
-    return {
-        "coulomb_Nm": dry * size.torque,
-        "static_Nm": static * size.torque,
-        "speed_rad_s": speed,
-    }
+    return {"coulomb_Nm": dry * size.torque, "static_Nm": static * size.torque, "speed_rad_s": speed}
 
 
 def _asymmetric(rng: Generator, plant: Plant) -> Parameters:
@@ -264,8 +249,6 @@ _DRAWS: Mapping[str, Callable[[Generator, Plant], Parameters]] = {
     "speed_sensor_delay": _share("delay_s", 0.05, 0.15, lambda s: s.mechanical_s),
     "current_sensor_offset": _signed(_share("offset_A", 0.01, 0.03, lambda s: s.current)),
 }
-EFFECTS: dict[str, Hidden] = {
-    name: replace(LIBRARY[name], draw=draw) for name, draw in _DRAWS.items()
-}
+EFFECTS: dict[str, Hidden] = {name: replace(LIBRARY[name], draw=draw) for name, draw in _DRAWS.items()}
 # beyond that hardly any inductance would remain
 EFFECTS["inductance_saturation"] = replace(EFFECTS["inductance_saturation"], limits=(1e-4, 1.0))

@@ -98,9 +98,7 @@ def _signed(draw: Callable[[Generator, Plant], Parameters], name: str):
     return signed
 
 
-def _coupling_draw(
-    rng: Generator, plant: Plant, hertz: tuple[float, float], damped: tuple[float, float]
-) -> Parameters:
+def _coupling_draw(rng: Generator, plant: Plant, hertz: tuple[float, float], damped: tuple[float, float]) -> Parameters:
     """A spring with a given resonance of the two inertias against each other, and damping ratio."""
     share, ratio = rng.uniform(0.3, 0.7), log_uniform(rng, *damped)
     reduced, speed = plant.J * share * (1.0 - share), 2.0 * math.pi * log_uniform(rng, *hertz)
@@ -119,10 +117,7 @@ def _backlash_draw(rng: Generator, plant: Plant) -> Parameters:
 
 
 def _heating_draw(rng: Generator, plant: Plant) -> Parameters:
-    return {
-        "rise_per_W": log_uniform(rng, 5e-4, 5e-3),
-        "time_constant_s": log_uniform(rng, 0.7, 8.0),
-    }
+    return {"rise_per_W": log_uniform(rng, 5e-4, 5e-3), "time_constant_s": log_uniform(rng, 0.7, 8.0)}
 
 
 _COUPLING = dict.fromkeys(("stiffness", "damping", "load_share"))
@@ -140,9 +135,7 @@ def _stribeck_fields(p: Parameters) -> Parameters:
     }
 
 
-_cogging_fields = _renamed(
-    cogging_Nm="amplitude_Nm", cogging_periods="periods", cogging_phase="phase"
-)
+_cogging_fields = _renamed(cogging_Nm="amplitude_Nm", cogging_periods="periods", cogging_phase="phase")
 _ripple_fields = _renamed(ripple="amplitude", ripple_periods="periods", ripple_phase="phase")
 _friction_fields = _renamed(friction_forward_Nm="forward_Nm", friction_backward_Nm="backward_Nm")
 _heating_fields = _renamed(heat_per_W="rise_per_W", heat_s="time_constant_s")
@@ -152,9 +145,7 @@ _ripple_draw = _periodic_draw("amplitude", 0.02, 0.2)
 _ROWS = (
     Hidden("", "coulomb_friction", _coulomb_draw, _coulomb_fields, ("torque_Nm",)),
     Hidden("", "stribeck_friction", _stribeck_draw, _stribeck_fields, ("coulomb_Nm", "static_Nm")),
-    Hidden(
-        "", "asymmetric_friction", _asymmetric_draw, _friction_fields, ("forward_Nm", "backward_Nm")
-    ),
+    Hidden("", "asymmetric_friction", _asymmetric_draw, _friction_fields, ("forward_Nm", "backward_Nm")),
     Hidden("", "quadratic_drag", _one("drag", 3e-7, 3e-6), _renamed(drag="drag"), ("drag",)),
     Hidden("", "cogging_torque", _cogging_draw, _cogging_fields, ("amplitude_Nm",)),
     Hidden("", "torque_ripple", _ripple_draw, _ripple_fields, ("amplitude",), limits=(1e-4, 5.0)),
@@ -165,12 +156,8 @@ _ROWS = (
         _renamed(load_Nm="torque_Nm"),
         ("torque_Nm",),
     ),
-    Hidden(
-        "", "shaft_compliance", _compliance_draw, _coupled, (), ("stiffness",), limits=(1e-2, 10.0)
-    ),
-    Hidden(
-        "", "gear_backlash", _backlash_draw, _backlash_fields, ("gap_rad",), limits=(0.05, 10.0)
-    ),
+    Hidden("", "shaft_compliance", _compliance_draw, _coupled, (), ("stiffness",), limits=(1e-2, 10.0)),
+    Hidden("", "gear_backlash", _backlash_draw, _backlash_fields, ("gap_rad",), limits=(0.05, 10.0)),
     Hidden(
         "",
         "brush_voltage_drop",
@@ -195,13 +182,7 @@ _ROWS = (
         ("saturation",),
         limits=(1e-4, 50.0),
     ),
-    Hidden(
-        "",
-        "input_dead_zone",
-        _one("width_V", 0.1, 0.6),
-        _renamed(dead_zone_V="width_V"),
-        ("width_V",),
-    ),
+    Hidden("", "input_dead_zone", _one("width_V", 0.1, 0.6), _renamed(dead_zone_V="width_V"), ("width_V",)),
     Hidden(
         "",
         "speed_sensor_lag",
@@ -210,13 +191,7 @@ _ROWS = (
         ("time_constant_s",),
         limits=(2e-2, 10.0),
     ),
-    Hidden(
-        "",
-        "speed_sensor_delay",
-        _one("delay_s", 1e-3, 4e-3),
-        _renamed(delay_s="delay_s"),
-        ("delay_s",),
-    ),
+    Hidden("", "speed_sensor_delay", _one("delay_s", 1e-3, 4e-3), _renamed(delay_s="delay_s"), ("delay_s",)),
     Hidden(
         "",
         "current_sensor_offset",
@@ -279,28 +254,17 @@ _FORMULAS = (
         _two_masses_fields,
         ("rise_per_W", "slow_rise_per_W"),
     ),
-    _variant(
-        "brush_smooth",
-        "brush_voltage_drop",
-        lambda rng: {"brush_onset_A": log_uniform(rng, 0.5, 3.0)},
-    ),
+    _variant("brush_smooth", "brush_voltage_drop", lambda rng: {"brush_onset_A": log_uniform(rng, 0.5, 3.0)}),
     _variant("kt_tanh", "torque_constant_saturation", lambda rng: {"kt_curve": 1.0}),
     _variant("kt_hyperbola", "torque_constant_saturation", lambda rng: {"kt_curve": 2.0}),
     _variant("l_hyperbola", "inductance_saturation", lambda rng: {"l_curve": 2.0}),
     _variant(
         "cogging_two_harmonics",
         "cogging_torque",
-        lambda rng: {
-            "cogging_second": float(rng.uniform(0.3, 0.7)),
-            "cogging_second_phase": _phase(rng),
-        },
+        lambda rng: {"cogging_second": float(rng.uniform(0.3, 0.7)), "cogging_second_phase": _phase(rng)},
     ),
     _variant("ripple_in_emf_too", "torque_ripple", lambda rng: {"ripple_in_emf": 1.0}),
-    _variant(
-        "drag_exponent",
-        "quadratic_drag",
-        lambda rng: {"drag_exponent": float(rng.choice([1.75, 2.25]))},
-    ),
+    _variant("drag_exponent", "quadratic_drag", lambda rng: {"drag_exponent": float(rng.choice([1.75, 2.25]))}),
 )
 FORMULAS: Mapping[str, Hidden] = {row.label: row for row in _FORMULAS}
 

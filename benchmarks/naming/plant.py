@@ -442,14 +442,7 @@ def simulate(
         disturbance = np.zeros((1, 1))
         disturbance = np.broadcast_to(disturbance, (time.size, steps))
     start = np.zeros(STATES)
-    start[[CURRENT, SPEED, ANGLE, LOAD_SPEED, TWIST, READ]] = (
-        current,
-        speed,
-        angle,
-        speed,
-        twist,
-        speed,
-    )
+    start[[CURRENT, SPEED, ANGLE, LOAD_SPEED, TWIST, READ]] = (current, speed, angle, speed, twist, speed)
     packed = np.array([plant], dtype=PACKED)[0]
     columns = (np.ascontiguousarray(c, float) for c in (time, voltage, load))
     return _run(*columns, np.ascontiguousarray(disturbance), disturbance.shape[1], start, packed)

@@ -67,9 +67,7 @@ def rivals(answer: Answer) -> list[list[str]]:
     return sets
 
 
-def outcome(
-    expected: str, truth: Iterable[str], answer: Answer, load_known: bool = True
-) -> Outcome:
+def outcome(expected: str, truth: Iterable[str], answer: Answer, load_known: bool = True) -> Outcome:
     """The outcome of an answer; `truth` has no names for a null or a stranger."""
     verdict = answer["verdict"]
     if verdict == "error":

@@ -55,11 +55,7 @@ def terms(c: Columns) -> tuple[Terms, Terms]:
     angle, share = np.cumsum(w) * dt, dt / WARMING_S
     warmth = lfilter([share], [1.0, share - 1.0], i**2)
     smooth = {"i": i, "w": w}
-    electrical = {
-        "current_sensor_offset": one,
-        "brush_voltage_drop": np.sign(i),
-        "resistance_heating": warmth * i,
-    }
+    electrical = {"current_sensor_offset": one, "brush_voltage_drop": np.sign(i), "resistance_heating": warmth * i}
     mechanical = {
         "constant_load": one,
         "coulomb_friction": np.sign(w),
@@ -78,9 +74,7 @@ def terms(c: Columns) -> tuple[Terms, Terms]:
     volts = {"v": _held(v, dt), "input_dead_zone": _held(np.sign(v), dt)}
     stored = {"change": _change(i), "inductance_saturation": _change(i**3)}
     pushed = {"change": _change(w), "load": _held(load, dt)}
-    return stored | volts | integrated(smooth | electrical), pushed | integrated(
-        smooth | mechanical
-    )
+    return stored | volts | integrated(smooth | electrical), pushed | integrated(smooth | mechanical)
 
 
 def selected(equations: list[Terms]) -> dict[str, float]:
@@ -109,8 +103,5 @@ def sparse(runs: Runs, holdout: Runs) -> dict[str, Any]:
     """The answer, as `pmdc diagnose --json` writes it; no parameters and no hold-out."""
     pairs = [terms(c) for c in runs.values()]
     found = selected([e for e, _ in pairs]) | selected([m for _, m in pairs])
-    effects = [
-        {"name": name, "parameters": {}, "also_possible": []}
-        for name in sorted(found, key=lambda n: -found[n])
-    ]
+    effects = [{"name": name, "parameters": {}, "also_possible": []} for name in sorted(found, key=lambda n: -found[n])]
     return {"verdict": "named" if effects else "none_detected", "effects": effects}

@@ -40,23 +40,14 @@ def _spring(hertz: float, damped: float = 0.1) -> Parameters:
 
 
 def _periodic(name: str, size: float) -> list[Parameters]:
-    return [
-        {name: size, "periods": float(n), "phase": phase}
-        for n in range(1, 13)
-        for phase in (0.0, 0.5 * math.pi)
-    ]
+    return [{name: size, "periods": float(n), "phase": phase} for n in range(1, 13) for phase in (0.0, 0.5 * math.pi)]
 
 
 # the starts of each effect: its shapes at a small amplitude
 STARTS: Mapping[str, list[Parameters]] = {
     "coulomb_friction": [{"torque_Nm": 0.01}],
-    "stribeck_friction": [
-        {"coulomb_Nm": 0.01, "static_Nm": 0.02, "speed_rad_s": speed} for speed in (5.0, 15.0)
-    ],
-    "asymmetric_friction": [
-        {"forward_Nm": 0.01, "backward_Nm": 0.02},
-        {"forward_Nm": 0.02, "backward_Nm": 0.01},
-    ],
+    "stribeck_friction": [{"coulomb_Nm": 0.01, "static_Nm": 0.02, "speed_rad_s": speed} for speed in (5.0, 15.0)],
+    "asymmetric_friction": [{"forward_Nm": 0.01, "backward_Nm": 0.02}, {"forward_Nm": 0.02, "backward_Nm": 0.01}],
     "quadratic_drag": [{"drag": 2e-7}],
     "cogging_torque": _periodic("amplitude_Nm", 0.01),
     "torque_ripple": _periodic("amplitude", 0.01),
@@ -143,10 +134,7 @@ class Bench:
     def residual(self, model: Model) -> NDArray[np.float64]:
         """Measured minus simulated over noise, of all runs and both channels, flattened."""
         plant = model.plant()
-        jobs = [
-            (plant, c, angle, m)
-            for c, angle, m in zip(self.runs, model.angles, self.measured, strict=True)
-        ]
+        jobs = [(plant, c, angle, m) for c, angle, m in zip(self.runs, model.angles, self.measured, strict=True)]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             flat = np.concatenate([r.ravel() for r in pool.map(self._one, jobs)])
         return np.clip(np.nan_to_num(flat, nan=1e6), -1e6, 1e6)
@@ -234,11 +222,7 @@ def baseline(bench: Bench) -> Model:
 def _periods_pairs(name: str) -> Iterator[list[Parameters]]:
     """Starts that are judged together: sine and cosine of the same periods; others one by one."""
     starts = STARTS[name]
-    yield from (
-        (starts[k : k + 2] for k in range(0, len(starts), 2))
-        if name in ANGLE
-        else ([s] for s in starts)
-    )
+    yield from ((starts[k : k + 2] for k in range(0, len(starts), 2)) if name in ANGLE else ([s] for s in starts))
 
 
 def screened(bench: Bench, model: Model) -> list[tuple[float, str, Model]]:
@@ -317,11 +301,7 @@ def _parameters(model: Model, name: str) -> dict[str, Any]:
             return [value - size, value + size]
         return [value * math.exp(-error), value * math.exp(min(error, 50.0))]
 
-    return {
-        p: {"value": v, "ci95": interval(p, v)}
-        for p, v in model.effects[name].items()
-        if p not in FIXED
-    }
+    return {p: {"value": v, "ci95": interval(p, v)} for p, v in model.effects[name].items() if p not in FIXED}
 
 
 def _holdout_rms(holdout: Runs, noise: NDArray[np.float64], model: Model) -> float:
@@ -338,14 +318,7 @@ def stepwise(runs: Runs, holdout: Runs) -> dict[str, Any]:
     bare = baseline(bench)
     model = swapped(bench, forward(bench, bare), bare)
     noise = bench.noise * np.sqrt((model.residual.reshape(-1, 2) ** 2).mean(0))
-    gap = {
-        "before": _holdout_rms(holdout, noise, bare),
-        "after": _holdout_rms(holdout, noise, model),
-        "floor": 1.0,
-    }
-    effects = [
-        {"name": name, "parameters": _parameters(model, name), "also_possible": []}
-        for name in model.effects
-    ]
+    gap = {"before": _holdout_rms(holdout, noise, bare), "after": _holdout_rms(holdout, noise, model), "floor": 1.0}
+    effects = [{"name": name, "parameters": _parameters(model, name), "also_possible": []} for name in model.effects]
     verdict = "named" if effects else "none_detected"
     return {"verdict": verdict, "effects": effects, "gap": {"holdout": gap}}

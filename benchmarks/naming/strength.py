@@ -100,10 +100,7 @@ class Gauge:
         flat = d.reshape(-1)
         left = (flat - self.basis @ (self.basis.T @ flat)).reshape(d.shape)
         parts = np.split(left, np.cumsum(self.lengths)[:-1])
-        return Response(
-            peak=max(math.sqrt(float(np.mean(p**2))) for p in parts),
-            chi_square=float(np.sum(left**2)),
-        )
+        return Response(peak=max(math.sqrt(float(np.mean(p**2))) for p in parts), chi_square=float(np.sum(left**2)))
 
 
 def amplitude_for(

@@ -10,15 +10,7 @@ from typing import Any
 from rich.table import Table
 
 from benchmarks.naming.hidden import NAMES
-from benchmarks.naming.score import (
-    PUBLISHED_RECOVERY,
-    Outcome,
-    gap_closed,
-    intervals,
-    named,
-    outcome,
-    right,
-)
+from benchmarks.naming.score import PUBLISHED_RECOVERY, Outcome, gap_closed, intervals, named, outcome, right
 
 Result = dict[str, Any]  # one line of the results file
 ABSTAINED = {"ambiguous": "amb", "not_in_library": "lib", "none_detected": "none", "error": "err"}
@@ -150,16 +142,12 @@ def strengths(results: Sequence[Result]) -> Table:
 
 def noise_sweep(results: Sequence[Result]) -> Table:
     """Recovery by noise beside the published one for known base parameters."""
-    table = _table(
-        "Recovery by noise", "noise %", ("cases", "named right %", "wrong %", "published %")
-    )
+    table = _table("Recovery by noise", "noise %", ("cases", "named right %", "wrong %", "published %"))
     groups = _grouped(results, lambda r: float(r["detail"].split()[1]))
     for percent, rows in sorted(groups.items()):
         counts = Counter(outcome_of(r) for r in rows)
         shares = [_percent(counts[name], len(rows)) for name in ("exact", "wrong")]
-        table.add_row(
-            f"{percent:g}", str(len(rows)), *shares, str(PUBLISHED_RECOVERY.get(percent, "-"))
-        )
+        table.add_row(f"{percent:g}", str(len(rows)), *shares, str(PUBLISHED_RECOVERY.get(percent, "-")))
     return table
 
 

@@ -6,9 +6,7 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True, parallel=True, fastmath=True)
-def numba_speeds(
-    gains: NDArray, motion: NDArray, setpoint: float, volts: float, step: float, samples: int
-):
+def numba_speeds(gains: NDArray, motion: NDArray, setpoint: float, volts: float, step: float, samples: int):
     """Last speed and largest speed of each loop, (loops, 2).
 
     `gains` (loops, 6): Kp, Ki, Kd, filter time, set-point weight, tracking time; `motion`, the exact
@@ -59,14 +57,7 @@ def control_speeds(gains: NDArray, motion: NDArray, setpoint: float, step: float
     return seen
 
 
-def gym_speeds(
-    gains: NDArray,
-    motor: dict[str, float],
-    setpoint: float,
-    volts: float,
-    step: float,
-    samples: int,
-):
+def gym_speeds(gains: NDArray, motor: dict[str, float], setpoint: float, volts: float, step: float, samples: int):
     """Last and largest speed in the physical system of gym-electric-motor, without its rewards and references."""
     import gym_electric_motor as gem
     from gym_electric_motor.physical_systems import converters, mechanical_loads, voltage_supplies

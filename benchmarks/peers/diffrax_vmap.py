@@ -51,9 +51,7 @@ def _solve(parameters, run, **options):
     last = float(len(run.voltage) - 1)
     start = jnp.stack([run.current[0], run.speed[0]])
     term, solver = diffrax.ODETerm(_slope), diffrax.Tsit5()
-    solution = diffrax.diffeqsolve(
-        term, solver, 0.0, last, y0=start, args=(parameters, run), **options
-    )
+    solution = diffrax.diffeqsolve(term, solver, 0.0, last, y0=start, args=(parameters, run), **options)
     return _errors(solution.ys, run)
 
 

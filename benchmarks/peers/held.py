@@ -35,16 +35,10 @@ def exact_step(parameters: NDArray, dt: float) -> NDArray:
     R, L, Kb, Kt, J, f = np.moveaxis(np.asarray(parameters), -1, 0)
     a, b, c, d = -R / L, -Kb / L, Kt / J, -f / J
     mean, square = (a + d) / 2, (a - d) ** 2 / 4 + b * c
-    oscillates = (
-        square.real < 0
-    )  # two branches keep real arithmetic real, as the complex step needs
+    oscillates = square.real < 0  # two branches keep real arithmetic real, as the complex step needs
     gap = np.sqrt(np.where(oscillates, -square, square))
     gap = np.where(np.abs(gap * dt) < 1e-7, 1e-7 / dt, gap)
-    apart, turn, decay = (
-        np.where(oscillates, 0.0, gap),
-        np.where(oscillates, gap, 0.0),
-        np.exp(mean * dt),
-    )
+    apart, turn, decay = (np.where(oscillates, 0.0, gap), np.where(oscillates, gap, 0.0), np.exp(mean * dt))
     slow, fast = np.exp((mean + apart) * dt), np.exp((mean - apart) * dt)
     even = np.where(oscillates, decay * np.cos(turn * dt), (slow + fast) / 2)
     odd = np.where(oscillates, decay * np.sin(turn * dt), (slow - fast) / 2) / gap

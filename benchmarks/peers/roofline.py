@@ -57,16 +57,8 @@ def _linear_tile(tile, voltage, load, current, speed):
             i, w = tile[j], tile[T + j]
             tile[2 * T + j] += (i - yi) ** 2
             tile[3 * T + j] += (w - yw) ** 2
-            tile[j] = (
-                tile[4 * T + j] * i
-                + tile[5 * T + j] * w
-                + (tile[6 * T + j] * v + tile[7 * T + j] * t)
-            )
-            tile[T + j] = (
-                tile[8 * T + j] * i
-                + tile[9 * T + j] * w
-                + (tile[10 * T + j] * v + tile[11 * T + j] * t)
-            )
+            tile[j] = tile[4 * T + j] * i + tile[5 * T + j] * w + (tile[6 * T + j] * v + tile[7 * T + j] * t)
+            tile[T + j] = tile[8 * T + j] * i + tile[9 * T + j] * w + (tile[10 * T + j] * v + tile[11 * T + j] * t)
 
 
 @njit(parallel=True, **FAST)
@@ -183,9 +175,7 @@ def _with_effects(constants, dt, voltage, load, current, speed):
     return errors
 
 
-def squared_errors_with_effects(
-    candidates: NDArray, effects: NDArray, run: Run
-) -> NDArray[np.float64]:
+def squared_errors_with_effects(candidates: NDArray, effects: NDArray, run: Run) -> NDArray[np.float64]:
     """Errors of motors with smoothed Coulomb friction, brush drop and heating, shape (2, P).
 
     `effects` has shape (P, 7), columns as in `EFFECTS`: N m, rad/s, V, A, 1/K, K/W, s.

@@ -110,9 +110,7 @@ def _products(step, d_step, start, voltage, load, current, speed):
                 s[j] = a * si + b * sw + push_i
                 s[8 + j] = c * si + d * sw + push_w
             i, w = a * i + b * w + (e * v + g * t), c * i + d * w + (h * v + q * t)
-        for j in range(
-            16
-        ):  # effects of initial states decay to subnormal numbers, which are very slow
+        for j in range(16):  # effects of initial states decay to subnormal numbers, which are very slow
             if abs(s[j]) < 1e-30:
                 s[j] = 0.0
         for channel in range(2):
@@ -218,9 +216,7 @@ def identify(
 ) -> dict[str, float]:
     """R, L, Kb, Kt, J and f of the motor, from records of it."""
     runs = [Run.of(columns) for columns in records]
-    spread = [
-        np.std(np.concatenate(signals)) for signals in zip(*(r[3:] for r in runs), strict=True)
-    ]
+    spread = [np.std(np.concatenate(signals)) for signals in zip(*(r[3:] for r in runs), strict=True)]
     case = Case(runs, 1 / np.array(spread))
     starts = _screened(case, np.random.default_rng(seed))
     with ThreadPoolExecutor(2) as threads:
@@ -230,8 +226,6 @@ def identify(
     return dict(zip(NAMES, np.exp(best[:6]).tolist(), strict=True))
 
 
-def identify_by_least_squares(
-    records: Sequence[Mapping[str, NDArray]], seed: int = 0
-) -> dict[str, float]:
+def identify_by_least_squares(records: Sequence[Mapping[str, NDArray]], seed: int = 0) -> dict[str, float]:
     """The same starts and sensitivities under `scipy.optimize.least_squares`."""
     return identify(records, seed, _refine_by_scipy)

@@ -13,10 +13,7 @@ from benchmarks.peers.held import Run
 
 def _free_run(parameters: NDArray, run: Run, rtol: float) -> NDArray:
     R, L, Kb, Kt, J, f = (float(p) for p in parameters)
-    voltage, load = (
-        run.voltage.tolist(),
-        run.load.tolist(),
-    )  # elements of lists are faster to access
+    voltage, load = (run.voltage.tolist(), run.load.tolist())  # elements of lists are faster to access
     last, rate = len(voltage) - 1, 1.0 / run.dt
 
     def slope(t, x):

@@ -95,9 +95,7 @@ def _electrical_misfit(edge: _Edge, shift: int) -> float:
     rows = np.arange(MAX_SHIFT, BEFORE_EDGE + AFTER_EDGE - MAX_SHIFT - 1)
     later = rows + shift
     # two neighbouring currents span R i + L di/dt for any ratio of L / R to the step
-    return _misfit(
-        edge.voltage[rows], edge.current[later], edge.current[later + 1], edge.speed[later]
-    )
+    return _misfit(edge.voltage[rows], edge.current[later], edge.current[later + 1], edge.speed[later])
 
 
 def _mechanical_misfit(edge: _Edge, shift: int) -> float:

@@ -12,13 +12,7 @@ from ..recordings.recording import Finding, Recording, place_of_sample
 from ..recordings.white_noise import noise_by_differences
 from .alignment import shifted_channels, slow_sampling
 from .invalid_samples import clipped_extremes
-from .plausibility import (
-    angle_against_speed,
-    implausible_units,
-    lost_signs,
-    reversed_signs,
-    speed_of,
-)
+from .plausibility import angle_against_speed, implausible_units, lost_signs, reversed_signs, speed_of
 
 MAX_JITTER = 0.02  # of a step, root mean square
 MISSING_ROW = 1.5  # longer steps, in typical ones of an even clock, lack a row
@@ -173,9 +167,7 @@ def current_jumps(run: Recording) -> Iterator[Finding]:
         return
     steps = np.abs(np.diff(run.current))
     row = int(np.argmax(steps))
-    if steps[row] > MAX_JUMP * np.ptp(run.current) and steps[row] > 10 * noise_by_differences(
-        3, run.current
-    ):
+    if steps[row] > MAX_JUMP * np.ptp(run.current) and steps[row] > 10 * noise_by_differences(3, run.current):
         yield Finding(
             run.name,
             "current",

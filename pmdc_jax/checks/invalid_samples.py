@@ -115,9 +115,7 @@ def _drive_is_steady(run: Recording) -> Bool[np.ndarray, " samples"]:
     return ~(steps | np.roll(steps, 1) | np.roll(steps, -1))
 
 
-def clipped_extremes(
-    values: Float[np.ndarray, " samples"],
-) -> Iterator[tuple[float, int, int]]:
+def clipped_extremes(values: Float[np.ndarray, " samples"]) -> Iterator[tuple[float, int, int]]:
     """Extremes at which a noisy signal stays longer than by chance, with start and length of the longest stay; or to
     which it leaps too often, to stay for only a few samples each."""
     if not _is_noisy(values):
@@ -134,9 +132,7 @@ def clipped_extremes(
             yield float(extreme), start, length
 
 
-def _repeats_between_leaps(
-    values: Float[np.ndarray, " samples"], extreme: float, noise: float
-) -> int:
+def _repeats_between_leaps(values: Float[np.ndarray, " samples"], extreme: float, noise: float) -> int:
     """How many values repeat the one before in stays at an extreme that begin and end with a leap."""
     starts, ends = _stays(values)
     inside = (values[starts] == extreme) & (starts > 0) & (ends < len(values) - 1)
@@ -180,11 +176,7 @@ def _longest_stay_at(values: np.ndarray, extreme: float) -> tuple[int, int, floa
     expected = 1 + np.log(CHANCE_OF_STAY / len(values)) / np.log(min(repeats, 0.999))
     # a speed in encoder counts stays at one value whenever the motor turns steadily
     elsewhere = 2.0 * _second_longest_stay(inner[inner != 0])
-    return (
-        int(starts[longest]),
-        int(ends[longest] - starts[longest]),
-        max(float(expected), elsewhere, 5.0),
-    )
+    return (int(starts[longest]), int(ends[longest] - starts[longest]), max(float(expected), elsewhere, 5.0))
 
 
 def _frozen(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
@@ -217,9 +209,7 @@ def _second_longest_stay(values: Float[np.ndarray, " samples"]) -> int:
     return int(lengths[-2]) if len(lengths) > 1 else 0
 
 
-def _stays(
-    values: Float[np.ndarray, " samples"],
-) -> tuple[Int[np.ndarray, " stays"], Int[np.ndarray, " stays"]]:
+def _stays(values: Float[np.ndarray, " samples"]) -> tuple[Int[np.ndarray, " stays"], Int[np.ndarray, " stays"]]:
     """First and last sample of each stay of a signal at one value; one after the other they make up the signal."""
     ends = np.flatnonzero(np.diff(values, append=np.nan) != 0)
     return np.append(0, ends[:-1] + 1), ends

@@ -78,8 +78,7 @@ def lost_signs(run: Recording) -> Iterator[Finding]:
 
     positive = [name for name in UNSIGNED if np.min(w[name]) > -MAX_NEGATIVE * np.max(w[name])]
     least, lost = min(
-        ((unexplained(*some), some) for k in (1, 2) for some in combinations(positive, k)),
-        default=(1.0, ()),
+        ((unexplained(*some), some) for k in (1, 2) for some in combinations(positive, k)), default=(1.0, ())
     )
     as_recorded = unexplained()
     if least < min(MAX_UNEXPLAINED, as_recorded / 2) and as_recorded > MAX_UNEXPLAINED / 2:
@@ -153,9 +152,7 @@ def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
     wrong = [finding for run in runs for finding in _impossible_values(run)]
     yield from wrong
     names = ", ".join(run.name for run in runs if run.load is not None)
-    constants = max(
-        (_constants(runs, longer) for longer in WINDOW_LENGTHS), key=lambda c: c.explained
-    )
+    constants = max((_constants(runs, longer) for longer in WINDOW_LENGTHS), key=lambda c: c.explained)
     Kb, Kt = constants.Kb, constants.Kt
     if constants.explained < 0.8 or not (constants.R.positive and Kb.positive):
         return
@@ -206,9 +203,7 @@ def _impossible_values(run: Recording) -> Iterator[Finding]:
 
     largest = {name: float(np.max(np.abs(w[name]))) for name in ("speed", "voltage") if name in w}
     if largest.get("voltage", 0.0) > MAX_VOLTAGE:
-        yield wrong(
-            "voltage", f"{largest['voltage']:.4g} V is too high for a brushed motor", "[mV]"
-        )
+        yield wrong("voltage", f"{largest['voltage']:.4g} V is too high for a brushed motor", "[mV]")
     elif largest.get("speed", 0.0) > MAX_SPEED:
         what = f"{largest['speed']:.4g} rad/s is too fast for a brushed motor"
         yield wrong("speed", what, "[rpm] or [deg/s]")

@@ -123,9 +123,7 @@ def state_feedback(
     if len(loop_poles) == 2:
         return StateFeedback(**gains)
     slowest_time_constant = float(1 / np.min(np.abs(np.real(np.asarray(poles)))))
-    return StateFeedbackIntegral(
-        **gains, integral=float(-K[2]), tracking_time=slowest_time_constant
-    )
+    return StateFeedbackIntegral(**gains, integral=float(-K[2]), tracking_time=slowest_time_constant)
 
 
 def _state_space(motor: Motor, sample_time: float | None) -> tuple[np.ndarray, np.ndarray]:
@@ -138,9 +136,7 @@ def _state_space(motor: Motor, sample_time: float | None) -> tuple[np.ndarray, n
     return A, np.array([model.iv, model.wv], float)
 
 
-def _with_error_integral(
-    A: np.ndarray, B: np.ndarray, sample_time: float | None
-) -> tuple[np.ndarray, np.ndarray]:
+def _with_error_integral(A: np.ndarray, B: np.ndarray, sample_time: float | None) -> tuple[np.ndarray, np.ndarray]:
     """A and B with a third state, the integral of set point minus speed."""
     # row of d(integral)/dt = -w, or of integral[k+1] = integral[k] - step w[k]
     row = [0.0, -1.0, 0.0] if sample_time is None else [0.0, -sample_time, 1.0]

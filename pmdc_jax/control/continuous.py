@@ -73,18 +73,13 @@ def continuous_loop(
 
 
 def _limited(
-    motor: Motor,
-    state: State,
-    voltage: Number,
-    voltage_limit: Number,
-    current_limit: Number | None,
+    motor: Motor, state: State, voltage: Number, voltage_limit: Number, current_limit: Number | None
 ) -> Number:
     """The voltage limited by the current loop, then by the voltage limit."""
     if current_limit is not None:
         holding_voltage = motor.R * state.current + motor.Kb * state.speed
         lowest, highest = (
-            holding_voltage + CURRENT_LOOP_GAIN * motor.R * (sign * current_limit - state.current)
-            for sign in (-1, 1)
+            holding_voltage + CURRENT_LOOP_GAIN * motor.R * (sign * current_limit - state.current) for sign in (-1, 1)
         )
         voltage = jnp.clip(voltage, lowest, highest)
     return jnp.clip(voltage, -voltage_limit, voltage_limit)

@@ -33,10 +33,7 @@ def law_content(law: Law) -> dict[str, Any]:
         "gains": gains_of(law.controller),
         "sample_time_s": float(hardware.sample_time),
         "delay_samples": hardware.delay,
-        "limits": {
-            "voltage_V": float(hardware.voltage_limit),
-            "current_A": _number_or_none(hardware.current_limit),
-        },
+        "limits": {"voltage_V": float(hardware.voltage_limit), "current_A": _number_or_none(hardware.current_limit)},
         "speed_step_rad_s": _number_or_none(hardware.speed_step),
         "measures_current": hardware.measures_current,
         "model": {name: float(value) for name, value in law.model._asdict().items()},
@@ -68,9 +65,7 @@ def load_controller(path: str | Path) -> Law:
             sample_time=_positive(where, "sample_time_s", content.get("sample_time_s")),
             voltage_limit=_positive(where, "voltage_V", limits.get("voltage_V")),
             current_limit=_positive_or_none(where, "current_A", limits.get("current_A")),
-            speed_step=_positive_or_none(
-                where, "speed_step_rad_s", content.get("speed_step_rad_s")
-            ),
+            speed_step=_positive_or_none(where, "speed_step_rad_s", content.get("speed_step_rad_s")),
             delay=int(delay),
             measures_current=bool(content.get("measures_current", True)),
         ),

@@ -41,9 +41,7 @@ class AbstractController(eqx.Module):
     integrates: ClassVar[bool] = True
     filters_derivative: ClassVar[bool] = False
 
-    def command(
-        self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
-    ) -> Number:
+    def command(self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number) -> Number:
         """Commanded voltage, V, before any limit.
 
         **Arguments**: `reference` and `speed`, rad/s; `current`, A; `step`, the sample time in s, 0 in
@@ -51,15 +49,11 @@ class AbstractController(eqx.Module):
         """
         raise NotImplementedError
 
-    def rates(
-        self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
-    ) -> Memory:
+    def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
         """Rates of the memory, per second; `excess`, V, is the applied minus the commanded voltage."""
         raise NotImplementedError
 
-    def equilibrium(
-        self, reference: Number, speed: Number, current: Number, voltage: Number, step: Number
-    ) -> Memory:
+    def equilibrium(self, reference: Number, speed: Number, current: Number, voltage: Number, step: Number) -> Memory:
         """Memory in steady state: the filter holds `speed`, the integral, if any, makes the command `voltage`."""
         memory = Memory(jnp.zeros_like(jnp.asarray(speed, float)), speed)
         if not self.integrates:
@@ -68,9 +62,7 @@ class AbstractController(eqx.Module):
         return memory._replace(integral=integral)
 
 
-def _integral_rate(
-    integral: Number, tracking_time: Number, error: Number, excess: Number, step: Number
-) -> Number:
+def _integral_rate(integral: Number, tracking_time: Number, error: Number, excess: Number, step: Number) -> Number:
     """Rate of the integral, with back-calculation over `tracking_time` while the voltage is limited.
 
     **Source**: Astrom, Hagglund, "Advanced PID Control" (2006), section 3.5, back-calculation.
@@ -89,34 +81,21 @@ class PI(AbstractController):
 
     name: ClassVar = "pi"
     label: ClassVar = "PI controller"
-    units: ClassVar = {
-        "proportional": "V s/rad",
-        "integral": "V/rad",
-        "setpoint_weight": "",
-        "tracking_time": "s",
-    }
+    units: ClassVar = {"proportional": "V s/rad", "integral": "V/rad", "setpoint_weight": "", "tracking_time": "s"}
     coordinates: ClassVar = ("stiffness", "integral_time", "setpoint_weight", "tracking_time")
-    c_command: ClassVar = (
-        "PMDC_PROPORTIONAL * (PMDC_SETPOINT_WEIGHT * reference - speed) + state->integral"
-    )
+    c_command: ClassVar = "PMDC_PROPORTIONAL * (PMDC_SETPOINT_WEIGHT * reference - speed) + state->integral"
 
     proportional: Number
     integral: Number
     setpoint_weight: Number
     tracking_time: Number
 
-    def command(
-        self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
-    ) -> Number:
+    def command(self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number) -> Number:
         del current, step
         return self.proportional * (self.setpoint_weight * reference - speed) + memory.integral
 
-    def rates(
-        self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
-    ) -> Memory:
-        integral = _integral_rate(
-            self.integral, self.tracking_time, reference - speed, excess, step
-        )
+    def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
+        integral = _integral_rate(self.integral, self.tracking_time, reference - speed, excess, step)
         return Memory(integral, jnp.zeros_like(memory.filtered))
 
 
@@ -149,20 +128,14 @@ class PID(AbstractController):
     setpoint_weight: Number
     tracking_time: Number
 
-    def command(
-        self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
-    ) -> Number:
+    def command(self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number) -> Number:
         del current
         slope = (speed - memory.filtered) / (self.filter_time + step)
         proportional = self.proportional * (self.setpoint_weight * reference - speed)
         return proportional + memory.integral - self.derivative * slope
 
-    def rates(
-        self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
-    ) -> Memory:
-        integral = _integral_rate(
-            self.integral, self.tracking_time, reference - speed, excess, step
-        )
+    def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
+        integral = _integral_rate(self.integral, self.tracking_time, reference - speed, excess, step)
         return Memory(integral, (speed - memory.filtered) / (self.filter_time + step))
 
 
@@ -176,15 +149,9 @@ class StateFeedback(AbstractController):
 
     name: ClassVar = "state-feedback"
     label: ClassVar = "State feedback"
-    units: ClassVar = {
-        "reference_gain": "V s/rad",
-        "current_gain": "V/A",
-        "speed_gain": "V s/rad",
-    }
+    units: ClassVar = {"reference_gain": "V s/rad", "current_gain": "V/A", "speed_gain": "V s/rad"}
     coordinates: ClassVar = ("stiffness", "derivative_time")
-    c_command: ClassVar = (
-        "PMDC_REFERENCE_GAIN * reference - (PMDC_CURRENT_GAIN * current + PMDC_SPEED_GAIN * ahead)"
-    )
+    c_command: ClassVar = "PMDC_REFERENCE_GAIN * reference - (PMDC_CURRENT_GAIN * current + PMDC_SPEED_GAIN * ahead)"
     feeds_back_current: ClassVar = True
     integrates: ClassVar = False
 
@@ -192,16 +159,12 @@ class StateFeedback(AbstractController):
     current_gain: Number
     speed_gain: Number
 
-    def command(
-        self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
-    ) -> Number:
+    def command(self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number) -> Number:
         del memory, step
         feedback = self.current_gain * current + self.speed_gain * speed
         return self.reference_gain * reference - feedback
 
-    def rates(
-        self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
-    ) -> Memory:
+    def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
         del reference, speed, excess, step
         zero = jnp.zeros_like(memory.integral)
         return Memory(zero, zero)
@@ -228,19 +191,13 @@ class StateFeedbackIntegral(AbstractController):
     integral: Number
     tracking_time: Number
 
-    def command(
-        self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number
-    ) -> Number:
+    def command(self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number) -> Number:
         del step
         feedback = self.current_gain * current + self.speed_gain * speed
         return self.reference_gain * reference - feedback + memory.integral
 
-    def rates(
-        self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number
-    ) -> Memory:
-        integral = _integral_rate(
-            self.integral, self.tracking_time, reference - speed, excess, step
-        )
+    def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
+        integral = _integral_rate(self.integral, self.tracking_time, reference - speed, excess, step)
         return Memory(integral, jnp.zeros_like(memory.filtered))
 
 

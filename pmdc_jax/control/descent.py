@@ -39,13 +39,7 @@ class Descent(NamedTuple):
     lowest_costs: Costs
 
 
-def best_coordinates(
-    task: Task,
-    space: GainSpace,
-    motors: Motor,
-    seed: int = 0,
-    starts: int = STARTS,
-) -> np.ndarray:
+def best_coordinates(task: Task, space: GainSpace, motors: Motor, seed: int = 0, starts: int = STARTS) -> np.ndarray:
     """Coordinates of the best gains found from any start, (gains,).
 
     Gains are drawn log-uniformly over their ranges. From the best, Adam descends the smooth cost, and each start keeps
@@ -74,12 +68,7 @@ def _cheapest(coordinates: Coordinates, costs: Costs, count: int) -> Float[Array
 
 
 def _smooth_costs(
-    task: Task,
-    space: GainSpace,
-    model: SampledMotor,
-    motors: Motor,
-    coordinates: Coordinates,
-    width: Number,
+    task: Task, space: GainSpace, model: SampledMotor, motors: Motor, coordinates: Coordinates, width: Number
 ) -> Costs:
     def cost_at(x: Float[Array, " gains"]) -> Float[Array, ""]:
         return cost(task, smooth_score(task, model, motors, space.controller(x), width), DESCENT)
@@ -100,9 +89,7 @@ def _initial_smooth_costs(
 
 
 @compiled
-def _exact_costs(
-    task: Task, space: GainSpace, model: SampledMotor, motors: Motor, coordinates: Coordinates
-) -> Costs:
+def _exact_costs(task: Task, space: GainSpace, model: SampledMotor, motors: Motor, coordinates: Coordinates) -> Costs:
     def cost_at(x: Float[Array, " gains"]) -> Float[Array, ""]:
         return cost(task, exact_score(task, model, motors, space.controller(x)), SELECTION)
 

@@ -52,11 +52,7 @@ class EvaluatedController:
 
 
 def evaluate(
-    name: str,
-    task: Task,
-    motor: Motor,
-    controller: AbstractController,
-    validation_motors: Motor | None,
+    name: str, task: Task, motor: Motor, controller: AbstractController, validation_motors: Motor | None
 ) -> EvaluatedController:
     """A controller with its exact metrics; `validation_motors`, along a leading axis, give the percentiles."""
     controller = jax.tree.map(jnp.asarray, controller)
@@ -68,13 +64,9 @@ def evaluate(
         controller=controller,
         metrics=_finite_or_none(step_metrics(*step, task.setpoint)),
         load=_finite_or_none(load_metrics(*loaded, task.setpoint)),
-        second_step=_finite_or_none(
-            step_metrics(*second, SECOND_SETPOINT * task.setpoint, task.setpoint)
-        ),
+        second_step=_finite_or_none(step_metrics(*second, SECOND_SETPOINT * task.setpoint, task.setpoint)),
         small_step=_finite_or_none(_small_step_metrics(task, motor, law)),
-        robust=None
-        if validation_motors is None
-        else evaluate_robustness(task, motor, controller, validation_motors),
+        robust=None if validation_motors is None else evaluate_robustness(task, motor, controller, validation_motors),
         stable=margins(motor, law).stable,
     )
 
@@ -83,13 +75,9 @@ def _small_step_metrics(task: Task, motor: Motor, law: Law) -> StepMetrics:
     """Metrics of a step to a twentieth of the set point, without load and noise. Gains that do not overshoot a step
     with the voltage at its limit may overshoot this one."""
     small = eqx.tree_at(
-        lambda t: (t.setpoint, t.load, t.noise),
-        task,
-        (SMALL_STEP * task.setpoint, 0 * task.load, 0 * task.noise),
+        lambda t: (t.setpoint, t.load, t.noise), task, (SMALL_STEP * task.setpoint, 0 * task.load, 0 * task.noise)
     )
-    (time, speed), *_ = small.parts(
-        simulate_task(small, motor, law), REPORTED_SUBSTEPS * task.substeps
-    )
+    (time, speed), *_ = small.parts(simulate_task(small, motor, law), REPORTED_SUBSTEPS * task.substeps)
     return step_metrics(time, speed, small.setpoint)
 
 
@@ -100,9 +88,7 @@ def simulate_task(task: Task, motor: Motor, law: Law) -> Response:
 
 
 @compiled
-def simulate_speeds(
-    task: Task, motors: Motor, law: Law
-) -> Float[Array | np.ndarray, "motors samples"]:
+def simulate_speeds(task: Task, motors: Motor, law: Law) -> Float[Array | np.ndarray, "motors samples"]:
     """Speed of every motor at every sample, rad/s."""
 
     def speed(motor: Motor) -> Float[Array | np.ndarray, " samples"]:
@@ -117,9 +103,7 @@ def _finite_or_none(metrics: StepMetrics | LoadMetrics) -> dict[str, float | Non
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
-def evaluate_robustness(
-    task: Task, motor: Motor, controller: AbstractController, motors: Motor
-) -> Robustness:
+def evaluate_robustness(task: Task, motor: Motor, controller: AbstractController, motors: Motor) -> Robustness:
     """Metrics over `motors`, along a leading axis, of a controller whose law is designed for `motor`."""
     controller = jax.tree.map(jnp.asarray, controller)
     model = SampledMotor.of(motor, task.hardware.sample_time)

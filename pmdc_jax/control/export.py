@@ -83,8 +83,7 @@ def c_header(law: Law) -> str:
         ignored="" if hardware.measures_current else " (ignored: it is estimated)",
         moment="from the next sample on" if hardware.delay else "at once",
         constants="\n".join(
-            f"#define PMDC_{name.upper()} ((pmdc_real){value!r})"
-            for name, value in _constants(law).items()
+            f"#define PMDC_{name.upper()} ((pmdc_real){value!r})" for name, value in _constants(law).items()
         ),
         body="\n".join(f"    {line}" for line in _body(law)),
     )
@@ -93,10 +92,7 @@ def c_header(law: Law) -> str:
 def _constants(law: Law) -> dict[str, float]:
     hardware = law.hardware
     constants = gains_of(law.controller)
-    constants |= {
-        "sample_time": float(hardware.sample_time),
-        "voltage_limit": float(hardware.voltage_limit),
-    }
+    constants |= {"sample_time": float(hardware.sample_time), "voltage_limit": float(hardware.voltage_limit)}
     if hardware.current_limit is not None:
         constants["current_limit"] = float(hardware.current_limit)
     return constants | {f"model_{name}": float(v) for name, v in law.model._asdict().items()}
@@ -144,10 +140,7 @@ def _command(law: Law) -> list[str]:
     """Statements that compute the commanded voltage."""
     lines = []
     if law.controller.filters_derivative:
-        lines += [
-            "const pmdc_real slope = (speed - state->filtered)"
-            " / (PMDC_FILTER_TIME + PMDC_SAMPLE_TIME);"
-        ]
+        lines += ["const pmdc_real slope = (speed - state->filtered) / (PMDC_FILTER_TIME + PMDC_SAMPLE_TIME);"]
     return [*lines, f"const pmdc_real asked = {law.controller.c_command};"]
 
 
@@ -170,8 +163,7 @@ def _memory_update(law: Law) -> list[str]:
     if law.controller.integrates:
         lines += [
             "/* anti-windup: the integral tracks the voltage applied */",
-            "const pmdc_real tracking = PMDC_TRACKING_TIME > PMDC_SAMPLE_TIME"
-            " ? PMDC_TRACKING_TIME : PMDC_SAMPLE_TIME;",
+            "const pmdc_real tracking = PMDC_TRACKING_TIME > PMDC_SAMPLE_TIME ? PMDC_TRACKING_TIME : PMDC_SAMPLE_TIME;",
             "state->integral += PMDC_SAMPLE_TIME * (PMDC_INTEGRAL * (reference - speed)",
             "                                       + (applied - asked) / tracking);",
         ]

@@ -32,8 +32,7 @@ def check_reachable(
     if current_limit is not None and current > current_limit:
         raise InputError(
             option,
-            f"holding {setpoint:g} rad/s{against} takes {current:.2f} A,"
-            f" more than the limit of {current_limit:g} A",
+            f"holding {setpoint:g} rad/s{against} takes {current:.2f} A, more than the limit of {current_limit:g} A",
             f"Raise --current-limit, or lower {lower}",
         )
 
@@ -50,9 +49,7 @@ def _highest_speed(motor: Motor, setpoint: float, voltage_limit: float, load: fl
     return low
 
 
-def check_settling(
-    max_settling: float | None, fastest_settling: float | None, setpoint: float
-) -> float:
+def check_settling(max_settling: float | None, fastest_settling: float | None, setpoint: float) -> float:
     """The fastest settling; an `InputError` where there is none, or `max_settling` is shorter."""
     if fastest_settling is None:
         raise InputError(
@@ -70,9 +67,7 @@ def check_settling(
     return fastest_settling
 
 
-def default_load_torque(
-    motor: Motor, setpoint: float, voltage_limit: float, current_limit: float | None
-) -> float:
+def default_load_torque(motor: Motor, setpoint: float, voltage_limit: float, current_limit: float | None) -> float:
     """Half the load torque that the limits still hold at the set point, N m: the default load step."""
     state, voltage = steady_state(motor, setpoint)
     spare_current = (voltage_limit - abs(float(voltage))) / float(motor.R)

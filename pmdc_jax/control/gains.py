@@ -51,18 +51,12 @@ class GainSpace(NamedTuple):
         """The controller at these coordinates."""
         kind = CONTROLLERS[self.kind]
         relative = {name: jnp.exp(x) for name, x in zip(self.names, coordinates, strict=True)}
-        times = {
-            name: self.time_unit * value
-            for name, value in relative.items()
-            if name.endswith("_time")
-        }
+        times = {name: self.time_unit * value for name, value in relative.items() if name.endswith("_time")}
         stiffness, gains = self.gain_unit * relative["stiffness"], {}
         if kind.feeds_back_current:
             # K1 i equals K2 times the change of speed that the torque Kt i produces in derivative_time
             current_gain = stiffness * times["derivative_time"] * self.motor.Kt / self.motor.J
-            gains["reference_gain"] = reference_gain(
-                self.motor, self.setpoint, current_gain, stiffness
-            )
+            gains["reference_gain"] = reference_gain(self.motor, self.setpoint, current_gain, stiffness)
             gains |= {"current_gain": current_gain, "speed_gain": stiffness}
         else:
             gains |= {"proportional": stiffness, "setpoint_weight": relative["setpoint_weight"]}
@@ -75,9 +69,7 @@ class GainSpace(NamedTuple):
         return kind(**gains)
 
 
-def reference_gain(
-    motor: Motor, setpoint: Number, current_gain: Number, speed_gain: Number
-) -> Number:
+def reference_gain(motor: Motor, setpoint: Number, current_gain: Number, speed_gain: Number) -> Number:
     """Kr, V s/rad, with which state feedback holds the set point exactly, without load."""
     state, voltage = steady_state(motor, setpoint)
     return (voltage + current_gain * state.current) / setpoint + speed_gain

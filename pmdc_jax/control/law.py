@@ -39,15 +39,7 @@ class SampledMotor(NamedTuple):
         to_peak = jnp.minimum(sample_time, _time_to_peak_current(linear))
         P, Q, *_ = make_propagator(linear, to_peak, Drive())
         return cls(
-            ii=A[0, 0],
-            iw=A[0, 1],
-            iv=B[0, 0],
-            wi=A[1, 0],
-            ww=A[1, 1],
-            wv=B[1, 0],
-            pi=P[0, 0],
-            pw=P[0, 1],
-            pv=Q[0, 0],
+            ii=A[0, 0], iw=A[0, 1], iv=B[0, 0], wi=A[1, 0], ww=A[1, 1], wv=B[1, 0], pi=P[0, 0], pw=P[0, 1], pv=Q[0, 0]
         )
 
     def next(self, current: Number, speed: Number, voltage: Number) -> tuple[Number, Number]:
@@ -101,9 +93,7 @@ class Law(eqx.Module):
         memory = self.controller.equilibrium(reference, at.speed, at.current, voltage, step)
         return LawState(memory, at.current, voltage)
 
-    def step(
-        self, state: LawState, reference: Number, speed: Number, current: Number
-    ) -> tuple[LawState, Number]:
+    def step(self, state: LawState, reference: Number, speed: Number, current: Number) -> tuple[LawState, Number]:
         """Compute one sample: the next state and the voltage (V) from the measured speed (rad/s) and current (A).
 
         The current is ignored where the hardware does not measure it. The voltage takes effect after the hardware's
@@ -117,9 +107,7 @@ class Law(eqx.Module):
             predicted_current, predicted_speed = model.next(current, speed, state.voltage)
         fed_back_speed = predicted_speed if self.controller.feeds_back_current else speed
         period = hardware.sample_time
-        commanded = self.controller.command(
-            state.memory, reference, fed_back_speed, predicted_current, period
-        )
+        commanded = self.controller.command(state.memory, reference, fed_back_speed, predicted_current, period)
         limited = self._limited(commanded, predicted_current, predicted_speed)
         rates = self.controller.rates(state.memory, reference, speed, limited - commanded, period)
         memory = Memory(*(m + period * r for m, r in zip(state.memory, rates, strict=True)))

@@ -93,9 +93,7 @@ def closed_loop(motor: Motor, law: Law, course: Course, substeps: int = 1) -> Re
         state, instants = jax.lax.scan(substep, state, length=substeps, unroll=substeps == 1)
         return LoopState(state, law_state, voltage, past_speeds), instants
 
-    _, (current, speed, voltage) = jax.lax.scan(
-        sample, start, (course.reference, course.load, course.speed_noise)
-    )
+    _, (current, speed, voltage) = jax.lax.scan(sample, start, (course.reference, course.load, course.speed_noise))
     instants = jnp.arange(current.size)
     time = instants * (hardware.sample_time / substeps)
     return Response(time, current.ravel(), speed.ravel(), voltage.ravel())

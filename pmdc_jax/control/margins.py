@@ -166,11 +166,7 @@ def margins(motor: Motor, law: Law) -> Margins:
 def _without_unused_states(loop: Loop) -> Loop:
     """The loop without the law's unused states, such as the filter of a PI controller: no voltage depends on them."""
     # in one sample, and in any number of samples: entry (i, j) is positive if state i depends on state j
-    direct = (
-        (loop.A != 0).astype(int)
-        + np.outer(loop.B != 0, loop.C != 0)
-        + np.eye(len(loop.A), dtype=int)
-    )
+    direct = (loop.A != 0).astype(int) + np.outer(loop.B != 0, loop.C != 0) + np.eye(len(loop.A), dtype=int)
     depends = np.linalg.matrix_power(direct, len(direct))
     needed = (depends[:2] > 0).any(axis=0) | ((loop.C != 0) @ depends > 0)
     A, B, C, N, D, Y, late = loop
@@ -224,9 +220,7 @@ def _gain_margin(gain: np.ndarray) -> float | None:
     return float(factors.min()) if factors.size else None
 
 
-def _phase_and_delay_margin(
-    angle: np.ndarray, gain: np.ndarray, step: float
-) -> tuple[float | None, float | None]:
+def _phase_and_delay_margin(angle: np.ndarray, gain: np.ndarray, step: float) -> tuple[float | None, float | None]:
     """The smallest phase shift (degrees) and the smallest delay (s) that bring the loop gain to -1."""
     magnitude = np.log(np.abs(gain))
     k = np.flatnonzero(magnitude[:-1] * magnitude[1:] <= 0)

@@ -33,9 +33,7 @@ class StepMetrics(NamedTuple):
     SteadyStateError: Scalar
 
 
-def step_metrics(
-    time: Samples, speed: Samples, final: Number, initial: Number = 0.0
-) -> StepMetrics:
+def step_metrics(time: Samples, speed: Samples, final: Number, initial: Number = 0.0) -> StepMetrics:
     """Exact metrics of a step from `initial` to `final`, rad/s, interpolated between samples.
 
     Crossings are interpolated linearly and peaks by a parabola, so that the error falls at least with the square of
@@ -79,9 +77,7 @@ def load_metrics(time: Samples, speed: Samples, reference: Number) -> LoadMetric
     )
 
 
-def smooth_settling(
-    time: Samples, speed: Samples, final: Number, initial: Number, width: Number
-) -> Scalar:
+def smooth_settling(time: Samples, speed: Samples, final: Number, initial: Number, width: Number) -> Scalar:
     """Differentiable settling time, s.
 
     The time during which the largest |error| still to come exceeds the band, with a soft maximum and a logistic edge
@@ -90,9 +86,7 @@ def smooth_settling(
     """
     excess = jnp.abs((speed - final) / (final - initial)) / BAND - 1  # in bands
     # jax.lax.cumlogsumexp is equivalent, but unrolls into a tree that takes seconds to compile
-    _, largest_to_come = jax.lax.scan(
-        _soft_running_maximum, jnp.asarray(-jnp.inf), excess / width, reverse=True
-    )
+    _, largest_to_come = jax.lax.scan(_soft_running_maximum, jnp.asarray(-jnp.inf), excess / width, reverse=True)
     step = time[1] - time[0]
     return step * jnp.sum(jax.nn.sigmoid(largest_to_come))
 

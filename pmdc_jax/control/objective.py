@@ -17,19 +17,9 @@ from .hardware import Hardware
 from .law import Law, SampledMotor
 from .loop import Course, Response, closed_loop
 from .margins import linear_loop, sensitivity_peak
-from .metrics import (
-    BAND,
-    Samples,
-    Scalar,
-    load_metrics,
-    smooth_overshoot,
-    smooth_settling,
-    step_metrics,
-)
+from .metrics import BAND, Samples, Scalar, load_metrics, smooth_overshoot, smooth_settling, step_metrics
 
-PART_COUNT = (
-    3  # equally long parts of the task: the step, the load step, and the second step under load
-)
+PART_COUNT = 3  # equally long parts of the task: the step, the load step, and the second step under load
 SECOND_SETPOINT = 0.5  # set point of the second step, over that of the first
 EXACT_SUBSTEPS = 4  # simulated instants per sample; exact metrics interpolate between them
 # Width of the smooth overshoot (%) for an allowed overshoot of 1 %, over the width of the smooth settling (bands).
@@ -79,14 +69,10 @@ class Strictness(NamedTuple):
 
 # The descent keeps a distance from the overshoot limit, which the smooth metrics blur. The tracking error, weight 1 for
 # each part, gives it a gradient where nothing settles yet.
-DESCENT = Strictness(
-    overshoot=1.0, allowed_overshoot=0.8, allowed_sensitivity=1.0, tracking_error=3.0
-)
+DESCENT = Strictness(overshoot=1.0, allowed_overshoot=0.8, allowed_sensitivity=1.0, tracking_error=3.0)
 # The choice uses exact metrics. Nearly all the allowed overshoot may be used, but exceeding it costs more than it can
 # gain. The tolerance on the sensitivity spares loops that the descent has left right at the limit.
-SELECTION = Strictness(
-    overshoot=3.0, allowed_overshoot=0.97, allowed_sensitivity=1.01, tracking_error=0.0
-)
+SELECTION = Strictness(overshoot=3.0, allowed_overshoot=0.97, allowed_sensitivity=1.01, tracking_error=0.0)
 
 
 class Task(eqx.Module):
@@ -153,9 +139,7 @@ class Score(NamedTuple):
     sensitivity: Scalar
 
 
-def exact_score(
-    task: Task, model: SampledMotor, motors: Motor, controller: AbstractController
-) -> Score:
+def exact_score(task: Task, model: SampledMotor, motors: Motor, controller: AbstractController) -> Score:
     """Exact metrics of a controller on every motor, resolved between samples too. `motors` has a leading axis."""
     setpoint, lower_setpoint = task.setpoint, SECOND_SETPOINT * task.setpoint
 
@@ -183,14 +167,10 @@ def smooth_score(
     def metrics(step: Part, loaded: Part, second: Part) -> dict[str, Scalar]:
         return {
             "settling": smooth_settling(*step, setpoint, 0.0, width),
-            "overshoot": smooth_overshoot(
-                step[1], setpoint, 0.0, overshoot_width * task.max_overshoot
-            ),
+            "overshoot": smooth_overshoot(step[1], setpoint, 0.0, overshoot_width * task.max_overshoot),
             "recovery": smooth_settling(*loaded, setpoint, 0.0, width),
             "second_settling": smooth_settling(*second, lower_setpoint, setpoint, width),
-            "second_overshoot": smooth_overshoot(
-                second[1], lower_setpoint, setpoint, overshoot_width
-            ),
+            "second_overshoot": smooth_overshoot(second[1], lower_setpoint, setpoint, overshoot_width),
         }
 
     return _score(task, model, motors, controller, 1, metrics)

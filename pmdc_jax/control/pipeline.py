@@ -22,14 +22,7 @@ from ..simulate.propagator import steps_within
 from .classical import ZIEGLER_NICHOLS_CONTROLLERS, ziegler_nichols
 from .controllers import AbstractController
 from .descent import STARTS, best_coordinates
-from .evaluation import (
-    EvaluatedController,
-    Robustness,
-    evaluate,
-    evaluate_robustness,
-    simulate_speeds,
-    simulate_task,
-)
+from .evaluation import EvaluatedController, Robustness, evaluate, evaluate_robustness, simulate_speeds, simulate_task
 from .gains import GainSpace
 from .law import Law
 from .margins import margins
@@ -155,9 +148,7 @@ def _task(specification: Specification, motor: Motor, unit_noise: np.ndarray) ->
         fastest_settling=jnp.asarray(specification.fastest_settling),
         settling_scale=jnp.asarray(specification.settling_scale),
         max_overshoot=jnp.asarray(requirements.allowed_overshoot),
-        max_sensitivity=None
-        if requirements.max_sensitivity is None
-        else jnp.asarray(requirements.max_sensitivity),
+        max_sensitivity=None if requirements.max_sensitivity is None else jnp.asarray(requirements.max_sensitivity),
         noise=jnp.asarray((requirements.speed_noise or 0.0) * unit_noise),
         part_samples=specification.part_samples,
         substeps=int(steps_within(motor, specification.sample_time, jnp.asarray(max_current))),
@@ -179,12 +170,7 @@ def _validation_motors(motor: Motor, variation: Uncertainty, seed: int) -> Motor
 
 
 def _best_controller(
-    specification: Specification,
-    task: Task,
-    motors: Motor,
-    unit_noise: np.ndarray,
-    seed: int,
-    starts: int,
+    specification: Specification, task: Task, motors: Motor, unit_noise: np.ndarray, seed: int, starts: int
 ) -> AbstractController:
     """Best controller of all starts, tuned with noise even if the sensor has none (`MIN_TUNING_NOISE`)."""
     requirements = specification.requirements

@@ -73,9 +73,7 @@ def _small_step_remark(result: Tuning) -> Iterator[str]:
     sensor's quantum."""
     overshoot = result.candidates[0].small_step["Overshoot"] or 0.0
     step = SMALL_STEP * result.setpoint
-    allowed = OVERSHOOT_TO_REPORT * max(
-        result.requirements.max_overshoot, result.metrics["Overshoot"] or 0.0
-    )
+    allowed = OVERSHOOT_TO_REPORT * max(result.requirements.max_overshoot, result.metrics["Overshoot"] or 0.0)
     quantum = result.requirements.speed_step or 0.0
     if overshoot > allowed and overshoot / 100 * abs(step) > quantum:
         yield (

@@ -111,14 +111,10 @@ class LoopRequirements:
             setpoint=setpoint,
             voltage_limit=voltage_limit,
             sample_time=sample_time,
-            load_torque=default_load_torque(*operation)
-            if self.load_torque is None
-            else self.load_torque,
+            load_torque=default_load_torque(*operation) if self.load_torque is None else self.load_torque,
             fastest_settling=fastest,
             settling_scale=max(fastest, LOOP_DEAD_TIMES * dead_time),
-            part_samples=_part_samples(
-                fastest, dead_time, _torque_period(motor, setpoint), sample_time
-            ),
+            part_samples=_part_samples(fastest, dead_time, _torque_period(motor, setpoint), sample_time),
             notes=(*limit_notes, *sampling_notes),
         )
 
@@ -135,8 +131,7 @@ class LoopRequirements:
         if setpoint is None:
             setpoint = _three_digits(SETPOINT_SHARE * float(motor.steady_speed(voltage_limit)))
             notes.append(
-                f"no set point given: using {setpoint:g} rad/s,"
-                f" {100 * SETPOINT_SHARE:g} % of the largest speed"
+                f"no set point given: using {setpoint:g} rad/s, {100 * SETPOINT_SHARE:g} % of the largest speed"
             )
         return setpoint, voltage_limit, notes
 
@@ -197,9 +192,7 @@ class Specification:
         return jax.tree.map(lambda x: jnp.asarray(x, float), hardware)
 
 
-def _check_number(
-    name: str, value: float | None, wanted: str, is_valid: Callable[[float], bool]
-) -> None:
+def _check_number(name: str, value: float | None, wanted: str, is_valid: Callable[[float], bool]) -> None:
     if value is not None and not (math.isfinite(value) and is_valid(value)):
         option = "--" + name.replace("_", "-")
         raise InputError(option, f"{value:g} is not {wanted}", "Give it in SI units")
@@ -219,18 +212,14 @@ def _torque_period(motor: Motor, setpoint: float) -> float:
     return max(angles, default=0.0) / (SECOND_SETPOINT * abs(setpoint))
 
 
-def _part_samples(
-    fastest: float, dead_time: float, torque_period: float, sample_time: float
-) -> int:
+def _part_samples(fastest: float, dead_time: float, torque_period: float, sample_time: float) -> int:
     """Samples in one part of the task, rounded up to 2^k or 1.5 2^k so that few shapes are compiled."""
     more = max(PART_DEAD_TIMES * dead_time, PART_TORQUE_PERIODS * torque_period)
     duration = max(PART_SETTLINGS * fastest, fastest + more)
     needed = max(MIN_SAMPLES, math.ceil(duration / sample_time))
     if needed > MAX_SAMPLES:
         raise InputError(
-            "--sample-time",
-            f"{sample_time:g} s needs {needed} samples for one step",
-            "Choose a longer sample time",
+            "--sample-time", f"{sample_time:g} s needs {needed} samples for one step", "Choose a longer sample time"
         )
     power = 2 ** math.floor(math.log2(needed))
     return next(n for n in (power, power * 3 // 2, power * 2) if n >= needed)

@@ -47,9 +47,7 @@ def drawn_motors(motor: Motor, uncertainty: Uncertainty, count: int, seed: int) 
     )
 
 
-def _moved(
-    motor: Motor, names: Sequence[str], deviations: Float[np.ndarray, "motors coordinates"]
-) -> Motor:
+def _moved(motor: Motor, names: Sequence[str], deviations: Float[np.ndarray, "motors coordinates"]) -> Motor:
     """Motors whose coordinates deviate by so much from those of `motor`, stacked."""
     stacked = jax.tree.map(lambda leaf: jnp.full(len(deviations), leaf, float), motor)
     deviation = dict(zip(names, deviations.T, strict=True))

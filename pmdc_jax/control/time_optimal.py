@@ -64,9 +64,7 @@ def fastest_settling(
     """
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
     duration = 10 * float(motor.transient_time)
-    bounds = jax.tree.map(
-        jnp.asarray, (setpoint, voltage_limit, current_limit, float(initial), float(load))
-    )
+    bounds = jax.tree.map(jnp.asarray, (setpoint, voltage_limit, current_limit, float(initial), float(load)))
     for _ in range(DOUBLINGS):
         entry_time = float(_bang_bang_step(motor, duration, INSTANTS, *bounds).entry_time)
         if not math.isnan(entry_time):
@@ -142,8 +140,7 @@ def _simulate_bang_bang(
     k = jnp.argmax(distance <= 0)
     entry_time = step * (k - 1 + distance[k - 1] / (distance[k - 1] - distance[k]))
     return BangBangStep(
-        entry_time=jnp.where(jnp.any(distance <= 0), entry_time, jnp.nan),
-        stays=jnp.min(distance) >= -2 * band,
+        entry_time=jnp.where(jnp.any(distance <= 0), entry_time, jnp.nan), stays=jnp.min(distance) >= -2 * band
     )
 
 

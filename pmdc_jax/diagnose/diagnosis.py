@@ -79,9 +79,7 @@ class VaryingParameter:
     p_value: float  # of the data if it were the same in all runs
     also_possible: tuple[str, ...]  # parameters whose variation would explain the runs as well
     fit: Mapping[str, RunFit]  # of every training run, simulated with its own value
-    negative_log_likelihood: (
-        float  # negative logarithm of the likelihood of these, up to a constant
-    )
+    negative_log_likelihood: float  # negative logarithm of the likelihood of these, up to a constant
 
 
 @frozen

@@ -37,17 +37,13 @@ def _random_steps(seed: int, shortest: float, longest: float) -> Waveform:
 
 
 WAVEFORMS: dict[str, Waveform] = {
-    "creep slowly through zero in both directions": lambda t: (
-        0.15 * np.abs((2 * t / 1.5) % 4 - 2) - 0.15
-    ),
+    "creep slowly through zero in both directions": lambda t: 0.15 * np.abs((2 * t / 1.5) % 4 - 2) - 0.15,
     "climb in steps to full speed forward, then backward": lambda t: (
         np.round(4 * np.abs((t * 4 / DURATION) % 4 - 2)) / 4 - 1
     ),
     "jump between levels every few hundredths of a second": _random_steps(1, 0.01, 0.06),
     "jump between levels every half second": _random_steps(2, 0.3, 0.7),
-    "reverse at full voltage, then coast": lambda t: (
-        np.sign(np.sin(4 * np.pi * t)) * ((t % 1.5) < 1)
-    ),
+    "reverse at full voltage, then coast": lambda t: np.sign(np.sin(4 * np.pi * t)) * ((t % 1.5) < 1),
     "rest, then small steps": lambda t: 0.08 * _random_steps(3, 0.2, 0.4)(t) * (t > 2),
 }
 
@@ -57,9 +53,7 @@ def next_experiment(naming: Naming, recordings: Sequence[Recording]) -> NextExpe
 
     None without a recorded voltage or a rival, and where no waveform shows a difference.
     """
-    limit = max(
-        (float(np.max(np.abs(r.voltage))) for r in recordings if r.voltage is not None), default=0
-    )
+    limit = max((float(np.max(np.abs(r.voltage))) for r in recordings if r.voltage is not None), default=0)
     if not limit or not naming.rivals:
         return None
     rival = naming.rivals[0]

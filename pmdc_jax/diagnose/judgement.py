@@ -31,9 +31,7 @@ def implausible_effect(motor: Motor) -> str | None:
     return next((e.name for e in shafts if e.damping_ratio(motor) > MAX_DAMPING_RATIO), None)
 
 
-def unneeded_effect(
-    naming: Naming, base: Identification, final: Identification, library: Library
-) -> str | None:
+def unneeded_effect(naming: Naming, base: Identification, final: Identification, library: Library) -> str | None:
     """The effect that the runs need least, if there is one that they do not need; else None.
 
     One of several effects is not needed if
@@ -76,10 +74,7 @@ def may_be_absent(final: Identification, effect: str, amplitude: str) -> bool:
 
 
 def judge(
-    naming: Naming,
-    base: Identification,
-    final: Identification,
-    electrical_misfits: tuple[float, float],
+    naming: Naming, base: Identification, final: Identification, electrical_misfits: tuple[float, float]
 ) -> tuple[Verdict, Noise]:
     """The verdict, and the noise of each run that it implies.
 

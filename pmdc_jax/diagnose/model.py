@@ -9,13 +9,7 @@ import numpy as np
 
 from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction, InputDeadZone
 from ..identify.fit.gauss_newton import TRIAL_TOLERANCE
-from ..identify.fit.generalised_least_squares import (
-    last_fit,
-    residuals_of,
-    series_of,
-    training_indices,
-    with_whitening,
-)
+from ..identify.fit.generalised_least_squares import last_fit, residuals_of, series_of, training_indices, with_whitening
 from ..identify.fit.polish import Fit, fit_at, reweighted
 from ..identify.fit.refine import Optimum
 from ..identify.noise.noise_model import Series, Whitener
@@ -102,11 +96,7 @@ class Model:
         jacobian = np.asarray(self.fit.evaluation.jacobian)
         columns = jacobian[problem.fitted_blocks][..., : len(names)]
         information = np.square(columns).reshape(-1, len(names)).sum(axis=0)
-        return {
-            name
-            for name, square in zip(names, information, strict=True)
-            if square < 1 / MIN_UNSEEN_STDERR**2
-        }
+        return {name for name, square in zip(names, information, strict=True) if square < 1 / MIN_UNSEEN_STDERR**2}
 
     @property
     def coulomb_torque(self) -> float:
@@ -162,19 +152,13 @@ class Model:
 
 
 def refit_from(
-    effects: tuple[str, ...],
-    prepared: Prepared,
-    start: Optimum,
-    white: Whitener,
-    useful: float = np.inf,
+    effects: tuple[str, ...], prepared: Prepared, start: Optimum, white: Whitener, useful: float = np.inf
 ) -> Model:
     """A model fitted from a start to whitened residuals; its `fit` is evaluated without the filter.
 
     **Arguments**: `useful`, the largest sum of squared white residuals that is of any use, as of `polish`.
     """
-    prepared, whitened = polish_with_angle(
-        with_whitening(prepared, white), start, TRIAL_TOLERANCE, useful=useful
-    )
+    prepared, whitened = polish_with_angle(with_whitening(prepared, white), start, TRIAL_TOLERANCE, useful=useful)
     prepared = prepared.with_problem(whitening=None)
     # no step: the unfiltered residuals at the same point
     unfiltered = fit_at(prepared.problem, whitened.optimum)

@@ -16,13 +16,7 @@ from ..recordings.recording_file import Runs
 from ..runtime.compiled import free_memory_maps
 from ..runtime.precision import double_precision
 from ..runtime.threads import one_blas_thread
-from .description import (
-    detectable_effects,
-    effects_found,
-    learned_curves,
-    regions_of_misfit,
-    rival_sets,
-)
+from .description import detectable_effects, effects_found, learned_curves, regions_of_misfit, rival_sets
 from .diagnosis import Diagnosis
 from .evidence.assessment import FALSE_ALARM
 from .evidence.electrical_balance import electrical_misfit
@@ -86,9 +80,7 @@ def diagnose(
         gap_of_run=gaps,
         closed_fraction=closed_fraction(by_role) if naming.chosen.effects else None,
         rivals=rival_sets(naming),
-        next_experiment=next_experiment(naming, prepared.training)
-        if verdict == "ambiguous"
-        else None,
+        next_experiment=next_experiment(naming, prepared.training) if verdict == "ambiguous" else None,
         curves=learned_curves(naming) if tells_curves else (),
         detectable=detectable_effects(naming.chosen_screen),
         base=base,
@@ -99,22 +91,17 @@ def diagnose(
         seconds=seconds,
         leaves_noise=naming.p_nothing_more >= FALSE_ALARM,
         varies=naming.varies,
-        gap_by_own_value=(
-            gaps_of_runs(final.fit, naming.varies.fit, noise) if naming.varies else {}
-        ),
+        gap_by_own_value=(gaps_of_runs(final.fit, naming.varies.fit, noise) if naming.varies else {}),
     )
 
 
-def _without_unneeded_effects(
-    attempt: Attempt, base: Identification
-) -> tuple[Naming, Identification]:
+def _without_unneeded_effects(attempt: Attempt, base: Identification) -> tuple[Naming, Identification]:
     """The naming without effects that are implausible or that the runs do not need, and the motor it identifies; `base`
     is the motor without effects."""
     naming = attempt.naming
     final = _identification(naming, attempt.solved)
     while effect := (
-        implausible_effect(naming.chosen.motor)
-        or unneeded_effect(naming, base, final, attempt.selection.library)
+        implausible_effect(naming.chosen.motor) or unneeded_effect(naming, base, final, attempt.selection.library)
     ):
         naming = attempt.selection.without(naming, effect)
         final = _identification(naming, attempt.solved)

@@ -94,9 +94,7 @@ def _sensor_outputs(motor: Motor, tape: Tape, path: Path) -> Outputs:
     return _reported_samples_first(motor, tape, jnp.moveaxis(simulated, 0, 1))
 
 
-def _reported_samples_first(
-    motor: Motor, tape: Tape, simulated: Float[Array, "samples outputs blocks"]
-) -> Outputs:
+def _reported_samples_first(motor: Motor, tape: Tape, simulated: Float[Array, "samples outputs blocks"]) -> Outputs:
     """What the motor reports (`reported`) of outputs whose first axis is the samples."""
     return reported(motor, tape, simulated.transpose(2, 1, 0)).transpose(2, 1, 0)
 
@@ -113,10 +111,7 @@ def input_gains(motor: Motor, tape: Tape) -> tuple[Outputs, Outputs]:
 
 @compiled
 def respond(
-    motor: Motor,
-    tape: Tape,
-    path: Path,
-    kicks: Float[Array | np.ndarray, "samples 2 blocks columns"],
+    motor: Motor, tape: Tape, path: Path, kicks: Float[Array | np.ndarray, "samples 2 blocks columns"]
 ) -> Float[Array, "samples 2 blocks columns"]:
     """The response of the linear `motor` to the kicks of every column, in current and speed.
 
@@ -128,11 +123,7 @@ def respond(
 
     def step(
         x: Columns,
-        sample: tuple[
-            Float[Array | np.ndarray, "2 blocks columns"],
-            Float[Array, " blocks"],
-            Float[Array, " blocks"],
-        ],
+        sample: tuple[Float[Array | np.ndarray, "2 blocks columns"], Float[Array, " blocks"], Float[Array, " blocks"]],
     ) -> tuple[Columns, Columns]:
         kick, moves, conducts = sample
         # written out here and below: XLA multiplies such small matrices slowly
@@ -165,8 +156,7 @@ def _starts_of_blocks(
     """
 
     def next_block(
-        start: Float[Array, "2 columns"],
-        block: tuple[Bool[Array, ""], Float[Array, "2 2"], Float[Array, "2 columns"]],
+        start: Float[Array, "2 columns"], block: tuple[Bool[Array, ""], Float[Array, "2 2"], Float[Array, "2 columns"]]
     ) -> tuple[Float[Array, "2 columns"], Float[Array, "2 columns"]]:
         begins, transition, forced_end = block
         start = jnp.where(begins, 0.0, start)
@@ -192,16 +182,13 @@ def _reported_response(
     if propagator.reading is not None:
         part, share = propagator.reading
         response = (
-            jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start)
-            + jnp.asarray(share)[:, None, :, None] * kicks
+            jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start) + jnp.asarray(share)[:, None, :, None] * kicks
         )
         response = response * varies
     if propagator.mean is None:
         return response
 
-    def mean(
-        within: Propagator, share: Scalars | float
-    ) -> Float[Array, "samples 2 blocks columns"]:
+    def mean(within: Propagator, share: Scalars | float) -> Float[Array, "samples 2 blocks columns"]:
         """Over a share of each sample."""
         assert within.mean is not None
         by_start = jnp.einsum("ijsb,sjbc->sibc", within.mean.transition, at_start)
@@ -224,9 +211,7 @@ def _propagator_and_inputs(motor: Motor, tape: Tape) -> tuple[Propagator, Input]
 
     def broadcast(leaf: Float[Array, "blocks ..."]) -> Float[Array, "... samples blocks"]:
         blocks_last = jnp.moveaxis(leaf, 0, -1)[..., None, :]
-        return jnp.broadcast_to(
-            blocks_last, (*blocks_last.shape[:-2], samples, blocks_last.shape[-1])
-        )
+        return jnp.broadcast_to(blocks_last, (*blocks_last.shape[:-2], samples, blocks_last.shape[-1]))
 
     value, load = jnp.asarray(tape.value).T, jnp.asarray(tape.load).T
     rise = None if tape.rise is None else jnp.asarray(tape.rise).T
@@ -261,9 +246,7 @@ def _states(motor: Motor, tape: Tape, path: Path) -> State:
         block_propagator = jax.tree.map(lambda leaf: leaf[..., 0, block], propagator)
         drive = jax.tree.map(lambda share: share[block], inputs.drive)
         state = State(current, speed, extra)
-        return held_step(
-            motor, block_propagator, Input(drive, value, load), state, steps
-        ).extra, extra
+        return held_step(motor, block_propagator, Input(drive, value, load), state, steps).extra, extra
 
     block = jnp.broadcast_to(jnp.arange(load.shape[1]), load.shape)
     samples = (begins, start.extra, path.current, path.speed, inputs.value, load, block)

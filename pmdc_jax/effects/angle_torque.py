@@ -66,9 +66,7 @@ class CoggingTorque(_Angular):
         return self.amplitude_Nm * _wave(self, state)
 
     def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
-        return replace(
-            self, amplitude_Nm=self.amplitude_Nm * _averaging_factor(self, state.speed * seconds)
-        )
+        return replace(self, amplitude_Nm=self.amplitude_Nm * _averaging_factor(self, state.speed * seconds))
 
     def repeats_after(self) -> dict[str, Scalars]:
         return _period(self)
@@ -88,9 +86,7 @@ class TorqueRipple(_Angular):
 
     name: ClassVar = "torque_ripple"
     label: ClassVar = "Torque ripple"
-    formula: ClassVar = (
-        "T_m = Kt i (1 + a sin(n angle + phase)), e = Kb w (1 + e_s a sin(n angle + phase))"
-    )
+    formula: ClassVar = "T_m = Kt i (1 + a sin(n angle + phase)), e = Kb w (1 + e_s a sin(n angle + phase))"
     equation: ClassVar = "mechanical"
     variable: ClassVar = "angle"
     ranges: ClassVar = {
@@ -112,9 +108,7 @@ class TorqueRipple(_Angular):
         return eqx.tree_at(lambda m: (m.Kt, m.Kb), motor, constants)
 
     def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
-        return replace(
-            self, amplitude=self.amplitude * _averaging_factor(self, state.speed * seconds)
-        )
+        return replace(self, amplitude=self.amplitude * _averaging_factor(self, state.speed * seconds))
 
     def repeats_after(self) -> dict[str, Scalars]:
         return _period(self)

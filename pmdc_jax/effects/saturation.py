@@ -64,9 +64,7 @@ class InductanceSaturation(AbstractEffect):
     per_A2: Scalars
 
     def parameters(self, motor: Motor, state: State) -> Motor:
-        return eqx.tree_at(
-            lambda m: m.L, motor, motor.L * (1 / (1 + self.per_A2 * state.current**2))
-        )
+        return eqx.tree_at(lambda m: m.L, motor, motor.L * (1 / (1 + self.per_A2 * state.current**2)))
 
     def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars:
         return motor.R * (1 / motor.L) * self.per_A2 * current**2

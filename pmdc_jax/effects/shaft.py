@@ -73,9 +73,7 @@ class ShaftCompliance(_TwoInertias):
     }
 
     def torque(self, state: State) -> Scalars:
-        return self.stiffness_Nm_rad * state.extra["twist"] + self.damping_Nms_rad * self.slip(
-            state
-        )
+        return self.stiffness_Nm_rad * state.extra["twist"] + self.damping_Nms_rad * self.slip(state)
 
     def initial_states(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del angle
@@ -103,9 +101,7 @@ class GearBacklash(_TwoInertias):
 
     name: ClassVar = "gear_backlash"
     label: ClassVar = "Gear backlash"
-    formula: ClassVar = (
-        "T_s = k overlap + d (w - w_L) while the teeth touch, overlap = |twist| - gap/2, else 0"
-    )
+    formula: ClassVar = "T_s = k overlap + d (w - w_L) while the teeth touch, overlap = |twist| - gap/2, else 0"
     states: ClassVar = ("gear_speed", "gear_twist")
     affine: ClassVar = True
     contact_state: ClassVar = "gear_twist"

@@ -61,11 +61,7 @@ def fits_with_visible(problem: Problem, polished: Fit, info: Information) -> lis
 
 def _invisible_alone(parameters: Parameters, info: Information) -> list[int]:
     """Positive parameters that change nothing by themselves, because they are nearly zero for example."""
-    return [
-        int(k)
-        for k in np.flatnonzero(info.unseen_share > MIN_UNSEEN_SHARE)
-        if parameters.logarithmic[k]
-    ]
+    return [int(k) for k in np.flatnonzero(info.unseen_share > MIN_UNSEEN_SHARE) if parameters.logarithmic[k]]
 
 
 def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
@@ -79,9 +75,7 @@ def _refit_with_visible(problem: Problem, polished: Fit, k: int) -> Fit | None:
     lengths = np.sqrt(np.square(jacobian[..., : len(problem.free)]).sum((0, 1, 2)))
     coordinates = np.array(polished.coordinates)
     coordinates[k] += np.log(VISIBLE_SHARE * lengths.max() / max(lengths[k], 1e-300))
-    coordinates[k] = np.clip(
-        coordinates[k], problem.parameters.lower[k], problem.parameters.upper[k]
-    )
+    coordinates[k] = np.clip(coordinates[k], problem.parameters.lower[k], problem.parameters.upper[k])
     unknowns = polished.unknowns._replace(coordinates=jnp.asarray(coordinates))
     refitted = _as_good_with_fixed(problem, polished, k, unknowns)
     return fit_at(problem, refitted.optimum._replace(at_bound=())) if refitted else None

@@ -16,9 +16,7 @@ from .uncertainty.identifiability import MIN_SHARE
 from .uncertainty.profile import QUADRATIC_STDERR, profile_interval
 
 
-def estimates_of(
-    problem: Problem, best: Optimum, info: Information, prepared: Prepared
-) -> dict[str, Estimate]:
+def estimates_of(problem: Problem, best: Optimum, info: Information, prepared: Prepared) -> dict[str, Estimate]:
     """The estimate of each parameter, from the best fit and what the runs tell of it."""
     parameters, intervals = problem.parameters, _intervals(problem, best, info)
     coordinates = np.asarray(best.unknowns.coordinates)
@@ -50,9 +48,7 @@ def estimates_of(
     return estimates
 
 
-def _intervals(
-    problem: Problem, best: Optimum, info: Information
-) -> dict[int, tuple[float, float]]:
+def _intervals(problem: Problem, best: Optimum, info: Information) -> dict[int, tuple[float, float]]:
     """The 95 % intervals of the identified coordinates, in parallel on all cores."""
     coordinates = np.asarray(best.unknowns.coordinates)
     # teeth that meet at another moment change all that follows: the sum of squares jumps, and no profile is smooth

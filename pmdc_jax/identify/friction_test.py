@@ -43,9 +43,7 @@ class MissingFriction(NamedTuple):
 
     friction_Nm: float
     z_score: float  # its value in standard errors
-    bias: Float[
-        np.ndarray, " parameters"
-    ]  # of the search coordinates without friction in the model
+    bias: Float[np.ndarray, " parameters"]  # of the search coordinates without friction in the model
 
 
 def missing_friction(prepared: Prepared, fit: Fit) -> MissingFriction | None:
@@ -56,9 +54,7 @@ def missing_friction(prepared: Prepared, fit: Fit) -> MissingFriction | None:
     rows = _regression_columns(prepared, fit)
     residuals = [series._replace(values=series.values[..., -1]) for series in rows]
     regression = _regress(rows, scaling_whitener(residuals), count)
-    if (
-        regression.z_score(count) <= MIN_Z_SCORE
-    ):  # too large rather than too small where the noise is coloured
+    if regression.z_score(count) <= MIN_Z_SCORE:  # too large rather than too small where the noise is coloured
         return None
     regression = _regress(rows, fit_whitener(regression.residuals), count)
     z_score = regression.z_score(count)
@@ -66,9 +62,7 @@ def missing_friction(prepared: Prepared, fit: Fit) -> MissingFriction | None:
     return MissingFriction(friction, z_score, bias) if z_score > MIN_Z_SCORE else None
 
 
-def friction_messages(
-    missing: MissingFriction | None, identification: Identification
-) -> Iterator[str]:
+def friction_messages(missing: MissingFriction | None, identification: Identification) -> Iterator[str]:
     """A message on the friction that a fit lacks, if a parameter compensates for it by more than `MIN_BIAS` of its
     standard errors, or if the residuals are far larger than the noise, so that no standard error is reliable."""
     if missing is None or identification.covariance is None:
@@ -124,9 +118,7 @@ def _load_filter(motor: Motor, tape: Tape, run: int) -> LoadFilter:
     return numerators, np.asarray(denominator)
 
 
-def _load_response(
-    of_load: LoadFilter, load: Float[np.ndarray, " samples"]
-) -> Float[np.ndarray, "samples 2"]:
+def _load_response(of_load: LoadFilter, load: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "samples 2"]:
     numerators, denominator = of_load
     return np.stack([lfilter(numerator, denominator, load) for numerator in numerators], 1)
 

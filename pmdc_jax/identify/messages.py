@@ -31,11 +31,7 @@ AVERAGING_SPANS = {
 
 
 def messages_of(
-    prepared: Prepared,
-    solved: Solved,
-    motor: Motor,
-    fit: Mapping[str, RunFit],
-    Kt_set_to_Kb: bool,
+    prepared: Prepared, solved: Solved, motor: Motor, fit: Mapping[str, RunFit], Kt_set_to_Kb: bool
 ) -> tuple[str, ...]:
     """What was corrected, assumed or interrupted, and what the loads and the temperatures of the runs may be."""
     messages = _corrections(prepared)
@@ -81,9 +77,7 @@ def _unknown_load(motor: Motor, training: Sequence[RunFit]) -> list[str]:
     what = "a constant load"
     if all(np.ptp(np.sign(fit.speed_simulated)) < 2 for fit in training):
         what += ", or friction, which looks the same while the motor turns one way only"
-    return [
-        f"the unknown load is {largest:.3g} N m in all runs: {what}. If nothing was attached, give --unloaded"
-    ]
+    return [f"the unknown load is {largest:.3g} N m in all runs: {what}. If nothing was attached, give --unloaded"]
 
 
 def _warm_windings(fit: Mapping[str, RunFit]) -> list[str]:
@@ -92,6 +86,4 @@ def _warm_windings(fit: Mapping[str, RunFit]) -> list[str]:
     warm = [f"{name} by {100 * x:.2g} %" for name, x in rises.items() if x > MIN_INITIAL_RISE]
     if not warm:
         return []
-    return [
-        f"the winding is warm, and R larger, at the start of {', '.join(warm)}: this is modelled"
-    ]
+    return [f"the winding is warm, and R larger, at the start of {', '.join(warm)}: this is modelled"]

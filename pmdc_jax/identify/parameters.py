@@ -77,8 +77,7 @@ class Parameters(eqx.Module):
         for target, source in self.ties:
             values[target] = values[source]
         effects = tuple(
-            effect(**{field: values[f"{effect.name}.{field}"] for field in effect.ranges})
-            for effect in self.effects
+            effect(**{field: values[f"{effect.name}.{field}"] for field in effect.ranges}) for effect in self.effects
         )
         return Motor(**{name: values[name] for name in PARAMETERS}, effects=effects)
 
@@ -100,9 +99,7 @@ class Parameters(eqx.Module):
         k = self.names.index(source)
         return float(np.exp(coordinates[k]) if self.logarithmic[k] else coordinates[k])
 
-    def with_tied(
-        self, covariance: Float[np.ndarray, "n n"]
-    ) -> tuple[tuple[str, ...], Float[np.ndarray, "m m"]]:
+    def with_tied(self, covariance: Float[np.ndarray, "n n"]) -> tuple[tuple[str, ...], Float[np.ndarray, "m m"]]:
         """Names and covariance of the free coordinates and of those that are tied to one of them."""
         tied = {target: source for target, source in self.ties if source in self.names}
         rows = [self.names.index(tied.get(name, name)) for name in (*self.names, *tied)]
@@ -121,9 +118,7 @@ def effects_named(names: Sequence[str]) -> tuple[type[AbstractEffect], ...]:
     """Effect classes by name; raises `InputError` on an unknown one."""
     for name in names:
         if name not in EFFECTS:
-            raise InputError(
-                "--effect", f"unknown effect {name}", f"Choose from {', '.join(EFFECTS)}"
-            )
+            raise InputError("--effect", f"unknown effect {name}", f"Choose from {', '.join(EFFECTS)}")
     return tuple(EFFECTS[name] for name in dict.fromkeys(names))
 
 
@@ -131,6 +126,4 @@ def check_names(option: str, names: Sequence[str]) -> None:
     """Raise `InputError` for a name that is not a parameter of the motor."""
     for name in names:
         if name not in PARAMETERS:
-            raise InputError(
-                option, f"unknown parameter {name}", f"Choose from {', '.join(PARAMETERS)}"
-            )
+            raise InputError(option, f"unknown parameter {name}", f"Choose from {', '.join(PARAMETERS)}")

@@ -52,9 +52,7 @@ def identify(
     report = progress or silent
     free_memory_maps()
     report("checking the recordings")
-    prepared = prepare(
-        recordings, holdout, tie=tie, known=known, unloaded=unloaded, effects=effects_named(effects)
-    )
+    prepared = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded, effects=effects_named(effects))
     prepared, solved = solve(prepared, search, seed, progress)
     report("estimating the uncertainty", solved.fit.fitness)
     plain_fit = solved.fit

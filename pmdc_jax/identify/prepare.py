@@ -63,9 +63,7 @@ class Prepared(NamedTuple):
         return [run for run, role in zip(self.runs, self.roles, strict=True) if role == "train"]
 
     def parameters(
-        self,
-        effects: Sequence[type[AbstractEffect]],
-        bounds: Mapping[str, tuple[float, float]] | None = None,
+        self, effects: Sequence[type[AbstractEffect]], bounds: Mapping[str, tuple[float, float]] | None = None
     ) -> Parameters:
         """The parameters of a motor with these effects; `bounds` overrides those of the search and of the effects."""
         bounds = {**search_bounds(self.training), **(bounds or {})}
@@ -100,9 +98,7 @@ def prepare(
     training = runs[: len(recordings)]
     noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in ("current", "speed")])
     irrelevant = _irrelevant(training, tie)
-    parameters = Parameters.of(
-        search_bounds(training), effects, irrelevant | dict(known or {}), tie
-    )
+    parameters = Parameters.of(search_bounds(training), effects, irrelevant | dict(known or {}), tie)
     if not parameters.names:
         raise InputError(
             "--known",
@@ -129,9 +125,7 @@ def prepare(
         dict(known or {}),
         tuple(tie),
         problem,
-        differentiated=tuple(
-            r.speed is None and r.angle is not None for r in (*recordings, *holdout)
-        ),
+        differentiated=tuple(r.speed is None and r.angle is not None for r in (*recordings, *holdout)),
     )
 
 
@@ -146,9 +140,7 @@ def _check_arguments(
     for run in (*recordings, *holdout):
         if not run.is_identifiable:
             what = f"too few columns to identify a motor, only {', '.join(run.columns())}"
-            raise InputError(
-                run.source or run.name, what, f"Needed besides time: {NEEDED_TO_IDENTIFY}"
-            )
+            raise InputError(run.source or run.name, what, f"Needed besides time: {NEEDED_TO_IDENTIFY}")
     check_names("--tie", [name for pair in tie for name in pair])
     check_names("--known", list(known or {}))
     targets = [target for target, _ in tie]
@@ -156,9 +148,7 @@ def _check_arguments(
         if targets.count(target) > 1:
             raise InputError("--tie", f"{target} is tied twice", "Drop one")
         if target == source or target in (known or {}) or target in {b for _, b in tie}:
-            raise InputError(
-                "--tie", f"{target}={source} forms a circle or ties a known value", "Drop one"
-            )
+            raise InputError("--tie", f"{target}={source} forms a circle or ties a known value", "Drop one")
         if {target, source} != {"Kt", "Kb"}:
             what = f"{target} and {source} are measured in different units"
             raise InputError("--tie", what, "Tie Kt=Kb: in SI units these two are equal")
@@ -178,9 +168,7 @@ def _signals(recordings: Sequence[Recording], name: str) -> list[np.ndarray]:
     return [signal for r in recordings if (signal := getattr(r, name)) is not None]
 
 
-def _irrelevant(
-    recordings: Sequence[Recording], tie: Sequence[tuple[str, str]]
-) -> dict[str, float]:
+def _irrelevant(recordings: Sequence[Recording], tie: Sequence[tuple[str, str]]) -> dict[str, float]:
     """Parameters that affect no run, not even through a tie, with a harmless value."""
     affecting = {"held": "R L", "torque": "J f", "current": "Kt J f", "voltage": "R L Kb Kt J f"}
     kinds = {"held" if r.held else r.drive for r in recordings}

@@ -137,8 +137,7 @@ class Evaluation(NamedTuple):
 def scaled(evaluation: Evaluation, stretch: Float[Array | np.ndarray, "2"]) -> Evaluation:
     """Residuals and derivatives multiplied by a factor for each output."""
     return evaluation._replace(
-        residuals=evaluation.residuals * stretch[:, None],
-        jacobian=evaluation.jacobian * stretch[:, None, None],
+        residuals=evaluation.residuals * stretch[:, None], jacobian=evaluation.jacobian * stretch[:, None, None]
     )
 
 
@@ -171,9 +170,7 @@ def predicted_starts(
     shared, own = np.split(change, [len(problem.free)])
     of_run = own.reshape(problem.tape.runs, UNKNOWNS_PER_RUN)[np.asarray(problem.tape.run)]
     by_shared, by_own = np.split(np.asarray(evaluation.d_starts), [len(shared)], axis=-1)
-    return (
-        np.asarray(evaluation.starts) + by_shared @ shared + np.einsum("bsp,bp->bs", by_own, of_run)
-    )
+    return np.asarray(evaluation.starts) + by_shared @ shared + np.einsum("bsp,bp->bs", by_own, of_run)
 
 
 def _evaluate_in_threads(
@@ -206,9 +203,7 @@ def whitened(problem: Problem, plain: Evaluation) -> Evaluation:
 
 
 def _evaluated(
-    problem: Problem,
-    unknowns: Unknowns,
-    starts: Float[Array | np.ndarray, "blocks states"] | None = None,
+    problem: Problem, unknowns: Unknowns, starts: Float[Array | np.ndarray, "blocks states"] | None = None
 ) -> Evaluation:
     tape = problem.tape
     simulated, jacobian, starts, d_starts = sensitivities(
@@ -238,15 +233,11 @@ def _without_nuisance(problem: Problem, plain: Evaluation) -> Evaluation:
 def _orthogonal(tape: Tape, allowed: Nuisance, plain: Evaluation) -> Evaluation:
     nuisance = allowed.responses * (tape.weight / allowed.noise[:, None])[..., None]
     both = jnp.concatenate([nuisance, plain.jacobian, plain.residuals[..., None]], -1)
-    products = jax.ops.segment_sum(
-        jnp.einsum("bcsi,bcsj->bij", nuisance, both), tape.run, tape.runs
-    )
+    products = jax.ops.segment_sum(jnp.einsum("bcsi,bcsj->bij", nuisance, both), tape.run, tape.runs)
     count = nuisance.shape[-1]
     gram, along = products[..., :count], products[..., count:]
     # runs with fewer nuisance parameters have columns of zeros
-    gram = (
-        gram + jnp.eye(count) * jnp.where(jnp.diagonal(gram, axis1=1, axis2=2) > 0, 0, 1)[:, None]
-    )
+    gram = gram + jnp.eye(count) * jnp.where(jnp.diagonal(gram, axis1=1, axis2=2) > 0, 0, 1)[:, None]
     share = jnp.linalg.solve(gram, along)
     projected = both[..., count:] - jnp.einsum("bcsi,bij->bcsj", nuisance, share[tape.run])
     return plain._replace(residuals=projected[..., -1], jacobian=projected[..., :-1])

@@ -36,9 +36,7 @@ def results_of(prepared: Prepared, solved: Solved) -> Identification:
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
     unknowns, ended = fit_run_unknowns(problem, best.unknowns)
-    fit = run_fits(
-        prepared.runs, prepared.roles, problem.tape, np.asarray(ended.simulated), unknowns.runs
-    )
+    fit = run_fits(prepared.runs, prepared.roles, problem.tape, np.asarray(ended.simulated), unknowns.runs)
     names, covariance = parameters.with_tied(info.covariance)
     noise = {
         name: white_noise([residual for _, residual in measured_and_residuals(fit, name)])
@@ -47,10 +45,7 @@ def results_of(prepared: Prepared, solved: Solved) -> Identification:
     return Identification(
         motor=motor,
         parameters=estimates_of(problem, best, info, prepared),
-        unidentified_directions=(
-            *_without_effect(prepared),
-            *explain_directions(info.unseen, parameters, training),
-        ),
+        unidentified_directions=(*_without_effect(prepared), *explain_directions(info.unseen, parameters, training)),
         fit=fit,
         noise={"current_A": noise["current"], "speed_rad_s": noise["speed"]},
         distance=best.distance,

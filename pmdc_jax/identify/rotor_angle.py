@@ -47,9 +47,7 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
     sample_time = np.asarray(tape.sample_time)[np.asarray(tape.grid)]
     for index in range(tape.runs):
         mine = (run == index) & ~np.isnan(turn).all(1)
-        measured, weight = (
-            np.asarray(x)[mine, 1].reshape(-1) for x in (tape.measured, tape.weight)
-        )
+        measured, weight = (np.asarray(x)[mine, 1].reshape(-1) for x in (tape.measured, tape.weight))
         expected = simulated[mine, 1].reshape(-1)
         known = np.flatnonzero(weight)
         if not len(known) or not np.all(np.isfinite(expected)):

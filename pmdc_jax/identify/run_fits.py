@@ -16,11 +16,7 @@ MAX_RESIDUAL_RATIO = 2.0
 
 
 def run_fits(
-    runs: Sequence[Recording],
-    roles: Sequence[Role],
-    tape: Tape,
-    simulated: np.ndarray,
-    own: RunUnknowns,
+    runs: Sequence[Recording], roles: Sequence[Role], tape: Tape, simulated: np.ndarray, own: RunUnknowns
 ) -> dict[str, RunFit]:
     """The fit of each run: what was measured beside what was `simulated`, the outputs in the blocks of the tape."""
     # as fitted: a speed corrected for what the sensor added, and both without samples that do not count
@@ -66,15 +62,11 @@ def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | 
 def large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:
     """RMS of the residuals over the white noise of the runs, for the outputs for which that exceeds
     `MAX_RESIDUAL_RATIO`."""
-    ratios = {
-        name: ratio_to_noise(measured_and_residuals(fit, name)) for name in ("current", "speed")
-    }
+    ratios = {name: ratio_to_noise(measured_and_residuals(fit, name)) for name in ("current", "speed")}
     return {name: ratio for name, ratio in ratios.items() if ratio > MAX_RESIDUAL_RATIO}
 
 
-def measured_and_residuals(
-    fit: Mapping[str, RunFit], name: str
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def measured_and_residuals(fit: Mapping[str, RunFit], name: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """An output as measured and its residuals, in every training run that has it."""
     pairs = [(getattr(f, name), f.residual(name)) for f in of_training(fit)]
     return [(measured, residual) for measured, residual in pairs if residual is not None]

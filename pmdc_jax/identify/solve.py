@@ -58,11 +58,7 @@ class Solved(NamedTuple):
 
 
 def solve(
-    prepared: Prepared,
-    search: str,
-    seed: int,
-    progress: ReportProgress | None = None,
-    timing: Timing | None = None,
+    prepared: Prepared, search: str, seed: int, progress: ReportProgress | None = None, timing: Timing | None = None
 ) -> tuple[Prepared, Solved]:
     """The best fit of a search, to runs corrected for artefacts of their sensors and for the timing of their inputs.
 
@@ -106,11 +102,7 @@ def _corrected(prepared: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
 
 
 def search_and_refine(
-    prepared: Prepared,
-    search: str,
-    seed: int,
-    progress: ReportProgress | None = None,
-    searches: int = MAX_SEARCHES,
+    prepared: Prepared, search: str, seed: int, progress: ReportProgress | None = None, searches: int = MAX_SEARCHES
 ) -> tuple[Prepared, Solved]:
     """Search the bounds and refine the best candidates; repeat with other seeds while the fit is poor or no two
     refinements agree, up to `searches` searches in all.
@@ -204,15 +196,10 @@ def _distinct(search_result: SearchResult, parameters: Parameters) -> list[np.nd
     return kept
 
 
-def _refine_all(
-    problem: Problem, search_result: SearchResult, before: Sequence[Optimum] = ()
-) -> list[Optimum]:
+def _refine_all(problem: Problem, search_result: SearchResult, before: Sequence[Optimum] = ()) -> list[Optimum]:
     """Refine the best distinct candidates of a search, one on each core at a time, until they agree with each other and
     those `before`; the best of all first."""
-    starts = [
-        _start(problem.tape, candidate)
-        for candidate in _distinct(search_result, problem.parameters)
-    ]
+    starts = [_start(problem.tape, candidate) for candidate in _distinct(search_result, problem.parameters)]
 
     def agreed(ends: list[Optimum]) -> bool:
         return _agreed(sorted([*before, *ends], key=_fitness), problem.outputs)
@@ -245,9 +232,7 @@ def _times_found(ends: Sequence[Optimum], outputs: int) -> int:
     return int(np.sum(fitness <= fitness[0] * (1 + tolerance) + 1e-12))
 
 
-def _search_record(
-    method: str, search_result: SearchResult, ends: Sequence[Optimum], outputs: int
-) -> Search:
+def _search_record(method: str, search_result: SearchResult, ends: Sequence[Optimum], outputs: int) -> Search:
     return Search(
         method=method,
         evaluations=search_result.evaluations,

@@ -73,10 +73,7 @@ def _followed_share(signal: Samples, late: Samples, step: float) -> tuple[float,
     """
     lags = np.arange(-SLOPE_SAMPLES, SLOPE_SAMPLES + 1)
     slope = np.correlate(signal, lags / (lags @ lags) / step, "same")
-    observed, expected = (
-        _half_second_difference(signal),
-        slope[1:-1] * _half_second_difference(late),
-    )
+    observed, expected = (_half_second_difference(signal), slope[1:-1] * _half_second_difference(late))
     known = np.isfinite(observed) & np.isfinite(expected)
     known[:SLOPE_SAMPLES] = known[-SLOPE_SAMPLES:] = False
     observed, expected = observed[known], expected[known]

@@ -67,9 +67,7 @@ QUANTITIES = {
         ("w", "n", "v", "drehzahl", "motordrehzahl", "rotational_speed"),
     ),
     "load": Quantity(
-        "load_torque_Nm",
-        ("N m", "N"),
-        ("load_torque", "load", "load_force", "lastmoment", "lastdrehmoment"),
+        "load_torque_Nm", ("N m", "N"), ("load_torque", "load", "load_force", "lastmoment", "lastdrehmoment")
     ),
     "angle": Quantity(
         "angle_rad",
@@ -104,9 +102,7 @@ LOADS = re.compile(r"(?i)(?<![a-z])(load|last|brak|brems|dyno)")
 # Names of columns that are the time if they hold dates with times; numbers need a unit
 DATED = ("timestamp", "time_stamp", "datetime", "date_time", "date", "datum")
 # Words in the names of columns that hold set points, limits or supplies rather than a measurement of the motor
-NOT_MEASURED = re.compile(
-    r"(?i)(?<![a-z])(ref|set|soll|cmd|command|target|demand|desired|limit|max|min|supply|bat)"
-)
+NOT_MEASURED = re.compile(r"(?i)(?<![a-z])(ref|set|soll|cmd|command|target|demand|desired|limit|max|min|supply|bat)")
 
 
 @frozen
@@ -126,9 +122,7 @@ class Column:
     by_unit: bool = False
 
 
-def match_columns(
-    headers: Sequence[str], columns: Mapping[str, str] | None, where: str
-) -> dict[str, Column]:
+def match_columns(headers: Sequence[str], columns: Mapping[str, str] | None, where: str) -> dict[str, Column]:
     """Which header holds which quantity.
 
     **Arguments**: `headers` of the file; `columns`, the mapping of the user from quantity to "header[:[-]unit]", which
@@ -166,9 +160,7 @@ def match_columns(
     return matched | _match_by_unit_or_symbol(headers, matched)
 
 
-def _match_by_unit_or_symbol(
-    headers: Sequence[str], matched: Mapping[str, Column]
-) -> dict[str, Column]:
+def _match_by_unit_or_symbol(headers: Sequence[str], matched: Mapping[str, Column]) -> dict[str, Column]:
     """Quantities recognised by the unit or the motor symbol of exactly one of the remaining headers."""
     taken = {column.header for column in matched.values()}
     free = [header for header in headers if header not in taken]
@@ -211,9 +203,7 @@ def understand(header: str) -> Column | None:
             return _column(header, named[0], None)
         if unit is None:
             continue
-        meant = [
-            q for q, quantity in QUANTITIES.items() if key in quantity.names + quantity.symbols
-        ]
+        meant = [q for q, quantity in QUANTITIES.items() if key in quantity.names + quantity.symbols]
         fitting = [q for q in meant if _is_unit_of(unit, q)]
         if len(fitting) == 1:
             return _column(header, fitting[0], unit)

@@ -24,9 +24,7 @@ MAX_INTERVALS_PER_SAMPLE = 20
 OUTPUTS = ("speed", "angle", "current")
 # Columns needed besides time: to simulate, and to identify
 NEEDED_TO_SIMULATE = "voltage, current or torque"
-NEEDED_TO_IDENTIFY = (
-    "voltage with current, speed or angle; or current or torque with speed or angle"
-)
+NEEDED_TO_IDENTIFY = "voltage with current, speed or angle; or current or torque with speed or angle"
 
 
 @frozen
@@ -157,9 +155,7 @@ class Recording:
         """Whether the rotor is locked or does not move at all while current flows; needs voltage and current."""
         if self.voltage is None or self.current is None or not np.any(np.nan_to_num(self.current)):
             return False
-        motion = (
-            np.diff(self.angle) if self.speed is None and self.angle is not None else self.speed
-        )
+        motion = np.diff(self.angle) if self.speed is None and self.angle is not None else self.speed
         return self.held or (motion is not None and not np.any(np.nan_to_num(motion)))
 
     def columns(self) -> dict[str, np.ndarray]:
@@ -213,9 +209,7 @@ def is_identifiable_from(columns: Mapping[str, object]) -> bool:
     return moves and ("current" in columns or "torque" in columns)
 
 
-def _faults_of_values(
-    quantity: str, values: np.ndarray, columns: Mapping[str, np.ndarray]
-) -> Iterator[Fault]:
+def _faults_of_values(quantity: str, values: np.ndarray, columns: Mapping[str, np.ndarray]) -> Iterator[Fault]:
     bad = ~np.isfinite(values)
     if not bad.any():
         return
@@ -226,9 +220,7 @@ def _faults_of_values(
         what = f"{infinite.sum()} infinite values, the first here"
         yield Fault(quantity, first, what, "Leave cells without a measurement empty")
     # the current is an input if neither voltage nor torque was recorded
-    output = quantity in OUTPUTS and (
-        quantity != "current" or "voltage" in columns or "torque" in columns
-    )
+    output = quantity in OUTPUTS and (quantity != "current" or "voltage" in columns or "torque" in columns)
     if not output and quantity != "temperature":
         what = f"{count} of {len(values)} values are missing (empty or NaN), the first here"
         yield Fault(quantity, first, what, "Inputs must be complete: fill the gaps, or cut the run")
@@ -267,9 +259,7 @@ def _long_gaps(steps: np.ndarray) -> Iterator[Fault]:
         yield Fault("time", longest + 1, what, mend)
 
 
-def jumps_of(
-    signal: Float[np.ndarray, " samples"], ratio: float, share: float
-) -> Int[np.ndarray, " jumps"]:
+def jumps_of(signal: Float[np.ndarray, " samples"], ratio: float, share: float) -> Int[np.ndarray, " jumps"]:
     """The samples at which a signal jumps: from the one before it changes by more than `ratio` times what it does in
     the samples beside, and by more than this `share` of its range."""
     size = np.abs(np.diff(signal))

@@ -43,9 +43,7 @@ Runs = Run | Sequence[Run]
 
 
 def read_recording(
-    path: str | os.PathLike[str],
-    columns: Mapping[str, str] | None = None,
-    to_simulate: bool = False,
+    path: str | os.PathLike[str], columns: Mapping[str, str] | None = None, to_simulate: bool = False
 ) -> Recording:
     """Read one run from a CSV, Parquet or MAT file.
 
@@ -61,9 +59,7 @@ def read_recording(
     return _read(open_table(path), path, columns, to_simulate)
 
 
-def read_recordings(
-    paths: Sequence[Path], mappings: Sequence[tuple[str, str]] = ()
-) -> list[Recording]:
+def read_recordings(paths: Sequence[Path], mappings: Sequence[tuple[str, str]] = ()) -> list[Recording]:
     """Read runs, which may be of several loggers.
 
     **Arguments**: `paths`; `mappings` from quantity to "header" or "header:unit", each for the files with that header.
@@ -94,9 +90,7 @@ def _has(table: Table, spec: str) -> bool:
     return header_and_unit(spec, table.headers)[0] in table.headers
 
 
-def _read(
-    table: Table, path: Path, columns: Mapping[str, str] | None, to_simulate: bool = False
-) -> Recording:
+def _read(table: Table, path: Path, columns: Mapping[str, str] | None, to_simulate: bool = False) -> Recording:
     matched = match_columns(table.headers, columns, str(path))
     if "time" not in matched:
         matched = _time_of_dates(table) | matched
@@ -127,10 +121,7 @@ def recordings_of(runs: Runs, to_simulate: bool = False) -> list[Recording]:
     **Raises**: `InputError` if a file cannot be read.
     """
     several = [runs] if isinstance(runs, Recording | str | os.PathLike) else runs
-    return [
-        run if isinstance(run, Recording) else read_recording(run, to_simulate=to_simulate)
-        for run in several
-    ]
+    return [run if isinstance(run, Recording) else read_recording(run, to_simulate=to_simulate) for run in several]
 
 
 def named_apart(recordings: Sequence[Recording]) -> list[Recording]:
@@ -164,9 +155,7 @@ def refuse_copies(recordings: Sequence[Recording]) -> None:
 
 def _hold_the_same(first: Recording, second: Recording) -> bool:
     own, other = first.columns(), second.columns()
-    return own.keys() == other.keys() and all(
-        np.array_equal(own[name], other[name], equal_nan=True) for name in own
-    )
+    return own.keys() == other.keys() and all(np.array_equal(own[name], other[name], equal_nan=True) for name in own)
 
 
 def _named_after_path(run: Recording, paths: Sequence[Path]) -> Recording:
@@ -211,9 +200,7 @@ def _time_of_dates(table: Table) -> dict[str, Column]:
     return {}
 
 
-def _with_dates_in_seconds(
-    matched: Mapping[str, Column], table: Table, where: str
-) -> dict[str, Column]:
+def _with_dates_in_seconds(matched: Mapping[str, Column], table: Table, where: str) -> dict[str, Column]:
     """The columns; a time that was read from dates is in seconds, whatever its header says."""
     for quantity, column in matched.items():
         if column.header in table.dates and quantity != "time":
@@ -226,11 +213,7 @@ def _with_dates_in_seconds(
 
 
 def _refuse_too_little(
-    matched: Mapping[str, object],
-    table: Table,
-    where: str,
-    to_simulate: bool,
-    empty: Sequence[str] = (),
+    matched: Mapping[str, object], table: Table, where: str, to_simulate: bool, empty: Sequence[str] = ()
 ) -> None:
     headers = ", ".join(filter(None, table.headers[:20])) or "none"
     content = f"columns in the file: {headers}"
@@ -252,9 +235,7 @@ def _refuse_too_little(
     what = f"{what} {', '.join(matched)}"
     if empty:
         what += f"; nothing is in {', '.join(empty)}"
-    mend = (
-        f"Needed besides time: {needed}. Map columns with --column {lacking}=HEADER:UNIT; {content}"
-    )
+    mend = f"Needed besides time: {needed}. Map columns with --column {lacking}=HEADER:UNIT; {content}"
     raise InputError(where, what, mend)
 
 
@@ -273,9 +254,7 @@ def _in_file(fault: Fault, matched: Mapping[str, Column], table: Table, where: s
     return InputError(", ".join(places), fault.what, fault.mend)
 
 
-def _notes(
-    run: str, headers: tuple[str, ...], matched: Mapping[str, Column], empty: list[str]
-) -> Iterator[Finding]:
+def _notes(run: str, headers: tuple[str, ...], matched: Mapping[str, Column], empty: list[str]) -> Iterator[Finding]:
     def note(column: str, what: str, mend: str) -> Finding:
         return Finding(run, column, "note", what, "", mend)
 

@@ -49,8 +49,7 @@ TURNS: dict[str, str] = {**dict.fromkeys(RPM, "rpm"), "r/s": "rps", "u/s": "rps"
 # Torques as weights by lengths, such as oz-in and kgf.cm, and the other way round, as in ft-lb
 WEIGHT, LENGTH = r"(?P<weight>oz|lb|kg|g)f?s?", r"(?P<length>in|ft|cm)"
 WEIGHT_BY_LENGTH = tuple(
-    re.compile(rf"{one}[\s_.·*\-]*{other}", re.I)
-    for one, other in ((WEIGHT, LENGTH), (LENGTH, WEIGHT))
+    re.compile(rf"{one}[\s_.·*\-]*{other}", re.I) for one, other in ((WEIGHT, LENGTH), (LENGTH, WEIGHT))
 )
 # Between the factors of a unit, as in N_m; not the minus of a sign or an exponent
 SEPARATOR = r"(?<=\w)[_.\-](?=[^\W\d])"

@@ -23,6 +23,4 @@ def noise_by_differences(order: int, *signals: Float[np.ndarray, " _"]) -> float
     """
     differences = np.concatenate([np.diff(signal, order) for signal in signals] or [np.empty(0)])
     sizes = np.abs(differences[np.isfinite(differences)])
-    return (
-        float(np.median(sizes) / (MEDIAN * np.sqrt(comb(2 * order, order)))) if len(sizes) else 0.0
-    )
+    return float(np.median(sizes) / (MEDIAN * np.sqrt(comb(2 * order, order)))) if len(sizes) else 0.0

@@ -8,14 +8,7 @@ from typing import Any
 
 import plotly.graph_objects as go
 
-from ..diagnose.diagnosis import (
-    Diagnosis,
-    EffectFound,
-    Gap,
-    LearnedCurve,
-    NextExperiment,
-    Region,
-)
+from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, LearnedCurve, NextExperiment, Region
 from ..effects import EFFECTS
 from ..identify.identification import RunFit
 from ..words import enumerate_words
@@ -104,8 +97,7 @@ def _tiles(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
 
 def _effect(effect: EffectFound) -> dict[str, Any]:
     parameters = [
-        (field_words(effect.name, field), write_estimate(estimate))
-        for field, estimate in effect.parameters.items()
+        (field_words(effect.name, field), write_estimate(estimate)) for field, estimate in effect.parameters.items()
     ]
     return {
         "label": EFFECTS[effect.name].label,
@@ -137,9 +129,7 @@ def _region(region: Region) -> dict[str, str]:
     return {
         "equation": region.equation,
         "variable": region.variable,
-        "where": intervals_in_words(region.variable, [region.region]).removeprefix(
-            f"at a {region.variable} "
-        ),
+        "where": intervals_in_words(region.variable, [region.region]).removeprefix(f"at a {region.variable} "),
         "z": fixed(region.z, 1),
     }
 
@@ -191,9 +181,7 @@ def _residuals(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     runs = [name for name, _ in runs_in_order(diagnosis.final)]
     points = points_per_trace((TRACES_OF_RESIDUALS + TRACES_OF_SIMULATION) * len(runs))
     figures = {
-        run: residual_figure(
-            {name: fits[run] for name, fits in models.items()}, diagnosis.final.noise, points
-        )
+        run: residual_figure({name: fits[run] for name, fits in models.items()}, diagnosis.final.noise, points)
         for run in runs
         if all(run in fits for fits in models.values())
     }
@@ -207,11 +195,7 @@ def _residual_over_variable(diagnosis: Diagnosis) -> dict[str, Any] | None:
     for channel in (wanted, "speed", "current"):
         figure = residual_over_variable_figure(_compared(diagnosis), variable, channel)
         if figure:
-            return {
-                "variable": variable,
-                "channel": channel,
-                "figure": figure_json(figure),
-            }
+            return {"variable": variable, "channel": channel, "figure": figure_json(figure)}
     return None
 
 
@@ -227,8 +211,7 @@ def _curve(curve: LearnedCurve) -> dict[str, Any]:
     reading = "current reading" if curve.unit == "A" else "speed reading"
     where = reading if curve.equation == "sensor" else f"{curve.equation} equation"
     return {
-        "title": f"{'friction' if curve.reverses else where} over"
-        f" {AXIS_TITLES.get(curve.variable, curve.variable)}",
+        "title": f"{'friction' if curve.reverses else where} over {AXIS_TITLES.get(curve.variable, curve.variable)}",
         "chance": p_value_words(curve.p_value),
         "figure": figure_json(curve_figure(curve)),
     }
@@ -263,10 +246,6 @@ def _varies(diagnosis: Diagnosis) -> dict[str, Any] | None:
 
 def _detectable(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
     return [
-        (
-            EFFECTS[one.effect].label,
-            field_words(one.effect, one.parameter),
-            value_with_unit(one.amplitude, one.unit, 2),
-        )
+        (EFFECTS[one.effect].label, field_words(one.effect, one.parameter), value_with_unit(one.amplitude, one.unit, 2))
         for one in detectable_others(diagnosis)
     ]

@@ -11,16 +11,7 @@ from plotly.subplots import make_subplots
 
 from ..diagnose.diagnosis import LearnedCurve, NextExperiment, Region
 from ..identify.identification import RunFit
-from .figures import (
-    INK,
-    INPUT,
-    RESIDUAL,
-    RESIDUALS,
-    SIMULATED,
-    envelope,
-    mark_noise,
-    style,
-)
+from .figures import INK, INPUT, RESIDUAL, RESIDUALS, SIMULATED, envelope, mark_noise, style
 
 T = TypeVar("T")
 
@@ -48,9 +39,7 @@ def where_figure(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> go.Fi
     """
     kinds = list(dict.fromkeys((one.equation, one.variable) for one in regions))
     titles = [f"{equation} equation over {variable}" for equation, variable in kinds]
-    figure = make_subplots(
-        rows=len(kinds), cols=1, subplot_titles=titles, vertical_spacing=0.42 / len(kinds)
-    )
+    figure = make_subplots(rows=len(kinds), cols=1, subplot_titles=titles, vertical_spacing=0.42 / len(kinds))
     for row, kind in enumerate(kinds, start=1):
         for one in (r for r in regions if (r.equation, r.variable) == kind):
             low, high = one.region
@@ -75,9 +64,7 @@ def where_figure(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> go.Fi
 
 def _coloured(compared: Mapping[str, T]) -> Iterator[tuple[str, T, str]]:
     """Name, content and colour of one or two models that are compared; the last is the one that was found."""
-    for (name, content), colour in zip(
-        compared.items(), (BEFORE, AFTER)[-len(compared) :], strict=True
-    ):
+    for (name, content), colour in zip(compared.items(), (BEFORE, AFTER)[-len(compared) :], strict=True):
         yield name, content, colour
 
 
@@ -102,9 +89,7 @@ def gap_figure(errors: Mapping[str, Mapping[str, float]], floors: Mapping[str, f
     return figure
 
 
-def residual_figure(
-    fits: Mapping[str, RunFit], noise: Mapping[str, float | None], points: int
-) -> go.Figure | None:
+def residual_figure(fits: Mapping[str, RunFit], noise: Mapping[str, float | None], points: int) -> go.Figure | None:
     """Free-run residuals over time of two models, by name; None without any output."""
     channels = [one for one in RESIDUALS if next(iter(fits.values())).residual(one) is not None]
     if not channels:
@@ -118,9 +103,7 @@ def residual_figure(
                 continue
             time, values = envelope(fit.time, residual, points)
             line = {"color": colour, "width": 0.8}
-            trace = go.Scatter(
-                x=time, y=values, name=name, line=line, showlegend=row == 1, legendgroup=name
-            )
+            trace = go.Scatter(x=time, y=values, name=name, line=line, showlegend=row == 1, legendgroup=name)
             figure.add_trace(trace, row=row, col=1)
         mark_noise(figure, row, noise.get(column))
         figure.update_yaxes(title_text=title, row=row, col=1)
@@ -144,15 +127,11 @@ def residual_over_variable_figure(
         figure.add_trace(trace)
     style(figure, height=320)
     figure.update_xaxes(title_text=AXIS_TITLES.get(variable, variable))
-    figure.update_yaxes(
-        title_text=f"mean {RESIDUALS[channel][0]}", zeroline=True, zerolinecolor=INK
-    )
+    figure.update_yaxes(title_text=f"mean {RESIDUALS[channel][0]}", zeroline=True, zerolinecolor=INK)
     return figure
 
 
-def averages(
-    fits: Mapping[str, RunFit], variable: str, channel: str
-) -> tuple[np.ndarray, np.ndarray] | None:
+def averages(fits: Mapping[str, RunFit], variable: str, channel: str) -> tuple[np.ndarray, np.ndarray] | None:
     """Mean variable and mean residual of all runs together, in bins of equally many samples; None without data."""
     pairs = [(_values(fit, variable), fit.residual(channel)) for fit in fits.values()]
     there = [(x, r) for x, r in pairs if x is not None and r is not None]
@@ -181,9 +160,7 @@ def curve_figure(curve: LearnedCurve) -> go.Figure:
     )
     line = {"color": AFTER, "width": 2}
     figure.add_trace(band)
-    figure.add_trace(
-        go.Scatter(x=curve.x, y=curve.value, mode="lines+markers", line=line, name="learned")
-    )
+    figure.add_trace(go.Scatter(x=curve.x, y=curve.value, mode="lines+markers", line=line, name="learned"))
     style(figure, height=300)
     figure.update_xaxes(title_text=AXIS_TITLES.get(curve.variable, curve.variable))
     titles = {

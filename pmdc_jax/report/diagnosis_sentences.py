@@ -21,15 +21,7 @@ from ..diagnose.hypotheses.effect_relations import CONTAINS, unbalanced_equation
 from ..identify.identification import Estimate, Role, RunFit
 from ..words import enumerate_words
 from .identification_sentences import as_sentence, cautions, role_word
-from .notation import (
-    effect_words,
-    field_words,
-    p_value_words,
-    percent,
-    significant,
-    value_with_unit,
-    write_estimate,
-)
+from .notation import effect_words, field_words, p_value_words, percent, significant, value_with_unit, write_estimate
 
 VERDICTS = {
     "named": "named",
@@ -37,13 +29,7 @@ VERDICTS = {
     "none_detected": "none detected",
     "not_in_library": "not in the library",
 }
-VARIABLE_UNITS = {
-    "speed": "rad/s",
-    "current": "A",
-    "voltage": "V",
-    "angle": "rad",
-    "frequency": "Hz",
-}
+VARIABLE_UNITS = {"speed": "rad/s", "current": "A", "voltage": "V", "angle": "rad", "frequency": "Hz"}
 # a parameter whose change in % is smaller is not mentioned
 MIN_DRIFT = 1.0
 # the regions of both directions are described as one if their far ends differ by no more than this factor
@@ -64,11 +50,7 @@ def verdict_sentences(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.effects:
         sentences += [_gap_sentence(diagnosis), _drift_sentence(diagnosis)]
     if diagnosis.verdict != "not_in_library":
-        sentences += [
-            _formula_sentence(diagnosis),
-            _slow_rest_sentence(diagnosis),
-            _held_out_sentence(diagnosis),
-        ]
+        sentences += [_formula_sentence(diagnosis), _slow_rest_sentence(diagnosis), _held_out_sentence(diagnosis)]
     sentences.append(_run_apart_sentence(diagnosis))
     return [sentence for sentence in sentences if sentence] + cautions(diagnosis.final)
 
@@ -104,9 +86,7 @@ def _ambiguous(diagnosis: Diagnosis) -> list[str]:
 def _not_in_library(diagnosis: Diagnosis) -> list[str]:
     sentences = [_disagreement_sentence(diagnosis)]
     if diagnosis.effects:
-        rest = (
-            "" if unlike_held_out(diagnosis.gap) else "; no effect of the library explains the rest"
-        )
+        rest = "" if unlike_held_out(diagnosis.gap) else "; no effect of the library explains the rest"
         subject = _capitalised(_effects_in_words(diagnosis))
         verb, added = ("explain", "were") if len(diagnosis.effects) > 1 else ("explains", "was")
         sentences.append(f"{subject} {verb} part of this and {added} added to the model{rest}.")
@@ -131,10 +111,7 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
             "The addition increases the error of the held-out runs: something else is missing that looks alike in the"
             " training runs. Include one of the held-out runs in the fit."
         )
-    return [
-        *sentences,
-        "The parameters compensate for what is missing: the intervals do not cover this error.",
-    ]
+    return [*sentences, "The parameters compensate for what is missing: the intervals do not cover this error."]
 
 
 def _held_out_sentence(diagnosis: Diagnosis) -> str:
@@ -187,9 +164,7 @@ def disagreement(regions: Sequence[Region], fits: Mapping[str, RunFit]) -> str:
     return f"in the {clearest.equation} equation, {where}"
 
 
-def intervals_in_words(
-    variable: str, intervals: Sequence[Interval], largest: float | None = None
-) -> str:
+def intervals_in_words(variable: str, intervals: Sequence[Interval], largest: float | None = None) -> str:
     """Intervals of one variable in words; `largest` is its largest magnitude in the runs, a few outliers excluded."""
     joined = _merged(intervals)
     if variable == "time":
@@ -289,9 +264,7 @@ def place_in_words(variable: str, value: float) -> str:
 def _experiment_sentence(diagnosis: Diagnosis) -> str:
     experiment = diagnosis.next_experiment
     if experiment is None:
-        return (
-            "No experiment within the recorded voltage range was found that would distinguish them."
-        )
+        return "No experiment within the recorded voltage range was found that would distinguish them."
     return (
         f"To decide, record this: {as_sentence(experiment.description)} It distinguishes them with a"
         f" probability of {percent(100 * experiment.power)}; --experiment OUT.csv writes its voltage."
@@ -327,9 +300,7 @@ def _gap_sentence(diagnosis: Diagnosis) -> str:
     role = judged_role(diagnosis)
     gap = diagnosis.gap[role]
     what = role_word(role).capitalize()
-    sentence = (
-        f"{what} error from {significant(gap.before)} to {significant(gap.after)} times the noise"
-    )
+    sentence = f"{what} error from {significant(gap.before)} to {significant(gap.after)} times the noise"
     if diagnosis.closed_fraction is None or diagnosis.closed_fraction <= 0:
         return f"{sentence}."
     return f"{sentence}: {percent(100 * diagnosis.closed_fraction)} of the gap is closed."
@@ -352,8 +323,7 @@ def _slow_rest_sentence(diagnosis: Diagnosis) -> str:
     """A warning that what counts as noise exceeds the white noise of the sensors; empty where it does not, or where
     something differs from run to run."""
     rest = [
-        f"{significant(times)} times the white noise of the {name}"
-        for name, times in diagnosis.final.missed.items()
+        f"{significant(times)} times the white noise of the {name}" for name, times in diagnosis.final.missed.items()
     ]
     if not rest or diagnosis.varies:
         return ""
@@ -377,10 +347,7 @@ REASONS = {
 def _varying_sentence(diagnosis: Diagnosis, varies: VaryingParameter) -> str:
     """What differs from run to run, why it may, and how much of the gap a value for each run closes."""
     by_size = sorted(varies.by_run, key=lambda run: varies.by_run[run].value or 0.0)
-    ends = [
-        f"{_value_in_words(varies.by_run[run])} in the run {run}"
-        for run in (by_size[0], by_size[-1])
-    ]
+    ends = [f"{_value_in_words(varies.by_run[run])} in the run {run}" for run in (by_size[0], by_size[-1])]
     other = f" (or {enumerate_words(varies.also_possible)})" if varies.also_possible else ""
     run, gap = max(diagnosis.gap_by_own_value.items(), key=lambda named: named[1].before)
     return (
@@ -426,11 +393,7 @@ class Drift(NamedTuple):
 def drifts(diagnosis: Diagnosis) -> list[Drift]:
     """Every parameter of the motor without effects, before and after these were added."""
     after = diagnosis.final.parameters
-    return [
-        Drift(name, estimate, after[name])
-        for name, estimate in diagnosis.base.parameters.items()
-        if name in after
-    ]
+    return [Drift(name, estimate, after[name]) for name, estimate in diagnosis.base.parameters.items() if name in after]
 
 
 def drift_words(one: Drift) -> str:

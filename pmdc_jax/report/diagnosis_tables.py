@@ -10,13 +10,7 @@ from ..diagnose.diagnosis import Diagnosis
 from ..effects import EFFECTS
 from .diagnosis_sentences import detectable_others, drift_words, drifts, verdict_sentences
 from .identification_sentences import role_word, runs_in_order
-from .notation import (
-    field_words,
-    p_value_words,
-    significant,
-    value_with_unit,
-    write_estimate,
-)
+from .notation import field_words, p_value_words, significant, value_with_unit, write_estimate
 from .terminal import parameter_table, plain_table, status_text
 
 
@@ -64,9 +58,7 @@ def _gaps(diagnosis: Diagnosis) -> Table:
         gap = diagnosis.gap_of_run[run]
         numbers = (significant(error) for error in (gap.before, gap.after, gap.floor))
         rows.append((run, role_word(fit.role), *numbers))
-    return plain_table(
-        "Free-run error relative to the noise", headings, rows, left=(0, 1), first_wraps="ellipsis"
-    )
+    return plain_table("Free-run error relative to the noise", headings, rows, left=(0, 1), first_wraps="ellipsis")
 
 
 def _detectable(diagnosis: Diagnosis) -> Table:
@@ -75,10 +67,4 @@ def _detectable(diagnosis: Diagnosis) -> Table:
         names = (EFFECTS[one.effect].label, field_words(one.effect, one.parameter))
         rows.append((*names, value_with_unit(one.amplitude, one.unit, 2)))
     headings = ("Effect", "Parameter", "From")
-    return plain_table(
-        "Detectable with 90 % probability",
-        headings,
-        rows,
-        left=(0, 1),
-        first_wraps="ellipsis",
-    )
+    return plain_table("Detectable with 90 % probability", headings, rows, left=(0, 1), first_wraps="ellipsis")

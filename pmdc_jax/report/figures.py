@@ -23,10 +23,7 @@ EDGE = "#c3cad4"
 NOISE_LINE = {"color": INK, "width": 1, "dash": "4px 3px"}
 FONT = "Inter, system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
 # by channel: axis title of its residual, and key of its noise
-RESIDUALS = {
-    "speed": ("Δ speed<br>[rad/s]", "speed_rad_s"),
-    "current": ("Δ current<br>[A]", "current_A"),
-}
+RESIDUALS = {"speed": ("Δ speed<br>[rad/s]", "speed_rad_s"), "current": ("Δ current<br>[A]", "current_A")}
 MODEBAR_BUTTONS = ["toImage", "zoom2d", "pan2d", "resetScale2d"]
 POINTS_PER_TRACE = 4000
 POINTS_PER_PAGE = 90_000  # about one megabyte as base64: the page stays under 6 MB with plotly.js
@@ -49,9 +46,7 @@ def run_figure(fit: RunFit, noise: Mapping[str, float | None], points: int) -> g
     """
     panels = _panels(fit, noise)
     heights = [panel.height for panel in panels]
-    figure = make_subplots(
-        rows=len(panels), cols=1, shared_xaxes=True, vertical_spacing=0.028, row_heights=heights
-    )
+    figure = make_subplots(rows=len(panels), cols=1, shared_xaxes=True, vertical_spacing=0.028, row_heights=heights)
     for row, panel in enumerate(panels, start=1):
         for trace in panel.traces:
             time, values = envelope(fit.time, trace["y"], points)
@@ -73,16 +68,12 @@ def mark_noise(figure: go.Figure, row: int, noise: float | None) -> None:
 
 def search_figure(search: Search) -> go.Figure:
     """Best and median fitness of each generation, then every refined start, on one log scale."""
-    figure = make_subplots(
-        rows=1, cols=2, shared_yaxes=True, column_widths=[0.72, 0.28], horizontal_spacing=0.03
-    )
+    figure = make_subplots(rows=1, cols=2, shared_yaxes=True, column_widths=[0.72, 0.28], horizontal_spacing=0.03)
     for name, values, colour in (
         ("median of the population", search.median, MEASURED),
         ("best", search.best, SIMULATED),
     ):
-        trace = go.Scatter(
-            x=np.arange(len(values)), y=_positive(values), name=name, line={"color": colour}
-        )
+        trace = go.Scatter(x=np.arange(len(values)), y=_positive(values), name=name, line={"color": colour})
         figure.add_trace(trace, row=1, col=1)
     refined = go.Scatter(
         x=np.arange(1, len(search.refined) + 1),
@@ -128,9 +119,7 @@ def correlation_figure(correlation: np.ndarray, names: Sequence[str]) -> go.Figu
     return figure
 
 
-def correlations(
-    covariance: np.ndarray, names: Sequence[str]
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def correlations(covariance: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     """The correlation matrix of the free parameters, those with a finite positive variance, and their names."""
     variance = np.diag(covariance) if np.size(covariance) else np.zeros(0)
     free = np.flatnonzero(np.isfinite(variance) & (variance > 0))
@@ -202,12 +191,7 @@ def _residual_panel(fit: RunFit, channel: str, noise: Mapping[str, float | None]
 
 
 def _line(
-    name: str,
-    values: np.ndarray | None,
-    colour: str,
-    width: float,
-    legend: bool = False,
-    shape: str = "linear",
+    name: str, values: np.ndarray | None, colour: str, width: float, legend: bool = False, shape: str = "linear"
 ) -> dict:
     if values is None:
         return {}

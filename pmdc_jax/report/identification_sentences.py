@@ -16,9 +16,7 @@ STATUS_WORDS = {
     "known": "known",
     "not_identifiable": "not identifiable",
 }
-MODEL_ASSUMPTION = (
-    "The standard errors assume that the model lacks no effect: `pmdc diagnose` tests that."
-)
+MODEL_ASSUMPTION = "The standard errors assume that the model lacks no effect: `pmdc diagnose` tests that."
 # an RMS residual up to this multiple of the noise counts as noise: the RMS of few samples scatters as much
 MAX_RMSE_TO_NOISE = 1.25
 # Kt / Kb, and its inverse, of a motor at most: iron loss and brushes make them differ by some percent
@@ -50,9 +48,7 @@ def cautions(identification: Identification) -> list[str]:
     """What the recordings cannot tell, and where the numbers are not to be trusted."""
     modelled = {effect.name for effect in identification.motor.effects}
     warnings = [
-        one
-        for one in identification.findings
-        if one.severity == "warning" and not modelled & set(one.modelled_by)
+        one for one in identification.findings if one.severity == "warning" and not modelled & set(one.modelled_by)
     ]
     doubted = dict.fromkeys(one.column or f"run {one.run}" for one in warnings)
     sentences = []
@@ -77,9 +73,7 @@ def cautions(identification: Identification) -> list[str]:
 def _unequal_constants_sentence(parameters: Mapping[str, Estimate]) -> str:
     """A warning that Kt and Kb differ by more than any motor's; empty where they do not, or are tied."""
     estimated = {
-        name: one.value
-        for name, one in parameters.items()
-        if one.value and one.status in ("identified", "at_bound")
+        name: one.value for name, one in parameters.items() if one.value and one.status in ("identified", "at_bound")
     }
     if not {"Kt", "Kb"} <= estimated.keys():
         return ""
@@ -140,10 +134,7 @@ def _precision_clause(estimates: dict[str, Estimate]) -> str:
     best, worst = min(errors, key=errors.__getitem__), max(errors, key=errors.__getitem__)
     if best == worst:
         return f", with a standard error of {percent(errors[best])}"
-    return (
-        f", with standard errors from {percent(errors[best])} ({best})"
-        f" to {percent(errors[worst])} ({worst})"
-    )
+    return f", with standard errors from {percent(errors[best])} ({best}) to {percent(errors[worst])} ({worst})"
 
 
 def _holdout_sentence(identification: Identification) -> str:

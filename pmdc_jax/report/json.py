@@ -161,8 +161,7 @@ def _plain(value: Any) -> Any:
     """
     if isinstance(value, dict):
         return {
-            str(key): None if key == "ci95" and _has_unknown_end(item) else _plain(item)
-            for key, item in value.items()
+            str(key): None if key == "ci95" and _has_unknown_end(item) else _plain(item) for key, item in value.items()
         }
     if hasattr(value, "tolist"):
         value = value.tolist()

@@ -29,10 +29,7 @@ def write_page(path: str | Path, template: str, **content: Any) -> None:
     )
     environment.filters["commands"] = _commands
     page = environment.get_template(template).render(
-        plotly_js=Markup(get_plotlyjs()),
-        versions=_versions(),
-        written=f"{datetime.now():%Y-%m-%d %H:%M}",
-        **content,
+        plotly_js=Markup(get_plotlyjs()), versions=_versions(), written=f"{datetime.now():%Y-%m-%d %H:%M}", **content
     )
     write_text(path, page)
 
@@ -48,9 +45,7 @@ def _commands(text: str) -> Markup:
     """Plain text as HTML, with `quoted` commands and command-line options marked as code, which the style never breaks
     over two lines."""
     quoted, option = r"`([^`]+)`", r"(--[a-z][\w-]*(?: \w+=\w+| [A-Z]+\b)?)"
-    marked = re.sub(
-        f"{quoted}|{option}", lambda m: f"<code>{m[1] or m[2]}</code>", str(escape(text))
-    )
+    marked = re.sub(f"{quoted}|{option}", lambda m: f"<code>{m[1] or m[2]}</code>", str(escape(text)))
     return Markup(marked)
 
 

@@ -44,10 +44,7 @@ def table_1(paper: Paper) -> tuple[list[str], list[list[str]]]:
         printed = significant(float(getattr(PRINTED, name)), 4)
         row = [f"{name} [{pretty_unit(PARAMETERS[name])}]", printed]
         for one in paper.recovered:
-            row += [
-                significant(float(getattr(one.motor, name)), 4),
-                significant(one.errors[name], 2),
-            ]
+            row += [significant(float(getattr(one.motor, name)), 4), significant(one.errors[name], 2)]
         rows.append(row)
     rows.append(_effort_row("evaluations", paper, lambda one: thousands(one.evaluations)))
     rows.append(_effort_row("time [s]", paper, lambda one: f"{one.seconds:.1f}"))
@@ -159,11 +156,7 @@ def _as_printed_json(paper: Paper, kind: str) -> dict[str, float] | None:
     if kind not in paper.as_printed:
         return None
     printed = paper.as_printed[kind]
-    return {
-        "Overshoot": printed.overshoot,
-        "SettlingTime": printed.settling,
-        "PeakVoltage": printed.peak_voltage,
-    }
+    return {"Overshoot": printed.overshoot, "SettlingTime": printed.settling, "PeakVoltage": printed.peak_voltage}
 
 
 def write_paper_report(paper: Paper, path: str | Path) -> None:
@@ -195,11 +188,7 @@ def fitness_figure(recovered: tuple[Recovered, ...]) -> go.Figure:
     """Fig. 4: the best fitness of each method over the generations."""
     figure = go.Figure()
     for one, colour in zip(recovered, COLOURS, strict=False):
-        figure.add_trace(
-            go.Scatter(
-                x=np.arange(1, len(one.best) + 1), y=one.best, name=one.method, line_color=colour
-            )
-        )
+        figure.add_trace(go.Scatter(x=np.arange(1, len(one.best) + 1), y=one.best, name=one.method, line_color=colour))
     figure.update_yaxes(type="log", title_text="best fitness", exponentformat="power")
     figure.update_xaxes(title_text="generation")
     style(figure, height=340)
@@ -211,9 +200,7 @@ def errors_figure(paper: Paper, quantity: str) -> go.Figure:
     figure = go.Figure()
     for one, colour in zip(paper.recovered, COLOURS, strict=False):
         errors = load_errors(one.motor)[quantity]
-        figure.add_trace(
-            go.Scatter(x=LOADS, y=errors, name=one.method, line_color=colour, mode="lines+markers")
-        )
+        figure.add_trace(go.Scatter(x=LOADS, y=errors, name=one.method, line_color=colour, mode="lines+markers"))
     figure.update_yaxes(title_text=f"error of {quantity} [%]")
     figure.update_xaxes(title_text="load torque [N·m]")
     style(figure, height=300)
@@ -222,9 +209,7 @@ def errors_figure(paper: Paper, quantity: str) -> go.Figure:
 
 def steps_figure(paper: Paper) -> go.Figure:
     """Figs 7 and 8: speed over time, and below it the voltage that produces it."""
-    figure = make_subplots(
-        rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[1.0, 0.5]
-    )
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[1.0, 0.5])
     for (kind, response), colour in zip(paper.steps.items(), COLOURS, strict=True):
         time = 1e3 * response.time
         shared = {"x": time, "name": CONTROLLERS[kind].label, "mode": "lines", "legendgroup": kind}

@@ -120,9 +120,7 @@ def plain_table(
     **Arguments**: `left`, indices of the left-aligned columns; `first_wraps`, what to do with words too long for the
     first column, whose cells then wrap on a narrow terminal; None if they do not wrap. Other columns are shortened.
     """
-    table = Table(
-        title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0)
-    )
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0))
     for number, heading in enumerate(headings):
         wraps = first_wraps if number == 0 else None
         table.add_column(
@@ -139,8 +137,4 @@ def plain_table(
 def console_for(stderr: bool) -> Console:
     """A console on standard output or standard error, `PIPE_WIDTH` wide if that is no terminal."""
     console = Console(stderr=stderr, highlight=False)
-    return (
-        console
-        if console.is_terminal
-        else Console(stderr=stderr, highlight=False, width=PIPE_WIDTH)
-    )
+    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=PIPE_WIDTH)

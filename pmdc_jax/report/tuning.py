@@ -52,16 +52,10 @@ def tuning_json(tuning: Tuning) -> dict[str, Any]:
         "fastest_possible_settling_s": tuning.fastest_possible_settling,
         "robust": _robust_json(tuning.robust),
         "load": {"torque_Nm": tuning.load_torque, **tuning.load},
-        "second_step": {
-            "to_rad_s": SECOND_SETPOINT * tuning.setpoint,
-            **tuning.candidates[0].second_step,
-        },
+        "second_step": {"to_rad_s": SECOND_SETPOINT * tuning.setpoint, **tuning.candidates[0].second_step},
         "small_step": {"to_rad_s": SMALL_STEP * tuning.setpoint, **tuning.candidates[0].small_step},
         "margins": asdict(tuning.margins),
-        "noise": {
-            "speed_rad_s": tuning.requirements.sensor_noise,
-            "voltage_V": tuning.voltage_noise,
-        },
+        "noise": {"speed_rad_s": tuning.requirements.sensor_noise, "voltage_V": tuning.voltage_noise},
         "peak_current_A": tuning.peak_current,
         "meets_specification": tuning.meets_specification,
         "candidates": [_candidate_json(one) for one in tuning.candidates],
@@ -137,11 +131,7 @@ def _load_sentence(tuning: Tuning) -> str:
     recovery, steady_state_error = tuning.load["RecoveryTime"], tuning.load["SteadyStateError"]
     back = "does not return to the 2 % band"
     if recovery is not None:
-        back = (
-            f"returns to the 2 % band after {_time_text(recovery)}"
-            if recovery
-            else "stays within 2 %"
-        )
+        back = f"returns to the 2 % band after {_time_text(recovery)}" if recovery else "stays within 2 %"
     torque, deviation = significant(tuning.load_torque), significant(tuning.load["Deviation"])
     return (
         f"A load step of {torque} N·m changes the speed by {deviation} rad/s; it {back},"
@@ -253,11 +243,7 @@ def _candidate_row(one: EvaluatedController, fastest: float) -> tuple[str, ...]:
 def _current_note(tuning: Tuning) -> str:
     limit = tuning.requirements.current_limit
     excess = _current_excess(tuning.peak_current, limit)
-    return (
-        f"{percent(100 * excess)} above the limit of {limit:g} A"
-        if excess
-        else _limits_text(tuning)
-    )
+    return f"{percent(100 * excess)} above the limit of {limit:g} A" if excess else _limits_text(tuning)
 
 
 def _milli(value: float | None) -> float | None:
@@ -279,10 +265,7 @@ def write_tuning_report(tuning: Tuning, path: str | Path) -> None:
         gains=gain_rows(tuning),
         headings=[heading.replace("\n", " ") for heading in COMPARISON_HEADINGS],
         comparison=comparison(tuning),
-        metrics=[
-            (METRICS[name][0], significant(value, 4), METRICS[name][1])
-            for name, value in tuning.metrics.items()
-        ],
+        metrics=[(METRICS[name][0], significant(value, 4), METRICS[name][1]) for name, value in tuning.metrics.items()],
         figure=figure_json(loop_figure(tuning)),
         robust=figure_json(robust_figure(tuning)) if tuning.robust else None,
         seed=tuning.seed,

@@ -30,9 +30,7 @@ Traces = Iterator[tuple[int, go.Scatter]]  # each trace with its row
 
 def loop_figure(tuning: Tuning) -> go.Figure:
     """Speed, voltage and current over time: the step, the load step, and the second step under load."""
-    figure = make_subplots(
-        rows=len(HEIGHTS), cols=1, shared_xaxes=True, vertical_spacing=0.04, row_heights=HEIGHTS
-    )
+    figure = make_subplots(rows=len(HEIGHTS), cols=1, shared_xaxes=True, vertical_spacing=0.04, row_heights=HEIGHTS)
     for traces in (_spread_traces, _setpoint_traces, _response_traces, _limit_traces):
         for row, trace in traces(tuning):
             figure.add_trace(trace, row=row, col=1)
@@ -95,9 +93,7 @@ def _mark_event(figure: go.Figure, moment: float, label: str) -> None:
     """Draw a labelled vertical line at the time `moment`, s."""
     at = 1e3 * moment
     figure.add_vline(x=at, line=EVENT_LINE)
-    figure.add_annotation(
-        x=at, y=0.03, yref="y domain", text=label, showarrow=False, xanchor="left", xshift=4
-    )
+    figure.add_annotation(x=at, y=0.03, yref="y domain", text=label, showarrow=False, xanchor="left", xshift=4)
 
 
 def _milliseconds(tuning: Tuning) -> np.ndarray:
@@ -106,21 +102,10 @@ def _milliseconds(tuning: Tuning) -> np.ndarray:
 
 
 def _line(
-    name: str,
-    time: np.ndarray,
-    values: Any,
-    line: dict[str, Any],
-    in_legend: bool = False,
-    **options: Any,
+    name: str, time: np.ndarray, values: Any, line: dict[str, Any], in_legend: bool = False, **options: Any
 ) -> go.Scatter:
     return go.Scatter(
-        x=time,
-        y=np.asarray(values, np.float32),
-        mode="lines",
-        name=name,
-        line=line,
-        showlegend=in_legend,
-        **options,
+        x=time, y=np.asarray(values, np.float32), mode="lines", name=name, line=line, showlegend=in_legend, **options
     )
 
 
@@ -136,14 +121,7 @@ def robust_figure(tuning: Tuning) -> go.Figure:
     figure = make_subplots(cols=len(names), subplot_titles=names)
     for column, (settling, overshoot) in enumerate(clouds, start=1):
         marker = {"color": (SIMULATED, RESIDUAL)[column - 1], "size": 5, "opacity": 0.6}
-        trace = go.Scatter(
-            x=settling,
-            y=overshoot,
-            mode="markers",
-            marker=marker,
-            showlegend=False,
-            cliponaxis=False,
-        )
+        trace = go.Scatter(x=settling, y=overshoot, mode="markers", marker=marker, showlegend=False, cliponaxis=False)
         figure.add_trace(trace, row=1, col=column)
         around = _range(settling, 0.02 * max(settling, default=0.0))
         figure.update_xaxes(title_text="settling [ms]", range=around, row=1, col=column)

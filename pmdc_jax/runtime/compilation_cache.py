@@ -12,10 +12,7 @@ from pathlib import Path
 PROGRAMS = "PMDC_PROGRAMS"
 # JAX reads these variables when it is first imported, so a command that computes nothing need not import it. All
 # programs are kept, however quick to compile, because there are many.
-SETTINGS = {
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
-}
+SETTINGS = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0"}
 
 
 def keep_compiled() -> None:

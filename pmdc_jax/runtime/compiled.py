@@ -33,17 +33,7 @@ Leaf = jax.Array | np.ndarray
 # friction and teeth, where they take a quarter longer.
 QUICK_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 # Libraries whose versions affect what a function of this package is compiled to
-LIBRARIES = (
-    "jax",
-    "jaxlib",
-    "equinox",
-    "diffrax",
-    "lineax",
-    "optimistix",
-    "optax",
-    "evosax",
-    "numpy",
-)
+LIBRARIES = ("jax", "jaxlib", "equinox", "diffrax", "lineax", "optimistix", "optax", "evosax", "numpy")
 # Most bytes of programs on disk; a diagnosis of recordings of a new shape adds a few million
 MAX_DISK_BYTES = 500_000_000
 
@@ -168,15 +158,7 @@ def _key(
     """The name of a program: a hash of everything that determines it."""
     kinds = [(x.shape, str(x.dtype), getattr(x, "weak_type", False)) for x in leaves]
     double = jax.config.read("jax_enable_x64")
-    identity = (
-        function.__module__,
-        function.__qualname__,
-        options,
-        kinds,
-        structure,
-        static,
-        double,
-    )
+    identity = (function.__module__, function.__qualname__, options, kinds, structure, static, double)
     return hashlib.sha256(pickle.dumps((_environment_hash(), identity))).hexdigest()
 
 
@@ -211,9 +193,7 @@ def _load_lapack() -> None:
     jax.block_until_ready(jnp.linalg.cholesky(jnp.eye(1)))
 
 
-def _compile(
-    key: str, function: Callable, leaves: Sequence[Leaf], options: dict[str, Any] | None
-) -> Program:
+def _compile(key: str, function: Callable, leaves: Sequence[Leaf], options: dict[str, Any] | None) -> Program:
     """A program compiled now, and kept if possible."""
     returned: list[Any] = []
 

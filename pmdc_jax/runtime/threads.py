@@ -58,9 +58,7 @@ def map_in_threads(function: Callable[[A], T], items: Iterable[A]) -> list[T]:
     return [task.result() for task in [submit(function, item) for item in items]]
 
 
-def map_in_threads_until(
-    function: Callable[[A], T], items: Sequence[A], enough: Callable[[list[T]], bool]
-) -> list[T]:
+def map_in_threads_until(function: Callable[[A], T], items: Sequence[A], enough: Callable[[list[T]], bool]) -> list[T]:
     """The same, until the results of the first items are `enough`: computed in batches of one item per core, but
     counted one by one, so that the answer does not depend on the number of cores."""
     made: list[T] = []

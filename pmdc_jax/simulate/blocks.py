@@ -65,17 +65,12 @@ def simulate_blocks(
             return _turned(state, after, turn[k]), simulated
 
         (state, simulated), (d_state, d_simulated) = value_and_derivatives(
-            observe_and_step,
-            (motor, propagator, state, load[k]),
-            (d_motor, d_propagator, d_state, d_load),
+            observe_and_step, (motor, propagator, state, load[k]), (d_motor, d_propagator, d_state, d_load)
         )
         return Carry((state, d_state), (simulated, d_simulated))
 
     reports = reports_of(propagator)
-    nothing_simulated = (
-        jnp.zeros((reports, len(starts))),
-        jnp.zeros((columns, reports, len(starts))),
-    )
+    nothing_simulated = (jnp.zeros((reports, len(starts))), jnp.zeros((columns, reports, len(starts))))
     start = Carry(_states_with_derivatives(motor, starts, columns), nothing_simulated)
     saveat = diffrax.SaveAt(
         subs=[
@@ -88,9 +83,7 @@ def simulate_blocks(
     return Pass(simulated, d_simulated, pack(end).T, jax.vmap(pack)(d_end).swapaxes(1, 2))
 
 
-def _of_blocks(
-    grids: Propagator, d_grids: Propagator, tape: Tape
-) -> tuple[Propagator, Propagator, Drive]:
+def _of_blocks(grids: Propagator, d_grids: Propagator, tape: Tape) -> tuple[Propagator, Propagator, Drive]:
     """The propagator of each block, its derivatives, and the drive."""
     # if there is one grid only, all blocks share its matrices: a copy for each would be read at every step
     grid = tape.grid if tape.sample_time.shape[0] > 1 else jnp.zeros(1, int)
@@ -135,9 +128,7 @@ def value_and_derivatives(
     function: Callable[..., T], primals: tuple[Any, ...], tangents: tuple[Any, ...]
 ) -> tuple[T, T]:
     """A function's value, and its derivative along every column of the tangents."""
-    return jax.vmap(lambda *tangent: jax.jvp(function, primals, tangent), out_axes=(None, 0))(
-        *tangents
-    )
+    return jax.vmap(lambda *tangent: jax.jvp(function, primals, tangent), out_axes=(None, 0))(*tangents)
 
 
 def pack(state: State) -> Float[Array, "states ..."]:

@@ -21,9 +21,7 @@ HALVINGS = 20
 SERIES_LIMIT = 3e-3
 
 
-def product(
-    a: Float[Array, "n n *#batch"], b: Float[Array, "n m *#batch"]
-) -> Float[Array, "n m ..."]:
+def product(a: Float[Array, "n n *#batch"], b: Float[Array, "n m *#batch"]) -> Float[Array, "n m ..."]:
     """Matrix product over the two leading axes; as sums, because XLA on CPU is slow on batches of tiny dots, and on
     reductions over a leading axis."""
     return reduce(add, (a[:, j, None] * b[j] for j in range(len(b))))
@@ -65,9 +63,7 @@ def phi_functions(z: Matrix, count: int) -> tuple[list[Matrix], list[Matrix]]:
     return [one + half[0], *half[1:]], [one + whole[0], *whole[1:]]
 
 
-def _doubling(
-    count: int,
-) -> tuple[Float[np.ndarray, " functions"], Float[np.ndarray, "functions functions"]]:
+def _doubling(count: int) -> tuple[Float[np.ndarray, " functions"], Float[np.ndarray, "functions functions"]]:
     """The doubled functions phi_0 - 1, phi_1, ... as `scale` (phi_0 - 1) f plus `sums` of the functions f."""
     scale = 0.5 ** np.arange(count + 1)
     sums = np.eye(count + 1) + np.tril(toeplitz(1 / factorial(np.arange(count + 1))))

@@ -66,19 +66,13 @@ def _errors(motors: Motor, tape: Tape, share: Int[Array | np.ndarray, ""], share
     """Errors of one of the equal shares of a population."""
     if shares > 1:
         size = motors.R.shape[0] // shares
-        leaves = [
-            jax.lax.dynamic_slice_in_dim(x, share * size, size) for x in jax.tree.leaves(motors)
-        ]
+        leaves = [jax.lax.dynamic_slice_in_dim(x, share * size, size) for x in jax.tree.leaves(motors)]
         # the barrier keeps XLA from fusing the slices into the arithmetic, which would lose its vector instructions
-        motors = jax.tree.unflatten(
-            jax.tree.structure(motors), jax.lax.optimization_barrier(leaves)
-        )
+        motors = jax.tree.unflatten(jax.tree.structure(motors), jax.lax.optimization_barrier(leaves))
     return _errors_with_effects(motors, tape) if motors.effects else _errors_of_linear(motors, tape)
 
 
-def _means_at_sample_start(
-    tape: Tape,
-) -> tuple[Samples, Samples, Bool[Array, "blocks 2"] | None]:
+def _means_at_sample_start(tape: Tape) -> tuple[Samples, Samples, Bool[Array, "blocks 2"] | None]:
     """Measurements and weights, with means over the last sample moved to where that sample begins; and which currents
     and speeds of the blocks are such means, None if nothing of the tape is a mean.
 
@@ -100,29 +94,20 @@ def _means_at_sample_start(
 
 
 def _outputs(
-    motors: Motor,
-    state: State,
-    mean: State | None,
-    over_last: Bool[Array, "blocks 2"] | None,
-    block: Int[Array, ""],
+    motors: Motor, state: State, mean: State | None, over_last: Bool[Array, "blocks 2"] | None, block: Int[Array, ""]
 ) -> tuple[Scalars, Scalars]:
     """Current and speed at a sample, or, in blocks that report means, the means from there to the next sample."""
     outputs = motors.sensors(state)
     if mean is None or over_last is None:
         return outputs
     current, speed = (
-        jnp.where(over_last[block, c], *both)
-        for c, both in enumerate(zip(motors.sensors(mean), outputs, strict=True))
+        jnp.where(over_last[block, c], *both) for c, both in enumerate(zip(motors.sensors(mean), outputs, strict=True))
     )
     return current, speed
 
 
 def _when_read(
-    motors: Motor,
-    propagator: Propagator,
-    acting: Input,
-    state: State,
-    steps: int | Int[Array, ""] = 1,
+    motors: Motor, propagator: Propagator, acting: Input, state: State, steps: int | Int[Array, ""] = 1
 ) -> State:
     """The state when the outputs of a sample are read, from that at its start."""
     if propagator.reading is None:
@@ -146,17 +131,13 @@ def _stride(propagator: Propagator) -> Stride:
     """By repeated doubling from one sample: the response to the earlier inputs is propagated through the later half."""
     transition, input_response = propagator.transition[:, :, None], propagator.inputs[:, :, None]
     for _ in range(STRIDE.bit_length() - 1):
-        input_response = jnp.concatenate(
-            [product(transition, input_response), input_response], axis=2
-        )
+        input_response = jnp.concatenate([product(transition, input_response), input_response], axis=2)
         transition = product(transition, transition)
     by_input = jnp.moveaxis(input_response, 0, 2)
     return Stride(transition[:, :, 0], by_input.reshape(2 * STRIDE, 2, -1))
 
 
-def _stride_starts(
-    stride: Stride, state: State, value: Samples, load: Samples
-) -> tuple[State, State]:
+def _stride_starts(stride: Stride, state: State, value: Samples, load: Samples) -> tuple[State, State]:
     """States of linear motors at the end of a block, and at the start of each of its strides, (strides, population).
 
     The inputs of all strides go through one matrix product, so that little sequential work is left.
@@ -215,9 +196,7 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
             after, mean = held_step_and_mean(motors, propagator, acting, state)
             read = _when_read(motors, propagator, acting, state)
             simulated = _outputs(motors, read, mean, over_last, block)
-            errors = tuple(
-                e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors)
-            )
+            errors = tuple(e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors))
             return (after, errors), None
 
         (_, errors), _ = jax.lax.scan(sample, (starts, carry.output), by_sample, unroll=STRIDE)
@@ -245,9 +224,7 @@ def _pick(grids: Float[Array, "grids ..."], grid: Int[Array, ""]) -> Float[Array
     return jnp.tensordot(jnp.where(jnp.arange(len(grids)) == grid, 1.0, 0.0), grids, 1)
 
 
-def _repeat_rows(
-    leaf: Float[Array, "... population"], rows: int
-) -> Float[Array, "... rows population"]:
+def _repeat_rows(leaf: Float[Array, "... population"], rows: int) -> Float[Array, "... rows population"]:
     return jnp.broadcast_to(leaf[..., None, :], (*leaf.shape[:-1], rows, leaf.shape[-1]))
 
 
@@ -264,13 +241,7 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
 
         def sample(
             carry: Gathered,
-            samples: tuple[
-                Float[Array, ""],
-                Float[Array, ""],
-                Float[Array, "2"],
-                Float[Array, "2"],
-                Int[Array, ""],
-            ],
+            samples: tuple[Float[Array, ""], Float[Array, ""], Float[Array, "2"], Float[Array, "2"], Int[Array, ""]],
         ) -> tuple[Gathered, None]:
             state, errors = carry
             value, load, measured, weight, k = samples
@@ -284,9 +255,7 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
             after, mean = held_step_and_mean(motors, propagator, acting, state, steps)
             read = _when_read(motors, propagator, acting, state, steps)
             simulated = _outputs(motors, read, mean, over_last, block)
-            errors = tuple(
-                e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors)
-            )
+            errors = tuple(e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors))
             return (after, errors), None
 
         run = tape.run[block]

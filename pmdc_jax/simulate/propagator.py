@@ -116,20 +116,13 @@ def make_propagator(
     )
 
 
-def _with_contact_response(
-    propagator: Propagator, contact: Float[Array, "powers n *#batch"]
-) -> Propagator:
+def _with_contact_response(propagator: Propagator, contact: Float[Array, "powers n *#batch"]) -> Propagator:
     assert propagator.weights is not None
     return propagator._replace(weights=propagator.weights._replace(contact=contact))
 
 
 def _by_linear_part(
-    motor: Motor,
-    step: StepLength,
-    A: Matrix,
-    B: Float[Array, "n 2 *#batch"],
-    linear_drive: bool,
-    averaged: bool,
+    motor: Motor, step: StepLength, A: Matrix, B: Float[Array, "n 2 *#batch"], linear_drive: bool, averaged: bool
 ) -> Propagator:
     """The propagator of a motor whose linear part is A and B.
 
@@ -167,11 +160,7 @@ def _etdrk4_weights(step: StepLength, phi: Sequence[Matrix]) -> tuple[Matrix, Ma
 
 
 def _mean(
-    step: StepLength,
-    phi: Sequence[Matrix],
-    B: Float[Array, "n 2 *#batch"],
-    ramps: bool,
-    staged: bool,
+    step: StepLength, phi: Sequence[Matrix], B: Float[Array, "n 2 *#batch"], ramps: bool, staged: bool
 ) -> MeanPropagator:
     """Matrices for the mean over a step; `phi` begins with phi_1 instead of phi_0."""
     rate_response = step * phi[1]
@@ -219,9 +208,7 @@ def grid_propagators(motor: Motor, tape: Tape) -> Propagator:
     return jax.vmap(of_grid)(*jax.tree.map(jnp.asarray, (tape.sample_time, tape.drive)))
 
 
-def pick_grid(
-    grids: Propagator, tape: Tape, grid: Int[Array | np.ndarray, "..."]
-) -> tuple[Propagator, Drive]:
+def pick_grid(grids: Propagator, tape: Tape, grid: Int[Array | np.ndarray, "..."]) -> tuple[Propagator, Drive]:
     """Propagator and drive of one grid, or of one grid for each block."""
     return jax.tree.map(lambda leaf: leaf[grid], (grids, tape.drive))
 

@@ -14,11 +14,7 @@ from .tape import BLOCK, Tape
 
 
 def at_instant(
-    motor: Motor,
-    instant: Instant,
-    acting: Input,
-    state: State,
-    steps: int | Int[Array, ""] = 1,
+    motor: Motor, instant: Instant, acting: Input, state: State, steps: int | Int[Array, ""] = 1
 ) -> tuple[State, State | None]:
     """The state at an instant within a sample, and its mean up to there, from the state at the start of the sample."""
     within = acting.part(instant.share / 2, instant.share)

@@ -59,9 +59,7 @@ UNKNOWNS_PER_RUN = len(RunUnknowns._fields)
 
 
 @compiled
-def free_run(
-    motor: Motor, tape: Tape, own: RunUnknowns | None = None
-) -> Float[Array, "blocks 2 samples"]:
+def free_run(motor: Motor, tape: Tape, own: RunUnknowns | None = None) -> Float[Array, "blocks 2 samples"]:
     """Current (A) and speed (rad/s) as the sensors report them, simulated freely.
 
     `own`, the unknowns of each run, is by default as recorded.
@@ -73,9 +71,7 @@ def free_run(
     guess = _guessed_starts(motor, own, tape, initial)
     constant = _constant(motor_on_grids, states)
     starts, joined, last, *_ = _join_blocks(motor_on_grids, constant, tape, own, initial, guess)
-    simulated = last.simulated + jnp.einsum(
-        "sncb,bn->scb", last.d_simulated[:, -states:], joined - starts
-    )
+    simulated = last.simulated + jnp.einsum("sncb,bn->scb", last.d_simulated[:, -states:], joined - starts)
     return reported(motor, tape, simulated.transpose(2, 1, 0))
 
 
@@ -110,9 +106,7 @@ def sensitivities(
         motor = assemble(parameters)
         return motor, grid_propagators(motor, tape)
 
-    motor_on_grids, d_motor_on_grids = value_and_derivatives(
-        prepare, (parameters,), (jnp.eye(count),)
-    )
+    motor_on_grids, d_motor_on_grids = value_and_derivatives(prepare, (parameters,), (jnp.eye(count),))
     motor = motor_on_grids[0]
     d_motor = jax.tree.map(lambda leaf: _pad_columns(leaf, all_columns), d_motor_on_grids[0])
     ones = jnp.eye(UNKNOWNS_PER_RUN, all_columns, count)[:, :, None]
@@ -132,12 +126,8 @@ def sensitivities(
         constant, passes = _constant(motor_on_grids, states), MAX_PASSES if motor.effects else 1
         guess = _join_blocks(motor_on_grids, constant, tape, own, initial, guess, passes).joined
     # otherwise every pass has all columns, because a pass with other columns is compiled anew
-    starts, _, passed, *_ = _join_blocks(
-        motor_on_grids, d_motor_on_grids, tape, own, initial, guess, MAX_PASSES
-    )
-    joined, d_starts = _newton_correction_with_derivatives(
-        passed, tape, starts, initial, d_initial, count
-    )
+    starts, _, passed, *_ = _join_blocks(motor_on_grids, d_motor_on_grids, tape, own, initial, guess, MAX_PASSES)
+    joined, d_starts = _newton_correction_with_derivatives(passed, tape, starts, initial, d_initial, count)
 
     by_start = passed.d_simulated[:, -states:]
     simulated = passed.simulated + jnp.einsum("sncb,bn->scb", by_start, joined - starts)
@@ -226,9 +216,7 @@ def _join_blocks(
     allowed = max_passes or (1 if exact else len(guess) + 1)
 
     def simulate(starts: Starts) -> Pass:
-        return simulate_blocks(
-            motor_on_grids, d_motor_on_grids, columns, tape, starts, own.load_offset
-        )
+        return simulate_blocks(motor_on_grids, d_motor_on_grids, columns, tape, starts, own.load_offset)
 
     def unjoined(joining: Joining) -> Bool[Array, ""]:
         return (joining.gap > MAX_RELATIVE_GAP) & (joining.passes < allowed)
@@ -249,17 +237,11 @@ def _join_blocks(
     if max_passes is None or exact:
         return end
     failed = end.gap > MAX_RELATIVE_GAP
-    return end._replace(
-        starts=jnp.where(failed, jnp.nan, end.starts), joined=jnp.where(failed, jnp.nan, end.joined)
-    )
+    return end._replace(starts=jnp.where(failed, jnp.nan, end.starts), joined=jnp.where(failed, jnp.nan, end.joined))
 
 
 def _newton_correction(
-    passed: Pass,
-    tape: Tape,
-    starts: Starts,
-    initial: Starts,
-    limits: tuple[Start, Start] | None = None,
+    passed: Pass, tape: Tape, starts: Starts, initial: Starts, limits: tuple[Start, Start] | None = None
 ) -> Starts:
     """Newton's correction: each block starts where the corrected one before it ends.
 
@@ -270,8 +252,7 @@ def _newton_correction(
     by_start = jnp.moveaxis(passed.d_end[-starts.shape[1] :], 0, -1)
 
     def follow(
-        end: Start,
-        block: tuple[Start, Bool[Array, ""], Start, Float[Array, "states states"], Start],
+        end: Start, block: tuple[Start, Bool[Array, ""], Start, Float[Array, "states states"], Start]
     ) -> tuple[Start, Start]:
         begin, first, passed_end, jacobian, start = block
         new = jnp.where(first, begin, end)
@@ -291,9 +272,7 @@ def _newton_correction(
 def _state_periods(motor: Motor) -> Float[Array, " states"]:
     """Period of each state: a shift by it changes nothing else. Zero without one."""
     known = {name: p for effect in motor.effects for name, p in effect.repeats_after().items()}
-    return jnp.stack(
-        [jnp.zeros(()), jnp.zeros(()), *(known.get(n, jnp.zeros(())) for n in motor.states)]
-    )
+    return jnp.stack([jnp.zeros(()), jnp.zeros(()), *(known.get(n, jnp.zeros(())) for n in motor.states)])
 
 
 # State at the start or end of a block, and its derivatives with respect to all columns

@@ -16,16 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
 from .exponential import Matrix
-from .propagator import (
-    MeanPropagator,
-    NonlinearStates,
-    Propagator,
-    Vector,
-    Weights,
-    linear_states,
-    state_of,
-    vector,
-)
+from .propagator import MeanPropagator, NonlinearStates, Propagator, Vector, Weights, linear_states, state_of, vector
 from .switches import computed_once, contact_correction, mean_correction, stick_or_reverse
 
 Time = float | Float[Array | np.ndarray, ""]  # of the solver: a count of steps
@@ -51,11 +42,7 @@ class Input(NamedTuple):
 
 
 def held_step(
-    motor: Motor,
-    propagator: Propagator,
-    acting: Input,
-    state: State,
-    steps: int | Int[Array, ""] = 1,
+    motor: Motor, propagator: Propagator, acting: Input, state: State, steps: int | Int[Array, ""] = 1
 ) -> State:
     """The state one sample later, in `steps` equal steps, for one of which `propagator` is made.
 
@@ -68,11 +55,7 @@ def held_step(
 
 
 def held_step_and_mean(
-    motor: Motor,
-    propagator: Propagator,
-    acting: Input,
-    state: State,
-    steps: int | Int[Array, ""] = 1,
+    motor: Motor, propagator: Propagator, acting: Input, state: State, steps: int | Int[Array, ""] = 1
 ) -> tuple[State, State | None]:
     """The state one sample later as by `held_step`, and its mean over this sample.
 
@@ -84,9 +67,7 @@ def held_step_and_mean(
     if isinstance(steps, int) and steps == 1:
         return _step(motor, propagator, acting, state)
 
-    def step(
-        k: int | Int[Array, ""], walked: tuple[State, State | None]
-    ) -> tuple[State, State | None]:
+    def step(k: int | Int[Array, ""], walked: tuple[State, State | None]) -> tuple[State, State | None]:
         now, total = walked
         after, mean = _step(motor, propagator, acting.part((k + 0.5) / steps, 1 / steps), now)
         return after, jax.tree.map(lambda so_far, more: so_far + more / steps, total, mean)
@@ -95,9 +76,7 @@ def held_step_and_mean(
     return jax.lax.fori_loop(0, steps, step, (state, nothing))
 
 
-def _linear_step(
-    motor: Motor, propagator: Propagator, acting: Input, state: State
-) -> tuple[State, State | None]:
+def _linear_step(motor: Motor, propagator: Propagator, acting: Input, state: State) -> tuple[State, State | None]:
     x, inputs = (state.current, state.speed), (acting.value, acting.load)
     change = None if acting.rise is None else _rate_change(motor, acting, state)
 
@@ -119,8 +98,7 @@ def _linear_step(
 def _rate_change(motor: Motor, acting: Input, state: State) -> Vector:
     """Change of the derivative from start to end of a step due to a drive that varies linearly."""
     low, high = (
-        vector(motor, motor.derivative(state, acting.at(end), acting.load, acting.drive))
-        for end in (0.0, 1.0)
+        vector(motor, motor.derivative(state, acting.at(end), acting.load, acting.drive)) for end in (0.0, 1.0)
     )
     return tuple(b - a for a, b in zip(low, high, strict=True))
 
@@ -130,9 +108,7 @@ def _required(matrix: Matrix | None) -> Matrix:
     return matrix
 
 
-def _step(
-    motor: Motor, propagator: Propagator, acting: Input, state: State
-) -> tuple[State, State | None]:
+def _step(motor: Motor, propagator: Propagator, acting: Input, state: State) -> tuple[State, State | None]:
     teeth = motor.toothed
     if teeth is not None:
         touching = teeth.teeth(state).touch
@@ -169,10 +145,7 @@ def _correct_dry_elements(
     end, nonlinear = vector(motor, after), _nonlinear_states(motor, after)
     now = motor.at(state)
     at_rest = state._replace(current=0.0 * state.current, speed=0.0 * state.speed)
-    for row, holds, unit in (
-        (1, "speed", 1 / now.J),
-        (0, "current", acting.drive.voltage / now.L),
-    ):
+    for row, holds, unit in ((1, "speed", 1 / now.J), (0, "current", acting.drive.voltage / now.L)):
         grip_at_rest = motor.grip(holds, at_rest)
         grip_at_end = motor.grip(holds, state_of(motor, end, nonlinear))
         if grip_at_rest is not None and grip_at_end is not None:
@@ -193,9 +166,7 @@ def _correct_dry_elements(
 Unswitched = tuple[State, State, State | None]
 
 
-def _affine_step(
-    motor: Motor, propagator: Propagator, weights: Weights, acting: Input, state: State
-) -> Unswitched:
+def _affine_step(motor: Motor, propagator: Propagator, weights: Weights, acting: Input, state: State) -> Unswitched:
     """A step of a motor that its effects leave linear."""
     x, nonlinear = vector(motor, state), _nonlinear_states(motor, state)
     rates = _rates(motor, acting, state, x, nonlinear, 0.5)
@@ -214,9 +185,7 @@ def _affine_step(
     return state_of(motor, x_rate, other_rates), after, mean
 
 
-def _etdrk4_step(
-    motor: Motor, propagator: Propagator, weights: Weights, acting: Input, state: State
-) -> Unswitched:
+def _etdrk4_step(motor: Motor, propagator: Propagator, weights: Weights, acting: Input, state: State) -> Unswitched:
     """A step by the four stages of ETDRK4."""
     assert weights.stages is not None
     half, half_input, half_minus_one, first, middle, last = weights.stages
@@ -251,12 +220,7 @@ def _etdrk4_step(
 
 
 def _rates(
-    motor: Motor,
-    acting: Input,
-    start: State,
-    x: Vector,
-    nonlinear: NonlinearStates,
-    when: float,
+    motor: Motor, acting: Input, start: State, x: Vector, nonlinear: NonlinearStates, when: float
 ) -> tuple[Vector, NonlinearStates]:
     """Derivatives at a share `when` of a step, with dry elements acting in the direction of motion at its start."""
     now = state_of(motor, x, nonlinear)
@@ -271,9 +235,7 @@ def _nonlinear_states(motor: Motor, state: State) -> NonlinearStates:
     return {name: x for name, x in state.extra.items() if name not in linear}
 
 
-def _shifted(
-    nonlinear: NonlinearStates, weight: Scalars, rates: NonlinearStates
-) -> NonlinearStates:
+def _shifted(nonlinear: NonlinearStates, weight: Scalars, rates: NonlinearStates) -> NonlinearStates:
     return {name: nonlinear[name] + weight * rates[name] for name in nonlinear}
 
 

@@ -101,10 +101,7 @@ def contact_correction(
         power = power * remaining
     sizes = computed_once(sizes, jnp.all(step > 0))
     by_state = jnp.moveaxis(contact, 1, 0)
-    return tuple(
-        reduce(add, (size * term for size, term in zip(sizes, terms, strict=True)))
-        for terms in by_state
-    )
+    return tuple(reduce(add, (size * term for size, term in zip(sizes, terms, strict=True))) for terms in by_state)
 
 
 def stick_or_reverse(
@@ -141,9 +138,7 @@ def stick_or_reverse(
     needed = opposing + after[row] / (response[row] * rest_response)
     exerted = jnp.where(needed > at_rest.forward, forward, needed)
     exerted = jnp.where(needed < -at_rest.backward, -backward, exerted)
-    exerted = jnp.where(
-        direction == 0, needed - _breakaway_excess(at_rest, start_force, needed), exerted
-    )
+    exerted = jnp.where(direction == 0, needed - _breakaway_excess(at_rest, start_force, needed), exerted)
     change = jnp.where(crosses, (opposing - exerted) * rest_response, 0.0)
     sticks = crosses & (exerted == needed)
     # the other states respond only through this one, so with the square of the remaining time

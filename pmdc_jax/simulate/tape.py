@@ -87,9 +87,7 @@ class Tape(eqx.Module):
         from one sample to the next, and when the outputs are read; its `lead` in whole samples is not applied.
         """
         runs = [_Run(recording, timing) for recording in recordings]
-        rises = timing.first_order_hold or any(
-            recording.resampled_from is not None for recording in recordings
-        )
+        rises = timing.first_order_hold or any(recording.resampled_from is not None for recording in recordings)
         averaged = any(r.averaging is not None or r.current_averaged for r in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
         sample_times, drives, free = (np.array(each) for each in zip(*grids, strict=True))
@@ -103,14 +101,11 @@ class Tape(eqx.Module):
             **_laid_in_blocks(runs, grids, empty_runs, rises, follow),
             sample_time=sample_times,
             drive=Drive(
-                *(np.where(drives == kind, 1.0, 0.0) for kind in Drive._fields[:3]),
-                free=np.where(free, 1.0, 0.0),
+                *(np.where(drives == kind, 1.0, 0.0) for kind in Drive._fields[:3]), free=np.where(free, 1.0, 0.0)
             ),
             initial=of_runs(run.initial for run in runs),
             averaging=of_runs(map(_averaging_shares, recordings)) if averaged else None,
-            load_unknown=of_runs(
-                r.load is None and not unloaded and not r.held for r in recordings
-            ),
+            load_unknown=of_runs(r.load is None and not unloaded and not r.held for r in recordings),
             angle=of_runs(_first(r.angle) for r in recordings),
             angle_known=of_runs(r.angle is not None for r in recordings),
             reading=None if timing.reading is None else np.asarray(timing.reading),
@@ -136,10 +131,7 @@ class Tape(eqx.Module):
         cuts = begins[np.argmin(np.abs(begins[:, None] - even), axis=0)]
         ends = np.unique([0, *cuts, blocks])
         longest = _round_up(int(np.diff(ends).max()))
-        return [
-            (self._of_blocks(np.arange(first, end), longest), int(end - first))
-            for first, end in pairwise(ends)
-        ]
+        return [(self._of_blocks(np.arange(first, end), longest), int(end - first)) for first, end in pairwise(ends)]
 
     def _of_blocks(self, blocks: Int[np.ndarray, " _"], size: int) -> Tape:
         """The tape of some blocks, padded to `size` by the last one, with weight 0."""
@@ -147,13 +139,9 @@ class Tape(eqx.Module):
         is_padding = np.arange(size) >= len(blocks)
         names = ("value", "load", "measured", "weight", "run", "begins", "grid", "turn", "rise")
         signals = {name: getattr(self, name) for name in names}
-        taken = replace(
-            self, **{n: None if s is None else np.asarray(s)[padded] for n, s in signals.items()}
-        )
+        taken = replace(self, **{n: None if s is None else np.asarray(s)[padded] for n, s in signals.items()})
         return replace(
-            taken,
-            weight=np.where(is_padding[:, None, None], 0.0, taken.weight),
-            begins=taken.begins | is_padding,
+            taken, weight=np.where(is_padding[:, None, None], 0.0, taken.weight), begins=taken.begins | is_padding
         )
 
     def drive_at(self, share: float) -> Samples:
@@ -210,9 +198,7 @@ class _Run:
         value = getattr(recording, drive)
         linear = timing.first_order_hold or varies_linearly(recording)
         if recording.resampled_from is not None:
-            self.value, self.rise = mean_and_rise(
-                recording, pieces_of(recording, timing.first_order_hold)
-            )
+            self.value, self.rise = mean_and_rise(recording, pieces_of(recording, timing.first_order_hold))
         elif timing.smooth is not None:
             decay = timing.smooth * recording.sample_time
             self.value, self.rise = smooth_mean_and_rise(value, decay)

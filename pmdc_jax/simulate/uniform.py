@@ -57,11 +57,7 @@ def _resampling_clock(time: np.ndarray) -> np.ndarray:
     mean = np.mean(steps[steps <= GAP * typical])
     candidates = [float(x) for x in (f"{mean:.2g}", f"{mean:.3g}", f"{typical:.3g}")]
     distinct = [len(np.unique(np.rint(elapsed / step))) for step in candidates]
-    step = next(
-        x
-        for x, ticks in zip(candidates, distinct, strict=True)
-        if ticks >= MIN_TICK_SHARE * max(distinct)
-    )
+    step = next(x for x, ticks in zip(candidates, distinct, strict=True) if ticks >= MIN_TICK_SHARE * max(distinct))
     return time[0] + step * np.arange(np.ceil(elapsed[-1] / step - 1e-9) + 1)
 
 

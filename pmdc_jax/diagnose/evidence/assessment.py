@@ -40,9 +40,7 @@ NEGLIGIBLE = 2e-3
 NEGLIGIBLE_REFIT_ONLY = 1e-2
 
 
-def familywise_p_value(
-    candidate_signals: Sequence[Signal], curve_signals: Sequence[Signal], count: int
-) -> float:
+def familywise_p_value(candidate_signals: Sequence[Signal], curve_signals: Sequence[Signal], count: int) -> float:
     """P-value of the strongest evidence if nothing were missing, Bonferroni-corrected for `count` blocks."""
     smallest = min(s.log_p for s in (*candidate_signals, *curve_signals))
     return float(min(1.0, np.exp(smallest + np.log(count))))
@@ -121,10 +119,7 @@ class Assessment(NamedTuple):
         """The candidates' signals with their gains on the unfiltered residuals."""
         unfiltered = self.screen.unfiltered
         before = unfiltered.regress().squares
-        return [
-            s._replace(gain=before - unfiltered.regress([s.block]).squares)
-            for s in self.candidate_signals
-        ]
+        return [s._replace(gain=before - unfiltered.regress([s.block]).squares) for s in self.candidate_signals]
 
     def _unexplained_unfiltered(self, model: Model) -> float:
         """`unexplained` for the unfiltered misfit: what the clearest signal would explain, over what the model does."""
@@ -164,20 +159,13 @@ class Assessment(NamedTuple):
         Never beside a refit-only form: what gear teeth leave, which meet at unpredictable times, can look like any
         effect.
         """
-        if (
-            _has_refit_only(model)
-            or self.p_value >= FALSE_ALARM
-            or self.best_candidate_share < EFFECT_SHARE
-        ):
+        if _has_refit_only(model) or self.p_value >= FALSE_ALARM or self.best_candidate_share < EFFECT_SHARE:
             return False
         best_curve = max(self.curve_signals, key=_gain)
         best = max(self.candidate_signals, key=_gain).candidate
         assert isinstance(best_curve.term, Curve) and best is not None
         # of model-form error a curve over the effect's own variable explains nearly all
-        own_curve = (
-            has_axes_of(model, best_curve.term)
-            and best_curve.gain > CURVE_SHARE * self.clearest.gain
-        )
+        own_curve = has_axes_of(model, best_curve.term) and best_curve.gain > CURVE_SHARE * self.clearest.gain
         return not (own_curve or has_axes_of(model, EFFECTS[best.effect]))
 
 

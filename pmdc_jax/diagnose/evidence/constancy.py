@@ -134,9 +134,7 @@ def _fit(model: Model, variation: _Variation) -> FitByRun | None:
         of_tape = model.training[run]
         coordinates[of_tape, place] = own
         fitted, squares = _squares(model, coordinates[of_tape])
-        runs = jax.tree.map(
-            lambda all_runs, new, k=of_tape: all_runs.at[k].set(new[k]), runs, fitted
-        )
+        runs = jax.tree.map(lambda all_runs, new, k=of_tape: all_runs.at[k].set(new[k]), runs, fitted)
         difference += squares[of_tape] - before[of_tape]
     if difference >= 0:
         return None

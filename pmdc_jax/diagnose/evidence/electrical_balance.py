@@ -153,9 +153,7 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
         return None
     measured = series_of(tape, run, np.asarray(tape.measured)).values
     simulated = measured - residuals
-    current_noise, speed_noise = (
-        _sensor_noise(measured[known, c], residuals[known, c]) for c in range(2)
-    )
+    current_noise, speed_noise = (_sensor_noise(measured[known, c], residuals[known, c]) for c in range(2))
     brushes = any(effect.holds == "current" for effect in model.motor.effects)
     if brushes:
         threshold = MIN_FLOW * current_noise
@@ -199,17 +197,13 @@ def _voltage_between_readings(model: Model, run: int, length: int) -> Float[np.n
     """The voltage at the start and at the end of each step between the samples of a run, of this number, V."""
     prepared, tape = model.prepared, model.prepared.problem.tape
     ends = np.stack([tape.samples_of(run, tape.drive_at(end), length) for end in (0.0, 1.0)], 1)
-    if (
-        share := prepared.timing.reading
-    ) is not None:  # from one reading to the next two voltages act
+    if (share := prepared.timing.reading) is not None:  # from one reading to the next two voltages act
         ends[:-1] = (1 - share) * ends[:-1] + share * ends[1:]
     return ends[:-1]
 
 
 def _flows(
-    measured: Float[np.ndarray, " samples"],
-    simulated: Float[np.ndarray, " samples"],
-    threshold: float,
+    measured: Float[np.ndarray, " samples"], simulated: Float[np.ndarray, " samples"], threshold: float
 ) -> Bool[np.ndarray, " samples"]:
     """Where measured and simulated current both clearly flow, in one direction.
 
@@ -218,9 +212,7 @@ def _flows(
     return (np.abs(simulated) > threshold) & (measured * np.sign(simulated) > threshold)
 
 
-def _sensor_noise(
-    measured: Float[np.ndarray, " samples"], residuals: Float[np.ndarray, " samples"]
-) -> float:
+def _sensor_noise(measured: Float[np.ndarray, " samples"], residuals: Float[np.ndarray, " samples"]) -> float:
     """Standard deviation of a sensor's white noise: the smaller of two estimates, from the measured signal and from its
     residuals, which show it better the rougher the motion is; the latter is at least that of the sensor's resolution.
     """

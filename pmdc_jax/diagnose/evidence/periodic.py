@@ -68,9 +68,7 @@ def line_of(model: Model) -> Line | None:
 
 
 def spectrum(
-    residuals: Float[np.ndarray, "samples outputs"],
-    driving: Float[np.ndarray, "samples inputs"],
-    step: float,
+    residuals: Float[np.ndarray, "samples outputs"], driving: Float[np.ndarray, "samples inputs"], step: float
 ) -> Spectrum:
     """The spectra of one run, sampled every `step` seconds; that of the residuals is zero if a drive is periodic."""
     residual = _power_over_level(residuals)
@@ -115,9 +113,7 @@ def _near(frequency: float, run: Spectrum, width: float = 0.0) -> slice:
     return slice(max(int(low) - 1, 0), int(high) + 3)
 
 
-def _power_over_level(
-    signals: Float[np.ndarray, "samples signals"],
-) -> Float[np.ndarray, " frequencies"]:
+def _power_over_level(signals: Float[np.ndarray, "samples signals"]) -> Float[np.ndarray, " frequencies"]:
     """Power at every frequency over the level of its neighbours, the largest of all signals."""
     centred = signals - signals.mean(0)
     power = np.abs(np.fft.rfft(centred, axis=0)) ** 2
@@ -139,10 +135,7 @@ def _slow_power_over_level(
     power = np.abs(np.fft.rfft(centred * taper, axis=0)[: SLOW_BINS + FARTHEST]) ** 2
     ratios = []
     for k in range(NEAREST + 1, SLOW_BINS):
-        below, above = (
-            range(max(k - FARTHEST, 1), k - NEAREST + 1),
-            range(k + NEAREST, k + FARTHEST + 1),
-        )
+        below, above = (range(max(k - FARTHEST, 1), k - NEAREST + 1), range(k + NEAREST, k + FARTHEST + 1))
         level = np.median(power[[*below, *above]], axis=0) / np.log(2)
         ratios.append(np.max(power[k] / np.maximum(level, floor)))
     return np.array(ratios)

@@ -70,9 +70,7 @@ class Evidence(NamedTuple):
         """The first column of what may be missing."""
         return self.parameters + self.late_readings
 
-    def regress(
-        self, blocks: Sequence[Block] = (), min_eigenvalue: float = MIN_EIGENVALUE
-    ) -> Regression:
+    def regress(self, blocks: Sequence[Block] = (), min_eigenvalue: float = MIN_EIGENVALUE) -> Regression:
         """Least squares of the residual on the motor's parameters, the late readings and some blocks.
 
         Directions whose eigenvalue, with columns scaled to unit length, is below `min_eigenvalue` are not moved.
@@ -95,15 +93,10 @@ class Evidence(NamedTuple):
         changes = solution.shared[: self.parameters, 0]
         return Regression(float(solution.squares[0]), changes, coefficients, errors)
 
-    def _solve(
-        self, blocks: Sequence[Block], targets: Sequence[int], min_eigenvalue: float
-    ) -> _Solution:
+    def _solve(self, blocks: Sequence[Block], targets: Sequence[int], min_eigenvalue: float) -> _Solution:
         """Least squares of the `targets`, which are columns, on what `regress` has."""
         per_run = np.array([c for b in blocks if b.per_run for c in b.columns], int)
-        shared = [
-            *range(self.first_column),
-            *(c for b in blocks if not b.per_run for c in b.columns),
-        ]
+        shared = [*range(self.first_column), *(c for b in blocks if not b.per_run for c in b.columns)]
         kept, n = np.array([*shared, *targets]), len(shared)
         total = self.products[:, kept[:, None], kept].sum(0)
         cross = self.products[:, per_run[:, None], kept]
@@ -123,10 +116,7 @@ class Evidence(NamedTuple):
         """The mean gain per degree of freedom of a block on the rounding errors of coarse converters; at least one."""
         if not self.rounding_columns:
             return 1.0
-        before, after = (
-            self._solve(blocks, self.rounding_columns, MIN_EIGENVALUE).squares
-            for blocks in ([], [block])
-        )
+        before, after = (self._solve(blocks, self.rounding_columns, MIN_EIGENVALUE).squares for blocks in ([], [block]))
         return float(max(np.mean(before - after) / self.degrees_of_freedom(block), 1.0))
 
     def degrees_of_freedom(self, block: Block) -> int:

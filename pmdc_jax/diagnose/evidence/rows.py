@@ -43,14 +43,7 @@ class Rows(NamedTuple):
     def white(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
         """Whitened rows, `CHUNK` samples at a time; columns in the order that `gather_evidence` expects."""
         shared, own, residual, _ = self.fit
-        columns = (
-            shared.values,
-            self.late,
-            self.columns,
-            self.rounding,
-            residual.values[..., None],
-            own.values,
-        )
+        columns = (shared.values, self.late, self.columns, self.rounding, residual.values[..., None], own.values)
         back = len(whiten.filters[run])
         for first in range(back, len(residual.values), CHUNK):
             part = slice(first - back, first + CHUNK)
@@ -58,18 +51,13 @@ class Rows(NamedTuple):
             yield whiten(run, Series(values, residual.known[part], residual.kind))
 
 
-def gather_rows(
-    model: Model, bare: Motor, path: Path, changes: Iterable[Change], count: int
-) -> list[Rows]:
+def gather_rows(model: Model, bare: Motor, path: Path, changes: Iterable[Change], count: int) -> list[Rows]:
     """The rows of every training run, from `changes` with `count` columns in all, which the motor without effects,
     `bare`, propagates."""
     tape, fits = model.prepared.problem.tape, series_of_runs(model)
     rows_of_runs = [
         Rows(
-            fit,
-            _late_readings(fit),
-            np.empty((*fit.residual.values.shape, count), np.float32),
-            rounding_errors(fit, k),
+            fit, _late_readings(fit), np.empty((*fit.residual.values.shape, count), np.float32), rounding_errors(fit, k)
         )
         for k, fit in enumerate(fits)
     ]
@@ -103,10 +91,7 @@ def _output_change(
 
 @compiled
 def _response(
-    bare: Motor,
-    tape: Tape,
-    path: Path,
-    kicks: Float32[Array | np.ndarray, "samples 2 blocks columns"],
+    bare: Motor, tape: Tape, path: Path, kicks: Float32[Array | np.ndarray, "samples 2 blocks columns"]
 ) -> Float32[Array, "blocks 2 samples columns"]:
     """The response to kicks of the motor without effects."""
     response = respond(bare, tape, path, kicks.astype(jnp.result_type(float)))

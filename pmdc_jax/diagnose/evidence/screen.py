@@ -75,8 +75,7 @@ def _without_clearest(plain: Screen, rows: Sequence[Rows]) -> list[Series]:
     """The residuals of each run less the most significant candidate or shared curve, and all that is fitted with it."""
     candidate_signals, curve_signals = signals(plain)
     clearest = min(
-        (s for s in (*candidate_signals, *curve_signals) if s.candidate or _is_definite(s)),
-        key=lambda s: s.log_p,
+        (s for s in (*candidate_signals, *curve_signals) if s.candidate or _is_definite(s)), key=lambda s: s.log_p
     ).block
     best = plain.evidence.regress([clearest])
     columns = np.array(clearest.columns) - plain.evidence.first_column

@@ -93,9 +93,7 @@ def signals(screen: Screen) -> tuple[list[Signal], list[Signal]]:
     """The signals of all possible candidates, and those of all curves; each list the most significant first."""
     pairs = zip(screen.curves, screen.curve_blocks, strict=True)
     gains = np.array([_gain_of_curve(screen, curve, block) for curve, block in pairs])
-    ripple_gains = {
-        c.periods: gain for c, gain in zip(screen.curves, gains, strict=True) if c.is_sensor_ripple
-    }
+    ripple_gains = {c.periods: gain for c, gain in zip(screen.curves, gains, strict=True) if c.is_sensor_ripple}
     return (
         sorted(_candidate_signals(screen, ripple_gains), key=_log_p),
         sorted(_curve_signals(screen, gains), key=_log_p),
@@ -120,13 +118,9 @@ def _curve_signals(screen: Screen, gains: np.ndarray) -> list[Signal]:
     """The signals of all curves, their gains corrected for what noise and imperfect sensors explain."""
     gains, drift = gains.copy(), screen.torque_drift
     for equation in ("mechanical", "sensor"):
-        waves = [
-            k for k, c in enumerate(screen.curves) if c.is_angle_wave and c.equation == equation
-        ]
+        waves = [k for k, c in enumerate(screen.curves) if c.is_angle_wave and c.equation == equation]
         if waves:
-            gains[waves] /= _dispersion_of_waves(
-                screen, gains[waves], screen.curve_blocks[waves[0]]
-            )
+            gains[waves] /= _dispersion_of_waves(screen, gains[waves], screen.curve_blocks[waves[0]])
     for k, (curve, block) in enumerate(zip(screen.curves, screen.curve_blocks, strict=True)):
         if drift is not None and curve.reverses:
             # a slowly fluctuating torque is noise; a changing friction, which reverses with the motion, is not
@@ -139,9 +133,7 @@ def _curve_signals(screen: Screen, gains: np.ndarray) -> list[Signal]:
     return [_signal(screen, curve, block, gain) for curve, block, gain in triples]
 
 
-def _signal(
-    screen: Screen, term: Candidate | Curve, block: Block, gain: float, common: float = 0.0
-) -> Signal:
+def _signal(screen: Screen, term: Candidate | Curve, block: Block, gain: float, common: float = 0.0) -> Signal:
     """The signal of one block, its p-value corrected for rounding, slow noise and the gain that is `common`."""
     dispersion = dispersion_by_noise(screen, block, _is_slow_torque(term), _is_voltage(term))
     degrees_of_freedom = screen.evidence.degrees_of_freedom(block)
@@ -194,16 +186,11 @@ def _is_slow_torque(term: Candidate | Curve) -> bool:
     return term.equation == "mechanical" and term.variable in ("speed", "current")
 
 
-def dispersion_by_noise(
-    screen: Screen, block: Block, slow_torque: bool = True, voltage: bool = True
-) -> float:
+def dispersion_by_noise(screen: Screen, block: Block, slow_torque: bool = True, voltage: bool = True) -> float:
     """Overdispersion of a block by rounding and, if they may look like it, by slow torque noise and by noise of the
     recorded voltage."""
     dispersion = screen.evidence.rounding_dispersion(block)
-    for noise, is_same_kind in (
-        (screen.torque_drift, slow_torque),
-        (screen.voltage_noise, voltage),
-    ):
+    for noise, is_same_kind in ((screen.torque_drift, slow_torque), (screen.voltage_noise, voltage)):
         if noise is not None and is_same_kind:
             dispersion = max(dispersion, _dispersion_beside(screen, block, noise))
     return dispersion
@@ -230,9 +217,7 @@ def _dispersion_of_waves(screen: Screen, gains: np.ndarray, wave: Block) -> floa
     return SLOW_WAVE_FACTOR * max(level, 1.0)
 
 
-def gain_common_to_waves(
-    evidence: Evidence, gained: Sequence[tuple[Candidate, Block, float]]
-) -> dict[str, float]:
+def gain_common_to_waves(evidence: Evidence, gained: Sequence[tuple[Candidate, Block, float]]) -> dict[str, float]:
     """By periodic effect, the median gain beyond chance over all periods: it is no evidence for any one of them."""
     by_period: dict[str, list[float]] = {}
     for candidate, block, gain in gained:

@@ -89,10 +89,7 @@ LOAD_SHARE = 0.5
 
 
 def amplitude_candidates(
-    field: str,
-    size: Callable[[Scales], float],
-    signed: bool = False,
-    **grids: Callable[[Scales], Iterable[float]],
+    field: str, size: Callable[[Scales], float], signed: bool = False, **grids: Callable[[Scales], Iterable[float]]
 ) -> MakeCandidates:
     """An effect with one amplitude, tried at `SMALL` of its `size`; `grids` of its other fields."""
 
@@ -160,21 +157,13 @@ def asymmetric_candidates(name: str, scales: Scales) -> list[Candidate]:
     def build(c: np.ndarray, coulomb_torque: float) -> Values | None:
         if min(c) + coulomb_torque <= 0:
             return None
-        return {
-            "forward_Nm": float(c[0]) + coulomb_torque,
-            "backward_Nm": float(c[1]) + coulomb_torque,
-        }
+        return {"forward_Nm": float(c[0]) + coulomb_torque, "backward_Nm": float(c[1]) + coulomb_torque}
 
-    columns = (
-        {"forward_Nm": small, "backward_Nm": TINY},
-        {"forward_Nm": TINY, "backward_Nm": small},
-    )
+    columns = ({"forward_Nm": small, "backward_Nm": TINY}, {"forward_Nm": TINY, "backward_Nm": small})
     return [Candidate(name, columns, (small, small), build, "backward_Nm")]
 
 
-def periodic_candidates(
-    field: str, size: Callable[[Scales], float], *others: Values
-) -> MakeCandidates:
+def periodic_candidates(field: str, size: Callable[[Scales], float], *others: Values) -> MakeCandidates:
     """Cosine and sine of the rotor angle, with its own phase in every run; `others`, alternatives for other fields."""
 
     def make(name: str, scales: Scales) -> list[Candidate]:
@@ -198,17 +187,11 @@ def periodic_candidates(
     return make
 
 
-def shaft_values(
-    hertz: float, scales: Scales, share: float = LOAD_SHARE, damping: float = 0.05
-) -> Values:
+def shaft_values(hertz: float, scales: Scales, share: float = LOAD_SHARE, damping: float = 0.05) -> Values:
     """A shaft between two inertias that resonates at `hertz`; `share`, the load's of the inertia; `damping`, ratio."""
     rate = 2 * np.pi * hertz
     stiffness = rate**2 * scales.inertia * share * (1 - share)
-    return {
-        "stiffness_Nm_rad": stiffness,
-        "damping_Nms_rad": 2 * damping * stiffness / rate,
-        "load_share": share,
-    }
+    return {"stiffness_Nm_rad": stiffness, "damping_Nms_rad": 2 * damping * stiffness / rate, "load_share": share}
 
 
 def compliance_candidates(name: str, scales: Scales) -> list[Candidate]:
@@ -217,11 +200,7 @@ def compliance_candidates(name: str, scales: Scales) -> list[Candidate]:
     def candidate(hertz: float) -> Candidate:
         values = shaft_values(hertz, scales)
         return Candidate(
-            name,
-            (values,),
-            (1.0,),
-            lambda c, coulomb_torque: values if c[0] > 0 else None,
-            full_simulation=True,
+            name, (values,), (1.0,), lambda c, coulomb_torque: values if c[0] > 0 else None, full_simulation=True
         )
 
     return [candidate(hertz) for hertz in RESONANCES if hertz * scales.sample_time < 0.5]

@@ -47,8 +47,4 @@ def _is_part_of_other(a: set[str], b: set[str]) -> bool:
 
 def _simplified(effects: set[str]) -> set[str]:
     """The set with each richer effect replaced by what it contains, without a constant load."""
-    return {
-        simple
-        for e in effects
-        for simple in (CONTAINS[e] - {"constant_load"} if e in CONTAINS else {e})
-    }
+    return {simple for e in effects for simple in (CONTAINS[e] - {"constant_load"} if e in CONTAINS else {e})}

@@ -24,10 +24,7 @@ from .candidates import Candidate, Scales
 from .trials import all_candidates
 
 # The variables over which each equation may have an unknown curve
-CURVE_VARIABLES = {
-    "mechanical": ("speed", "current", "time"),
-    "electrical": ("current", "speed", "voltage", "time"),
-}
+CURVE_VARIABLES = {"mechanical": ("speed", "current", "time"), "electrical": ("current", "speed", "voltage", "time")}
 CURVE_UNITS = {"mechanical": "N m", "electrical": "V"}
 # Knots of a curve over speed, current or voltage
 KNOTS = 9
@@ -118,16 +115,12 @@ class Library:
         self.bare = jax.tree.map(jnp.asarray, base.motor)
         self.scales = _scales(base)
         tape = base.prepared.problem.tape
-        self.measures_current = bool(
-            np.any(np.asarray(tape.weight)[base.prepared.problem.fitted_blocks, 0])
-        )
+        self.measures_current = bool(np.any(np.asarray(tape.weight)[base.prepared.problem.fitted_blocks, 0]))
         has_current = self.measures_current or bool(np.any(np.asarray(tape.drive.current) > 0))
         observable = {e for e, effect in EFFECTS.items() if has_current or not effect.needs_current}
         self.candidates = [c for c in all_candidates(self.scales) if c.effect in observable]
         # the errors of a coarse encoder last long enough to look like a voltage that changes over time
-        self.has_coarse_speed = any(
-            is_coarse(speed) for speed in _measured_speeds(base.prepared.training)
-        )
+        self.has_coarse_speed = any(is_coarse(speed) for speed in _measured_speeds(base.prepared.training))
         # so may what remains of the noise that was taken out of the recorded voltage
         self.has_input_noise = bool(base.prepared.input_noise)
         # by unit: the amplitude that imperfect sensors alone may produce
@@ -151,9 +144,7 @@ class Library:
                 parts = -(-len(settings) // columns_at_once(tape))
                 for part in np.array_split(np.arange(len(settings)), parts):
                     values = {f: np.array([settings[k][f] for k in part]) for f in settings[0]}
-                    yield partial(
-                        _small_change, EFFECTS[name], values, units[part], self.bare, tape, path
-                    )
+                    yield partial(_small_change, EFFECTS[name], values, units[part], self.bare, tape, path)
 
     def _simulated_change(self, shapes: Sequence[Candidate]) -> Change:
         """What an effect at finite size changes in the records, by full simulations."""

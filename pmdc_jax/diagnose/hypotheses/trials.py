@@ -6,14 +6,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from ...effects import (
-    EFFECTS,
-    CoulombFriction,
-    ShaftCompliance,
-    SpeedSensorDelay,
-    SpeedSensorLag,
-    StribeckFriction,
-)
+from ...effects import EFFECTS, CoulombFriction, ShaftCompliance, SpeedSensorDelay, SpeedSensorLag, StribeckFriction
 from .candidates import (
     Candidate,
     MakeCandidates,
@@ -34,12 +27,7 @@ from .candidates import (
 
 # Factors, up and down from the start of backlash, within which populations search. Almost nothing is known of the
 # stiffness: how fast teeth come to rest depends on their damping.
-BACKLASH_FACTORS = {
-    "gap_rad": 40.0,
-    "stiffness_Nm_rad": 30.0,
-    "damping_Nms_rad": 10.0,
-    "load_share": 2.0,
-}
+BACKLASH_FACTORS = {"gap_rad": 40.0, "stiffness_Nm_rad": 30.0, "damping_Nms_rad": 10.0, "load_share": 2.0}
 # A clear Stribeck peak: static over Coulomb friction, and the Stribeck speed as a share of `Scales.speed`
 STATIC_TO_COULOMB, STRIBECK_SPEED = 2.0, 0.05
 # Clear backlash: the gap as a share of the twist of the shaft under `Scales.torque`
@@ -74,9 +62,7 @@ class Trial(NamedTuple):
 
 
 def _shaft_starts(scales: Scales) -> list[Values]:
-    return [
-        shaft_values(f, scales, share, 0.1) for f in (200.0, 100.0, 50.0) for share in (0.6, 0.3)
-    ]
+    return [shaft_values(f, scales, share, 0.1) for f in (200.0, 100.0, 50.0) for share in (0.6, 0.3)]
 
 
 def _backlash_starts(scales: Scales) -> list[Values]:
@@ -115,35 +101,22 @@ TRIALS: Mapping[str, Trial] = {
     "coulomb_friction": Trial(
         amplitude_candidates("torque_Nm", lambda s: s.torque),
         fuller=Fuller(
-            "stribeck_friction",
-            _stribeck_from_coulomb,
-            ("static_Nm", "speed_rad_s"),
-            _coulomb_from_stribeck,
+            "stribeck_friction", _stribeck_from_coulomb, ("static_Nm", "speed_rad_s"), _coulomb_from_stribeck
         ),
     ),
     "stribeck_friction": Trial(stribeck_candidates, contains=frozenset({"coulomb_friction"})),
-    "asymmetric_friction": Trial(
-        asymmetric_candidates, contains=frozenset({"coulomb_friction", "constant_load"})
-    ),
-    "quadratic_drag": Trial(
-        amplitude_candidates("drag_Nms2_rad2", lambda s: s.torque / s.speed**2)
-    ),
+    "asymmetric_friction": Trial(asymmetric_candidates, contains=frozenset({"coulomb_friction", "constant_load"})),
+    "quadratic_drag": Trial(amplitude_candidates("drag_Nms2_rad2", lambda s: s.torque / s.speed**2)),
     "cogging_torque": Trial(periodic_candidates("amplitude_Nm", lambda s: s.torque)),
-    "torque_ripple": Trial(
-        periodic_candidates("amplitude", lambda s: 1.0, {"emf_share": 0.0}, {"emf_share": 1.0})
-    ),
+    "torque_ripple": Trial(periodic_candidates("amplitude", lambda s: 1.0, {"emf_share": 0.0}, {"emf_share": 1.0})),
     "constant_load": Trial(amplitude_candidates("torque_Nm", lambda s: s.torque, signed=True)),
     "shaft_compliance": Trial(
-        compliance_candidates,
-        starts=_shaft_starts,
-        fuller=Fuller("gear_backlash", _backlash_from_shaft, ("gap_rad",)),
+        compliance_candidates, starts=_shaft_starts, fuller=Fuller("gear_backlash", _backlash_from_shaft, ("gap_rad",))
     ),
     "gear_backlash": Trial(no_candidates, starts=_backlash_starts, factors=BACKLASH_FACTORS),
     "brush_voltage_drop": Trial(amplitude_candidates("voltage_V", lambda s: s.voltage)),
     "resistance_heating": Trial(
-        amplitude_candidates(
-            "rise_per_W", lambda s: 1 / (s.voltage * s.current), time_constant_s=thermal_times
-        )
+        amplitude_candidates("rise_per_W", lambda s: 1 / (s.voltage * s.current), time_constant_s=thermal_times)
     ),
     "torque_constant_saturation": Trial(
         amplitude_candidates("per_A2", lambda s: 1 / s.current**2, emf_share=lambda s: (0.0, 1.0))
@@ -158,15 +131,12 @@ TRIALS: Mapping[str, Trial] = {
         )
     ),
     "speed_sensor_lag": Trial(
-        finite_candidates("time_constant_s", sensor_times),
-        alike={"speed_sensor_delay": _delay_from_lag},
+        finite_candidates("time_constant_s", sensor_times), alike={"speed_sensor_delay": _delay_from_lag}
     ),
     "speed_sensor_delay": Trial(
         finite_candidates("delay_s", sensor_times), alike={"speed_sensor_lag": _lag_from_delay}
     ),
-    "current_sensor_offset": Trial(
-        amplitude_candidates("offset_A", lambda s: s.current, signed=True)
-    ),
+    "current_sensor_offset": Trial(amplitude_candidates("offset_A", lambda s: s.current, signed=True)),
 }
 
 

@@ -29,14 +29,10 @@ class Assessor:
         candidate_signals, curve_signals = signals(evidence)
         count = len(evidence.candidates) + len(evidence.curves)
         count *= MAX_EFFECTS if model.effects else 1
-        p_value = (
-            1.0 if model.is_exact else familywise_p_value(candidate_signals, curve_signals, count)
-        )
+        p_value = 1.0 if model.is_exact else familywise_p_value(candidate_signals, curve_signals, count)
         explained = 0.0
         if model.effects:
             base, fitted = (self.comparison.fitted(m, evidence.white) for m in (self.base, model))
             explained = base.squares - fitted.squares
         explained_unfiltered = self.base.fit.fitness - model.fit.fitness
-        return Assessment(
-            evidence, candidate_signals, curve_signals, p_value, explained, explained_unfiltered
-        )
+        return Assessment(evidence, candidate_signals, curve_signals, p_value, explained, explained_unfiltered)

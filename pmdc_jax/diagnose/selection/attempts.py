@@ -9,11 +9,7 @@ from typing import NamedTuple
 
 from ...effects import EFFECTS
 from ...identify.corrections.initial_temperature import with_initial_temperatures
-from ...identify.corrections.input_timing import (
-    negative_log_likelihood_within,
-    only_current_is_late,
-    other_timings,
-)
+from ...identify.corrections.input_timing import negative_log_likelihood_within, only_current_is_late, other_timings
 from ...identify.corrections.speed_averaging import with_averaging
 from ...identify.fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN
 from ...identify.prepare import Prepared
@@ -38,9 +34,7 @@ class Attempt(NamedTuple):
     identifying: float  # s that the identification of the motor without effects took
 
 
-def likeliest_attempt(
-    prepared: Prepared, search: str, seed: int, report: ReportProgress
-) -> Attempt:
+def likeliest_attempt(prepared: Prepared, search: str, seed: int, report: ReportProgress) -> Attempt:
     """The effects named, and then once more if these reveal another timing of the voltages or of counted speeds, or
     runs that begin with a warm winding."""
     attempt = _of_likeliest_timing(prepared, search, seed, report)
@@ -58,9 +52,7 @@ def likeliest_attempt(
     return _likelier(attempt, _named(prepared, attempt.solved, attempt.identifying, report))
 
 
-def _of_likeliest_timing(
-    prepared: Prepared, search: str, seed: int, report: ReportProgress
-) -> Attempt:
+def _of_likeliest_timing(prepared: Prepared, search: str, seed: int, report: ReportProgress) -> Attempt:
     """The effects named, and then once more if these reveal another timing of the voltages: the likelier ones of both,
     or those with a zero-order hold if nothing speaks against it any more."""
 
@@ -91,9 +83,7 @@ def _of_likeliest_timing(
     return _likelier(first, attempt(likelier[0]))
 
 
-def _named(
-    prepared: Prepared, solved: Solved, identifying: float, report: ReportProgress
-) -> Attempt:
+def _named(prepared: Prepared, solved: Solved, identifying: float, report: ReportProgress) -> Attempt:
     """The effects named beside the motor without effects that was identified."""
     report("gathering evidence", solved.fit.fitness)
     selection = StepwiseSelection(model_of((), prepared, solved.fit), solved, report)

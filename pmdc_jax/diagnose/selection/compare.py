@@ -39,9 +39,7 @@ class Comparison:
         self._filters: dict[Model, Whitener] = {}
         self._fitted: dict[tuple[Model, Whitener], Fitted] = {}
 
-    def ranked(
-        self, models: Sequence[Model], white: Whitener, margin: float = BIC_MARGIN
-    ) -> list[Fitted]:
+    def ranked(self, models: Sequence[Model], white: Whitener, margin: float = BIC_MARGIN) -> list[Fitted]:
         """Models by their criteria when fitted to residuals whitened by one filter, the best first.
 
         One that leaves far more unfiltered squares than another is ruled out (infinite criterion): a whitening filter

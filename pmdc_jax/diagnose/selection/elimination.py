@@ -36,10 +36,7 @@ class BackwardElimination:
         effects, alone or with another effect added, where these are as good."""
         white = self.comparison.filter_of(model)
         for smaller in self.refits.without_each(model, model.effects[:-1], white):
-            if (
-                self.is_new(smaller)
-                and self.comparison.ranked([model, smaller], white)[0].model is smaller
-            ):
+            if self.is_new(smaller) and self.comparison.ranked([model, smaller], white)[0].model is smaller:
                 return self.reduced(smaller)
         for effect in model.effects:
             for simple in self._simpler_forms(effect):
@@ -55,9 +52,7 @@ class BackwardElimination:
         """The simpler effects that may replace one: contained ones that were fitted before, and that of which it is
         fuller."""
         of_fuller = {s for s, form in FULLER.items() if form.effect == effect and form.to_simple}
-        return sorted(
-            CONTAINS.get(effect, set()) & self.refits.starts.first_values.keys() | of_fuller
-        )
+        return sorted(CONTAINS.get(effect, set()) & self.refits.starts.first_values.keys() | of_fuller)
 
     def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:
         """A model with a simpler form of a rich effect, and one more effect of comparable gain (`COMPARABLE_GAIN`).
@@ -93,10 +88,7 @@ class BackwardElimination:
         Its criterion is worse by less than `BIC_MARGIN` and what neither explains; or, by its own filter, nothing
         significant is left, and the unfiltered squares are hardly larger.
         """
-        rich, simple = (
-            self.comparison.fitted(m, self.comparison.filter_of(model)).criterion
-            for m in (model, simpler)
-        )
+        rich, simple = (self.comparison.fitted(m, self.comparison.filter_of(model)).criterion for m in (model, simpler))
         assessment = self.assess(model)
         unexplained = assessment.clearest.gain if assessment.p_value < FALSE_ALARM else 0.0
         margin = BIC_MARGIN + unexplained

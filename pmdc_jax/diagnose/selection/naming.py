@@ -78,9 +78,7 @@ class StepwiseSelection:
         # models that are not returned to: by different filters, each of two may look like the better one
         self.superseded: set[Model] = set()
         self.proposals = Proposals(self.refits, self.assess, self.superseded)
-        self.elimination = BackwardElimination(
-            self.refits, self.comparison, self.assess, self._is_new
-        )
+        self.elimination = BackwardElimination(self.refits, self.comparison, self.assess, self._is_new)
 
     def name(self) -> Naming:
         """Add effects while the evidence calls for them; then try other effects in place of those found."""
@@ -122,9 +120,7 @@ class StepwiseSelection:
                 return accepted
         return None
 
-    def _in_accepted_form(
-        self, accepts: Accepts, current: Model, better: Model | None
-    ) -> Model | None:
+    def _in_accepted_form(self, accepts: Accepts, current: Model, better: Model | None) -> Model | None:
         """A better model if it is accepted; else one with another form of what was added that is."""
         if better is None or accepts(current, better):
             return better
@@ -205,9 +201,7 @@ class StepwiseSelection:
             may_be_model_form_error=assessment.may_be_model_form_error(current),
             leaves_sensor_error=more_missing and assessment.is_sensor_error(),
             noise_share=np.sqrt(share_beyond(assessment.screen, curves)) if more_missing else 1.0,
-            p_without=p_values_without(
-                current, assessment.screen.white, self.refits, self.comparison
-            ),
+            p_without=p_values_without(current, assessment.screen.white, self.refits, self.comparison),
             final_fit=final_fit(current, self.comparison.filter_of(current)),
             line=line_of(current),
             varies=varying_parameter(current, assessment),

@@ -39,9 +39,7 @@ Proposed = list[Model | None]
 class Proposals:
     """Refits what may be better than a model; which of it is, `naming` decides."""
 
-    def __init__(
-        self, refits: Refits, assess: Callable[[Model], Assessment], superseded: Set[Model]
-    ) -> None:
+    def __init__(self, refits: Refits, assess: Callable[[Model], Assessment], superseded: Set[Model]) -> None:
         """`assess` gathers the evidence against a model; `superseded` are those that a better one has replaced."""
         self.refits, self.assess, self.superseded = refits, assess, superseded
 
@@ -113,11 +111,7 @@ class Proposals:
     def by_exchange(self, current: Model) -> Proposed:
         """A model with `MAX_EFFECTS` effects, with the new one of largest gain in place of one in the same equation."""
         assessment = self.assess(current)
-        if (
-            len(current.effects) < MAX_EFFECTS
-            or assessment.p_value >= FALSE_ALARM
-            or assessment.is_negligible(current)
-        ):
+        if len(current.effects) < MAX_EFFECTS or assessment.p_value >= FALSE_ALARM or assessment.is_negligible(current):
             return []
         others = [s for s in clear_signals(assessment) if effect_of(s) not in current.effects]
         if not others:
@@ -154,10 +148,7 @@ class Proposals:
         swaps = [
             (effect, other)
             for effect in current.effects
-            for other in sorted(
-                (equivalents.get(effect, set()) | TRIALS[effect].alike.keys())
-                - set(current.effects)
-            )
+            for other in sorted((equivalents.get(effect, set()) | TRIALS[effect].alike.keys()) - set(current.effects))
         ]
         return self.refits.with_replacements(current, white, swaps)
 

@@ -51,12 +51,7 @@ class Refits:
     """Fits models and keeps one for each set of effects."""
 
     def __init__(
-        self,
-        base: Model,
-        solved: Solved,
-        scales: Scales,
-        comparison: Comparison,
-        report: ReportProgress,
+        self, base: Model, solved: Solved, scales: Scales, comparison: Comparison, report: ReportProgress
     ) -> None:
         """`base` is the motor without effects, and `solved` how it was found; `scales` are those of the recordings."""
         self.starts, self.solved, self.report = Starts(scales), solved, report
@@ -65,9 +60,7 @@ class Refits:
         # pairs of a set and a model from which it has been refitted, or need not be
         self.refitted_from: set[tuple[frozenset[str], Model]] = set()
 
-    def with_signals(
-        self, current: Model, signals: Sequence[Signal], found: Screen
-    ) -> list[Model | None]:
+    def with_signals(self, current: Model, signals: Sequence[Signal], found: Screen) -> list[Model | None]:
         """The current model with the effect of each of some signals added, in parallel; None if physics forbids the
         coefficients found.
 
@@ -88,9 +81,7 @@ class Refits:
 
         return map_in_threads(with_signal, additions)
 
-    def _addition(
-        self, current: Model, signal: Signal, found: Screen
-    ) -> tuple[tuple[str, ...], Refit]:
+    def _addition(self, current: Model, signal: Signal, found: Screen) -> tuple[tuple[str, ...], Refit]:
         """The effects with that of a signal added, and what fits them."""
         effects = effects_with(current.effects, effect_of(signal))
         start = self.starts.from_signal(current, effects, signal, found)
@@ -118,9 +109,7 @@ class Refits:
         self._report_trial(current, [effects for effects, _ in refits])
         return map_in_threads(lambda of: self._stored_or_fitted(of[0], current, of[1]), refits)
 
-    def _replacement(
-        self, current: Model, white: Whitener, old: str, new: str
-    ) -> tuple[tuple[str, ...], Refit]:
+    def _replacement(self, current: Model, white: Whitener, old: str, new: str) -> tuple[tuple[str, ...], Refit]:
         """The effects with `new` in place of `old`, and what fits them if no fit is stored."""
         effects, starts, max_misfit = (*(e for e in current.effects if e != old), new), [], np.inf
         if frozenset(effects) not in self.models:
@@ -150,9 +139,7 @@ class Refits:
         assert model is not None
         return model
 
-    def with_fuller_form_held(
-        self, current: Model, white: Whitener, effect: str, useful: float
-    ) -> Model:
+    def with_fuller_form_held(self, current: Model, white: Whitener, effect: str, useful: float) -> Model:
         """The current model with a fuller form of an effect, whose extra parameters are held where they clearly act;
         `useful`, as of `refit_from`."""
         fuller = FULLER[effect]
@@ -197,9 +184,7 @@ class Refits:
                 return self._stored_or_better(key, model, refit)
         return smaller
 
-    def _stored_or_fitted(
-        self, effects: Sequence[str], current: Model, refit: Refit
-    ) -> Model | None:
+    def _stored_or_fitted(self, effects: Sequence[str], current: Model, refit: Refit) -> Model | None:
         """The stored fit of a set; if there is none, a new one from the current model, which is then stored."""
         key = frozenset(effects)
         if key not in self.models:
@@ -233,12 +218,7 @@ class Refits:
         return bool(before - after > MIN_REALISED_SHARE * signal.gain)
 
     def _refit_from_signal(
-        self,
-        effects: tuple[str, ...],
-        start: Start,
-        current: Model,
-        signal: Signal,
-        white: Whitener,
+        self, effects: tuple[str, ...], start: Start, current: Model, signal: Signal, white: Whitener
     ) -> Model:
         """A refit from where the evidence points; if that does not realise the promised gain, plain least squares, too.
 
@@ -256,11 +236,7 @@ class Refits:
         return min((model, from_plain), key=lambda m: self.comparison.fitted(m, white).squares)
 
     def _best_of_starts(
-        self,
-        effects: tuple[str, ...],
-        starts: Sequence[Start],
-        white: Whitener,
-        max_misfit: float = np.inf,
+        self, effects: tuple[str, ...], starts: Sequence[Start], white: Whitener, max_misfit: float = np.inf
     ) -> Model:
         """The best refit from several starts of the last effect: the best of short refits, refitted in full.
 
@@ -270,9 +246,7 @@ class Refits:
         seed, prepared, runs = self.solved.seed, starts[0].prepared, starts[0].point.unknowns.runs
         factors = {f"{effects[-1]}.{f}": x for f, x in TRIALS[effects[-1]].factors.items()}
         if factors:
-            starts = [
-                Start(prepared, _best_around(prepared, s.point, factors, seed)) for s in starts
-            ]
+            starts = [Start(prepared, _best_around(prepared, s.point, factors, seed)) for s in starts]
         best = _best_short_refit(starts)
         start = best._replace(unknowns=best_backlash_start(prepared.problem, best.unknowns, runs))
         if factors and best.fitness < max_misfit:
@@ -308,11 +282,7 @@ def _short_refit(start: Start) -> Optimum:
 
 
 def _refit_with_population(
-    effects: tuple[str, ...],
-    prepared: Prepared,
-    start: Optimum,
-    factors: Mapping[str, float],
-    seed: int,
+    effects: tuple[str, ...], prepared: Prepared, start: Optimum, factors: Mapping[str, float], seed: int
 ) -> Model:
     """A refit; or a second one from the best of a population around where the first ended, if that point is better and
     so is the refit, by the whitening filter of the residuals at the start."""
@@ -330,9 +300,7 @@ def _refit_with_population(
     return min((model, refit_from(effects, prepared, elsewhere, white)), key=whitened_misfit)
 
 
-def _best_around(
-    prepared: Prepared, start: Optimum, factors: Mapping[str, float], seed: int
-) -> Optimum:
+def _best_around(prepared: Prepared, start: Optimum, factors: Mapping[str, float], seed: int) -> Optimum:
     """The best point of a population search around a start; `factors` as in `best_nearby`."""
     fit = fit_at(prepared.problem, start)
     return best_nearby(prepared.problem, fit, factors, seed)

@@ -18,9 +18,7 @@ RULED_OUT = 4.0
 UNEXPLAINED_SHARE = 0.1
 
 
-def rivals_of(
-    chosen: Model, assessment: Assessment, refits: Refits, comparison: Comparison
-) -> list[Model]:
+def rivals_of(chosen: Model, assessment: Assessment, refits: Refits, comparison: Comparison) -> list[Model]:
     """Other sets that explain the runs as well, the best first, then the chosen one with each fuller form that is not
     ruled out."""
     white = assessment.screen.white
@@ -38,9 +36,7 @@ def rivals_of(
     return rivals + [m for m in fuller if comparison.fitted(m, white, limit).squares < limit]
 
 
-def p_values_without(
-    chosen: Model, white: Whitener, refits: Refits, comparison: Comparison
-) -> dict[str, float]:
+def p_values_without(chosen: Model, white: Whitener, refits: Refits, comparison: Comparison) -> dict[str, float]:
     """By effect of the chosen set, the p-value of the runs without it: a likelihood-ratio test, chi-squared with one
     degree of freedom for each of the effect's parameters."""
     p_values = {}

@@ -7,13 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...effects import EFFECTS
-from ..evidence.assessment import (
-    EFFECT_SHARE,
-    FALSE_ALARM,
-    MODEL_FORM_SHARE,
-    TRIAL_SHARE,
-    Assessment,
-)
+from ..evidence.assessment import EFFECT_SHARE, FALSE_ALARM, MODEL_FORM_SHARE, TRIAL_SHARE, Assessment
 from ..evidence.signals import Signal
 from ..hypotheses.effect_relations import CONTAINS, with_split_friction
 from ..hypotheses.trials import TRIALS
@@ -94,17 +88,12 @@ def clear_signals(assessment: Assessment) -> list[Signal]:
     best: dict[str, Signal] = {}
     for s in assessment.candidate_signals:
         best.setdefault(effect_of(s), s)
-    log_level, curve = (
-        np.log(FALSE_ALARM / len(assessment.screen.candidates)),
-        assessment.curve_signals[0],
-    )
+    log_level, curve = (np.log(FALSE_ALARM / len(assessment.screen.candidates)), assessment.curve_signals[0])
     large_gain = TRIAL_SHARE * curve.gain if curve.log_p < log_level else np.inf
     return [s for s in best.values() if s.log_p < log_level or s.gain > large_gain]
 
 
-def richer_form(
-    current: Model, assessment: Assessment, share: float = EFFECT_SHARE
-) -> list[Signal]:
+def richer_form(current: Model, assessment: Assessment, share: float = EFFECT_SHARE) -> list[Signal]:
     """The first clear effect that contains one of the model's and explains more than a `share` of what is left; at most
     one."""
     present = with_split_friction(set(current.effects))
@@ -112,9 +101,7 @@ def richer_form(
     return [
         s
         for s in clear_signals(assessment)
-        if CONTAINS.get(effect_of(s), set()) & present
-        and effect_of(s) not in current.effects
-        and s.gain > least
+        if CONTAINS.get(effect_of(s), set()) & present and effect_of(s) not in current.effects and s.gain > least
     ][:1]
 
 

@@ -39,17 +39,13 @@ class Starts:
         # by effect: the values from which it was first fitted
         self.first_values: dict[str, Values] = {}
 
-    def from_signal(
-        self, current: Model, effects: tuple[str, ...], signal: Signal, screen: Screen
-    ) -> Start | None:
+    def from_signal(self, current: Model, effects: tuple[str, ...], signal: Signal, screen: Screen) -> Start | None:
         """The start at the regression coefficients of a signal; None if physics forbids them."""
         candidate, fit = signal.candidate, screen.evidence.regress([signal.block])
         assert candidate is not None
         coefficients, angles = fit.coefficients[0], np.zeros(current.prepared.problem.tape.runs)
         if candidate.own_phase:
-            coefficients, angles[current.training] = _in_common_phase(
-                current, candidate, coefficients
-            )
+            coefficients, angles[current.training] = _in_common_phase(current, candidate, coefficients)
         start_values = candidate.build(coefficients, current.coulomb_torque)
         if start_values is None:
             return None
@@ -104,11 +100,7 @@ class Starts:
         return Start(prepared, Optimum(Unknowns(jnp.asarray(inside), turned), np.inf, ()))
 
     def _coordinates(
-        self,
-        parameters: Parameters,
-        current: Model,
-        values: Mapping[str, Values],
-        changes: np.ndarray | float,
+        self, parameters: Parameters, current: Model, values: Mapping[str, Values], changes: np.ndarray | float
     ) -> list[float]:
         """Search coordinates of some parameters: those of the current model where its runs determine them or no start
         value is known, as of an effect from a global search; else start values, given or the first of the effect."""

@@ -107,18 +107,13 @@ def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
     own, other = (AFTER, BEFORE) if gains[AFTER] > gains[BEFORE] else (BEFORE, AFTER)
     by_one = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))
     by_two = equation.solve(np.delete(np.arange(COLUMNS), other))
-    if by_one.mean_square - by_two.mean_square < MIN_OF_THREE * (
-        by_one.mean_square - by_three.mean_square
-    ):
+    if by_one.mean_square - by_two.mean_square < MIN_OF_THREE * (by_one.mean_square - by_three.mean_square):
         # it explains much, or the two are collinear, as where a current settles within a sample
         if abs(gains[other]) > MAX_OTHER_SIDE * gains[own]:
             return None
         by_two = by_three
     coefficients, errors, mean_square = by_two
-    if (
-        coefficients[own] < MIN_Z * errors[own]
-        or mean_square > (1 - MIN_EXPLAINED) * by_one.mean_square
-    ):
+    if coefficients[own] < MIN_Z * errors[own] or mean_square > (1 - MIN_EXPLAINED) * by_one.mean_square:
         return None
     later = AFTER if own == AFTER else NOW
     both = [later - 1, later]
@@ -158,8 +153,7 @@ def settling(equation: ElectricalEquation, prepared: Prepared, fit: Fit) -> Sett
     least = -error if by_fit < MAX_HIDDEN else MIN_LATER + error
     return Settling(
         sooner=bool(share - _later_share(by_fit) > least),
-        as_mean=bool(_later_share(remains) - share > MIN_EARLIER + error)
-        and prepared.averaging is None,
+        as_mean=bool(_later_share(remains) - share > MIN_EARLIER + error) and prepared.averaging is None,
     )
 
 
@@ -190,15 +184,12 @@ def electrical_equation(prepared: Prepared, fit: Fit) -> ElectricalEquation | No
         return None
     for k, run in runs:
         measured, simulated, weight, voltage = (
-            tape.samples_of(k, signal, len(run))
-            for signal in (tape.measured, outputs, tape.weight, tape.value)
+            tape.samples_of(k, signal, len(run)) for signal in (tape.measured, outputs, tape.weight, tape.value)
         )
         known = np.all(weight > 0, axis=1)
         used = known[1:-2] & known[2:-1] & known[3:]
         # where the current is next to nothing or reverses, brushes may drop any voltage
-        flow = np.sign(measured[:, 0]) * (
-            np.abs(measured[:, 0]) > MIN_FLOW * prepared.problem.noise[0]
-        )
+        flow = np.sign(measured[:, 0]) * (np.abs(measured[:, 0]) > MIN_FLOW * prepared.problem.noise[0])
         flows = used & (flow[2:-1] != 0) & (flow[3:] != 0)
         one_way = flows & (flow[1:-2] == flow[2:-1]) & (flow[2:-1] == flow[3:])
         steps = np.square(np.diff(voltage[1:-1]))

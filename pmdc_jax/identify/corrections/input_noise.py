@@ -62,9 +62,7 @@ def without_input_noise(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
     better = polish(problem, fit.optimum)
     if negative_log_likelihood(prepared, better) > negative_log_likelihood(prepared, fit):
         return prepared, fit
-    taken = {
-        run.name: float(np.std(x)) for run, x in zip(prepared.runs, lost, strict=True) if np.any(x)
-    }
+    taken = {run.name: float(np.std(x)) for run, x in zip(prepared.runs, lost, strict=True) if np.any(x)}
     return prepared._replace(problem=problem, input_noise=taken), better
 
 
@@ -87,9 +85,7 @@ def _felt_shares(prepared: Prepared, rough: Fit, smooth: Fit) -> list[float]:
     of the residuals with the smooth drive.
     """
     shares, tape = [], prepared.problem.tape
-    whole, smoothed = (
-        -np.asarray(fit.evaluation.residuals) * fit.noise[:, None] for fit in (rough, smooth)
-    )
+    whole, smoothed = (-np.asarray(fit.evaluation.residuals) * fit.noise[:, None] for fit in (rough, smooth))
     for run in range(len(prepared.runs)):
         both = series_of(tape, run, np.stack([whole, smoothed - whole], -1))
         white = fit_whitener([series_of(tape, run, smoothed)])(0, both)
@@ -102,9 +98,7 @@ def _felt_shares(prepared: Prepared, rough: Fit, smooth: Fit) -> list[float]:
             np.square(residual[mine] / rough.noise[:, None]).sum() for residual in (whole, smoothed)
         )
         is_noise = (
-            share < MAX_FELT_SHARE
-            and share + MIN_Z_SCORE * error < 1
-            and squares_smooth < MAX_SQUARES_RATIO * squares
+            share < MAX_FELT_SHARE and share + MIN_Z_SCORE * error < 1 and squares_smooth < MAX_SQUARES_RATIO * squares
         )
         shares.append(float(np.clip(share, 0.0, 1.0)) if is_noise else 1.0)
     return shares
@@ -123,9 +117,7 @@ def denoised(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " sampl
     noise = noise_by_differences(4, signal)  # by a median, since most of a signal is smooth
     if not noise > MIN_RELATIVE_NOISE * np.max(np.abs(signal)):
         return signal
-    estimates, errors = zip(
-        *(_estimate_by_widest(signal, noise, *window) for window in WINDOWS), strict=True
-    )
+    estimates, errors = zip(*(_estimate_by_widest(signal, noise, *window) for window in WINDOWS), strict=True)
     return np.average(estimates, axis=0, weights=1 / np.square(errors))
 
 

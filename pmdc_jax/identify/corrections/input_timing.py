@@ -25,22 +25,10 @@ from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negativ
 from ..fit.polish import Fit, fit_at
 from ..prepare import Prepared
 from ..problem import Problem, normal_matrix
-from .electrical_equation import (
-    ElectricalEquation,
-    TwoVoltages,
-    electrical_equation,
-    settling,
-    two_voltages,
-)
+from .electrical_equation import ElectricalEquation, TwoVoltages, electrical_equation, settling, two_voltages
 from .reading_time import MARGIN, change_by_reading
 from .retiming import electrical_rate, with_timing
-from .speed_averaging import (
-    refitted,
-    seems_averaged,
-    with_averaging,
-    without_averaging,
-    without_ends,
-)
+from .speed_averaging import refitted, seems_averaged, with_averaging, without_averaging, without_ends
 from .uneven_sampling import with_even_clock
 
 # Accuracy, in samples, with which a lead is searched
@@ -64,17 +52,13 @@ def other_timings(prepared: Prepared, fit: Fit) -> list[Timing]:
 
     **Arguments**: `prepared`, the runs with the effects of their sensors corrected; `fit`, to these.
     """
-    if not all(prepared.problem.samples > 0) or not any(
-        r.drive == "voltage" for r in prepared.runs
-    ):
+    if not all(prepared.problem.samples > 0) or not any(r.drive == "voltage" for r in prepared.runs):
         return []  # without a current, or without a speed, only a delay would show
     trials = _Trials(prepared, fit)
     proposed = [*_at_samples(prepared, fit), *_by_electrical_equation(trials)]
     plausible, score = _likelier(trials, proposed), trials.negative_log_likelihood
     if any(run.load is not None for run in prepared.training):
-        plausible = [
-            t if t.reading else min(t, t._replace(load=True), key=score) for t in plausible
-        ]
+        plausible = [t if t.reading else min(t, t._replace(load=True), key=score) for t in plausible]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     likely = [timing for timing in plausible if not timing.current_mean]
     means = [timing for timing in plausible if timing.current_mean]
@@ -151,9 +135,7 @@ def _likelier(trials: _Trials, proposed: Sequence[Timing]) -> list[Timing]:
     than straight ones, too."""
     prepared, fit = trials.prepared, trials.fit
     likely = trials.likelier(proposed, negative_log_likelihood_within(prepared, fit))
-    first_order = (
-        trials.negative_log_likelihood(FIRST_ORDER_HOLD) if FIRST_ORDER_HOLD in likely else np.inf
-    )
+    first_order = trials.negative_log_likelihood(FIRST_ORDER_HOLD) if FIRST_ORDER_HOLD in likely else np.inf
     if SMOOTH in likely and not trials.likelier([SMOOTH], first_order):
         likely.remove(SMOOTH)
     # of a slow difference the whitening filter takes most for noise
@@ -182,11 +164,7 @@ def _by_electrical_equation(trials: _Trials) -> list[Timing]:
     """The timings that the electrical equation makes plausible."""
     if trials.equation is None:
         return []
-    return (
-        _hidden(trials, trials.equation)
-        if trials.voltages is None
-        else _suggested_by(trials, trials.voltages)
-    )
+    return _hidden(trials, trials.equation) if trials.voltages is None else _suggested_by(trials, trials.voltages)
 
 
 def _suggested_by(trials: _Trials, voltages: TwoVoltages) -> list[Timing]:
@@ -233,15 +211,11 @@ def only_current_is_late(prepared: Prepared, fit: Fit) -> bool:
     """
     if prepared.timing.reading is None or prepared.timing.ahead >= 0:
         return False
-    late, error = _lateness_of_current(
-        prepared.problem, fit, change_by_reading(prepared.problem, fit)
-    )
+    late, error = _lateness_of_current(prepared.problem, fit, change_by_reading(prepared.problem, fit))
     return late > max(MIN_LATE_SHARE * abs(prepared.timing.lead), MIN_LATE_ERRORS * error)
 
 
-def _lateness_of_current(
-    problem: Problem, fit: Fit, *changes: Float[Array, "blocks 2 samples"]
-) -> tuple[float, float]:
+def _lateness_of_current(problem: Problem, fit: Fit, *changes: Float[Array, "blocks 2 samples"]) -> tuple[float, float]:
     """How much later than assumed the current was read, and the standard error of that, in samples, beside other
     `changes` of the outputs."""
     current = fit.evaluation.simulated[:, 0]
@@ -282,11 +256,7 @@ def _amplitudes(
     scale = problem.tape.weight / fit.noise[:, None] * problem.fitted_blocks[:, None, None]
     scaled = [change * scale for change in changes]
     normal = [
-        np.asarray(
-            normal_matrix(
-                fit.evaluation._replace(residuals=change), problem.tape, problem.fitted_runs
-            )
-        )
+        np.asarray(normal_matrix(fit.evaluation._replace(residuals=change), problem.tape, problem.fitted_runs))
         for change in scaled
     ]
     slopes = np.stack([matrix[:-1, -1] for matrix in normal])

@@ -18,11 +18,7 @@ from jaxtyping import Float
 from ...recordings.recording import AROUND, OVER_BOTH, OVER_LAST, Averaging
 from ...simulate import Tape
 from ..fit.gauss_newton import TOLERANCE
-from ..fit.likelihood import (
-    MIN_LOG_LIKELIHOOD_GAIN,
-    leaves_only_noise,
-    negative_log_likelihood,
-)
+from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
 from ..fit.polish import Fit, polish
 from ..noise.sensor_noise import quantum
 from ..prepare import Prepared
@@ -136,8 +132,7 @@ def _with_speeds_averaged(prepared: Prepared, averaging: Averaging | None) -> Pr
 def _shifted_earlier(prepared: Prepared) -> Prepared:
     """The runs with their speeds shifted to one sample earlier."""
     runs = [
-        run if run.speed is None else attrs.evolve(run, speed=np.append(run.speed[1:], np.nan))
-        for run in prepared.runs
+        run if run.speed is None else attrs.evolve(run, speed=np.append(run.speed[1:], np.nan)) for run in prepared.runs
     ]
     laid = Tape.from_recordings(runs)
     weight = jnp.asarray(prepared.problem.tape.weight * laid.weight)
@@ -145,10 +140,7 @@ def _shifted_earlier(prepared: Prepared) -> Prepared:
 
 
 def refitted(
-    prepared: Prepared,
-    fit: Fit,
-    inductance: float | None = None,
-    tolerance: float = TOLERANCE,
+    prepared: Prepared, fit: Fit, inductance: float | None = None, tolerance: float = TOLERANCE
 ) -> tuple[Prepared, Fit]:
     """The runs, and the best fit to them that starts from `fit`, or from there with a smaller inductance: a large one
     may have compensated part of a sample of delay.
@@ -180,9 +172,7 @@ def _averaging_by_noise(prepared: Prepared) -> tuple[Averaging | None, float, bo
     """
     speeds = _speeds(prepared)
     counts = _in_counts(speeds)
-    mean, min_gain = (
-        averaging_of_counts(counts) if counts else averaging_of_differences([s for s, _ in speeds])
-    )
+    mean, min_gain = averaging_of_counts(counts) if counts else averaging_of_differences([s for s, _ in speeds])
     if mean is None and speeds and not counts and prepared.timing.current_mean:
         mean = OVER_LAST
     if mean == OVER_LAST and not prepared.problem.samples[0] > 0:

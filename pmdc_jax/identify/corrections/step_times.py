@@ -111,9 +111,7 @@ def _refitted_smooth(prepared: Prepared, first_order: _Placed) -> _Placed:
     voltages."""
     rate = electrical_rate(prepared.problem, first_order.fit)
     smooth = with_timing(prepared, SMOOTH._replace(smooth=rate))
-    steps = [
-        _as_laid_out(smooth, run)._replace(share=s.share) for run, s in enumerate(first_order.steps)
-    ]
+    steps = [_as_laid_out(smooth, run)._replace(share=s.share) for run, s in enumerate(first_order.steps)]
     return _refitted(smooth, first_order.fit, steps)
 
 
@@ -124,12 +122,7 @@ def _negative_log_likelihood(placed: _Placed) -> float:
 def steps_of(run: Recording) -> VoltageSteps:
     """The voltage steps of a run that stand out, placed at samples."""
     at, height = np.zeros(0, int), np.zeros(0)
-    if (
-        run.drive == "voltage"
-        and run.voltage is not None
-        and run.resampled_from is None
-        and len(run) > 3
-    ):
+    if run.drive == "voltage" and run.voltage is not None and run.resampled_from is None and len(run) > 3:
         jumps = jumps_of(run.voltage, MIN_STEP_RATIO, MIN_STEP_SHARE)
         if len(jumps) <= len(run) / MIN_SAMPLES_PER_STEP:
             at, height = jumps, np.diff(run.voltage)[jumps - 1]
@@ -161,9 +154,7 @@ def _shares(steps: Sequence[VoltageSteps]) -> Float[np.ndarray, " steps"]:
     return np.concatenate([s.share for s in steps])
 
 
-def _fit_times(
-    problem: Problem, fit: Fit, steps: Sequence[VoltageSteps]
-) -> tuple[list[VoltageSteps], float]:
+def _fit_times(problem: Problem, fit: Fit, steps: Sequence[VoltageSteps]) -> tuple[list[VoltageSteps], float]:
     """The steps at the times that minimise the residuals of a fit, and the gain in log-likelihood for white noise."""
     tape = problem.tape
     scale = np.asarray(tape.weight) / fit.noise[:, None]

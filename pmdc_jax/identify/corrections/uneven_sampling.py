@@ -68,9 +68,7 @@ def _shifted(prepared: Prepared, fit: Fit) -> Prepared:
     for k, run in enumerate(prepared.runs):
         if run.resampled_from is not None:
             now = tape.samples_of(k, simulated, len(run))
-            then = simulated_at_stamps(
-                motor, tape.drive_of(k), run, now, prepared.timing.first_order_hold
-            )
+            then = simulated_at_stamps(motor, tape.drive_of(k), run, now, prepared.timing.first_order_hold)
             run = _nearest_samples(run, now, then)
         runs.append(run)
     laid, begins = Tape.from_recordings(runs), np.asarray(tape.begins)

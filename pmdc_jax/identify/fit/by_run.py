@@ -10,23 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ...simulate import UNKNOWNS_PER_RUN, RunUnknowns
-from ..problem import (
-    Evaluation,
-    Problem,
-    Unknowns,
-    evaluate,
-    normal_matrix,
-    scaled,
-    select_blocks,
-)
+from ..problem import Evaluation, Problem, Unknowns, evaluate, normal_matrix, scaled, select_blocks
 from ..uncertainty.covariance import information
-from .gauss_newton import (
-    RIDGE,
-    gauss_newton_step,
-    residual_noise,
-    ridge_of,
-    squares_of_outputs,
-)
+from .gauss_newton import RIDGE, gauss_newton_step, residual_noise, ridge_of, squares_of_outputs
 
 # Gauss-Newton steps at most, and the decrease of the cost from which another one is taken
 MAX_STEPS, MIN_DECREASE = 6, 1e-4
@@ -77,9 +63,7 @@ def errors_by_run(
     return np.stack([errors, info.interval_factor * errors])[:, count:][:, fitted]
 
 
-def _simulated(
-    problem: Problem, coordinates: Float[np.ndarray, "runs parameters"], runs: RunUnknowns
-) -> FitByRun:
+def _simulated(problem: Problem, coordinates: Float[np.ndarray, "runs parameters"], runs: RunUnknowns) -> FitByRun:
     """Every run simulated with its own coordinates."""
     first, *others = np.unique(coordinates, axis=0)
     evaluation = evaluate(problem, Unknowns(jnp.asarray(first), runs))

@@ -25,9 +25,7 @@ MAX_STEPS = 8
 MAX_FITNESS_RATIO = 1.1
 
 
-def last_fit(
-    prepared: Prepared, plain_fit: Fit, start: Fit, white: Whitener
-) -> tuple[Prepared, Fit]:
+def last_fit(prepared: Prepared, plain_fit: Fit, start: Fit, white: Whitener) -> tuple[Prepared, Fit]:
     """The fit with whitened residuals, from a `start` near it; the plain fit if its residuals are white already.
 
     The plain fit is also kept where the other one reproduces the runs clearly worse, because the motor has an effect
@@ -49,11 +47,7 @@ def _is_exact(prepared: Prepared, fit: Fit) -> bool:
 
 
 def fit_whitened(
-    prepared: Prepared,
-    start: Fit,
-    white: Whitener,
-    tolerance: float = TOLERANCE,
-    useful: float = np.inf,
+    prepared: Prepared, start: Fit, white: Whitener, tolerance: float = TOLERANCE, useful: float = np.inf
 ) -> tuple[Prepared, Fit]:
     """The problem with whitened residuals, and its solution started from a plain fit nearby.
 

@@ -21,13 +21,7 @@ from ..problem import (
     unflatten,
     whitened,
 )
-from .gauss_newton import (
-    TOLERANCE,
-    gauss_newton_step,
-    residual_noise,
-    ridge_of,
-    squares_of_outputs,
-)
+from .gauss_newton import TOLERANCE, gauss_newton_step, residual_noise, ridge_of, squares_of_outputs
 from .refine import Optimum
 
 # The polish stops if the cost fell by less than MIN_COST_DECREASE over the last PATIENCE steps: dry elements leave
@@ -117,9 +111,7 @@ def polish(
         unknowns, stopped = _moved(problem, best.unknowns, share * step)
         fixed |= stopped
         change = np.asarray(flatten(unknowns)) - np.asarray(flatten(best.unknowns))
-        trial = _evaluate_weighted(
-            problem, unknowns, starts=predicted_starts(problem, best.evaluation, change)
-        )
+        trial = _evaluate_weighted(problem, unknowns, starts=predicted_starts(problem, best.evaluation, change))
         costs.append(min(trial.cost, best.cost))
     distance = float(np.sqrt(gain / _residual_variance(problem, best)))
     starts = np.asarray(best.evaluation.starts)

@@ -37,9 +37,7 @@ class Optimum(NamedTuple):
         """Whether the minimum is near, by the gradient and not by a solver's own criterion."""
         return self.distance <= CONVERGED_DISTANCE
 
-    def moved(
-        self, parameters: Parameters, step: Float[Array | np.ndarray, " parameters"]
-    ) -> Optimum:
+    def moved(self, parameters: Parameters, step: Float[Array | np.ndarray, " parameters"]) -> Optimum:
         """A start whose coordinates are a step further on, within their bounds."""
         further = jnp.clip(self.unknowns.coordinates + step, parameters.lower, parameters.upper)
         return self._replace(unknowns=self.unknowns._replace(coordinates=further))
@@ -118,9 +116,7 @@ def _first_state(solver: optx.LevenbergMarquardt, start: Columns) -> Any:
     return solver.init(_linearised, start, model, SOLVER_OPTIONS, residuals, None, frozenset())
 
 
-def _linearised(
-    unknowns: Columns, model: tuple[Columns, Factor]
-) -> tuple[Float[Array | np.ndarray, " rows"], None]:
+def _linearised(unknowns: Columns, model: tuple[Columns, Factor]) -> tuple[Float[Array | np.ndarray, " rows"], None]:
     """The residuals, linearised about the only unknowns at which the solver asks for them and for their Jacobian."""
     point, factor = model
     return factor[:, -1] + factor[:, :-1] @ (unknowns - point), None

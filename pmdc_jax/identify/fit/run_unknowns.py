@@ -12,16 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from ...runtime.threads import map_in_threads
 from ...simulate import RunUnknowns
-from ..problem import (
-    Evaluation,
-    Problem,
-    Unknowns,
-    evaluate,
-    normal_matrix,
-    scaled,
-    select_blocks,
-    unflatten,
-)
+from ..problem import Evaluation, Problem, Unknowns, evaluate, normal_matrix, scaled, select_blocks, unflatten
 from .gauss_newton import TOLERANCE, gauss_newton_step, ridge_of, squares_of_runs
 from .polish import Fit
 
@@ -67,9 +58,7 @@ def best_initial_angle(problem: Problem, unknowns: Unknowns) -> Unknowns:
     return unknowns
 
 
-def _best_run_unknowns(
-    problem: Problem, unknowns: Unknowns, trials: Sequence[RunUnknowns]
-) -> Unknowns:
+def _best_run_unknowns(problem: Problem, unknowns: Unknowns, trials: Sequence[RunUnknowns]) -> Unknowns:
     """Each run's own unknowns as they are, or those of the trial that fits it best."""
     if not trials:
         return unknowns
@@ -83,9 +72,7 @@ def _best_run_unknowns(
     return unknowns._replace(runs=runs)
 
 
-def fit_run_unknowns(
-    problem: Problem, unknowns: Unknowns, passes: int = 4
-) -> tuple[Unknowns, Evaluation]:
+def fit_run_unknowns(problem: Problem, unknowns: Unknowns, passes: int = 4) -> tuple[Unknowns, Evaluation]:
     """Fit only what belongs to each run: its initial state, and its load where that is unknown.
 
     A step that makes a run worse, because the teeth of a gear meet at another time for example, is shortened for that

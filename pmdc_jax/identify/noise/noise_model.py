@@ -50,10 +50,7 @@ class Whitener:
         sizes: dict[tuple[int, ...], list[np.ndarray]] = {}
         for S in self.scales:
             sizes.setdefault(S.shape, []).append(np.sqrt(np.diag(np.linalg.inv(S @ S.T))))
-        alike = all(
-            np.ptp(np.log(of_kind), axis=0).max() < MAX_LOG_NOISE_SPREAD
-            for of_kind in sizes.values()
-        )
+        alike = all(np.ptp(np.log(of_kind), axis=0).max() < MAX_LOG_NOISE_SPREAD for of_kind in sizes.values())
         return alike and not any(len(A) for A in self.filters)
 
     def __call__(self, run: int, series: Series) -> Float[np.ndarray, "rows *columns"]:
@@ -72,10 +69,7 @@ def fit_whitener(residuals: Sequence[Series]) -> Whitener:
         by_kind[kind] = _autoregression([s for s in residuals if s.kind == kind])
     filters = [by_kind[series.kind] for series in residuals]
     scales = _scales(residuals, filters)
-    slow = [
-        _slow_power(_filtered(series, A, S))
-        for series, A, S in zip(residuals, filters, scales, strict=True)
-    ]
+    slow = [_slow_power(_filtered(series, A, S)) for series, A, S in zip(residuals, filters, scales, strict=True)]
     return Whitener(filters, [S / np.sqrt(s) for S, s in zip(scales, slow, strict=True)])
 
 

@@ -56,9 +56,7 @@ def ratio_to_noise(measured_and_left: Iterable[tuple[np.ndarray, np.ndarray]]) -
     noise do not count.
     """
     scaled = [
-        residual / noise
-        for measured, residual in measured_and_left
-        if (noise := noise_of_sensor(measured, residual))
+        residual / noise for measured, residual in measured_and_left if (noise := noise_of_sensor(measured, residual))
     ]
     return float(np.sqrt(np.nanmean(np.square(np.concatenate(scaled))))) if scaled else 0.0
 

@@ -56,9 +56,7 @@ class Whitening(eqx.Module):
         return cls(jnp.asarray(bands), jnp.asarray(np.moveaxis(usable, 2, 1)))
 
     def __call__(
-        self,
-        signal: Float[Array, "blocks 2 samples columns"],
-        run: Int[Array | np.ndarray, " blocks"],
+        self, signal: Float[Array, "blocks 2 samples columns"], run: Int[Array | np.ndarray, " blocks"]
     ) -> Float[Array, "blocks 2 samples columns"]:
         """Whiten columns such as residuals, in A and rad/s."""
         blocks, outputs, samples, columns = signal.shape

@@ -7,15 +7,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from evosax.algorithms.population_based.base import (
-    Params as BaseParams,
-)
-from evosax.algorithms.population_based.base import (
-    PopulationBasedAlgorithm,
-)
-from evosax.algorithms.population_based.base import (
-    State as BaseState,
-)
+from evosax.algorithms.population_based.base import Params as BaseParams
+from evosax.algorithms.population_based.base import PopulationBasedAlgorithm
+from evosax.algorithms.population_based.base import State as BaseState
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
@@ -50,11 +44,7 @@ class BinaryGA(PopulationBasedAlgorithm):
     """
 
     def __init__(
-        self,
-        population_size: int,
-        solution: Float[Array, " n"],
-        bits: int = 10,
-        **kwargs: Callable[..., Any],
+        self, population_size: int, solution: Float[Array, " n"], bits: int = 10, **kwargs: Callable[..., Any]
     ) -> None:
         super().__init__(population_size, solution, **kwargs)
         self.bits = bits
@@ -89,12 +79,7 @@ class BinaryGA(PopulationBasedAlgorithm):
         return self._decode(child).at[0].set(best), state
 
     def _tell(
-        self,
-        key: jax.Array,
-        population: Float[Array, "p n"],
-        fitness: Float[Array, " p"],
-        state: State,
-        params: Params,
+        self, key: jax.Array, population: Float[Array, "p n"], fitness: Float[Array, " p"], state: State, params: Params
     ) -> State:
         del key, params
         return state.replace(population=population, fitness=fitness)

@@ -55,11 +55,7 @@ def effect_bounds(
     R, Kb, _ = _crude_armature(recordings)
     typical = _typical_magnitudes(recordings, R, Kb)
     volts, amperes = (_largest_rms(recordings, name) for name in ("voltage", "current"))
-    scales = {
-        "N m": 3 * typical.torque,
-        "N m s^2/rad^2": 3 * typical.torque / typical.speed**2,
-        "rad/s": typical.speed,
-    }
+    scales = {"N m": 3 * typical.torque, "N m s^2/rad^2": 3 * typical.torque / typical.speed**2, "rad/s": typical.speed}
     if volts:
         scales["V"] = volts
     if amperes:
@@ -76,9 +72,7 @@ def effect_bounds(
             elif allowed.unit == "s":
                 low, high = max(low, typical.sample_time / 5), min(high, 3 * typical.duration)
             # the range is empty if the signal of this unit is too small for the effect
-            bounds[f"{effect.name}.{field}"] = (
-                (low, high) if low < high else (allowed.lower, allowed.upper)
-            )
+            bounds[f"{effect.name}.{field}"] = (low, high) if low < high else (allowed.lower, allowed.upper)
     return bounds
 
 
@@ -106,14 +100,10 @@ def _crude_armature(recordings: Sequence[Recording]) -> tuple[float, float, floa
         guess = steady[1] if np.any(inputs[:, 1]) else TYPICAL_KB
         return (R if R > 0 else steady[0]), (Kb if Kb > 0 else guess), max(L, 0.0)
     volts_per_speed = [
-        rms(r.voltage) / rms(r.speed)
-        for r in recordings
-        if r.voltage is not None and r.speed is not None
+        rms(r.voltage) / rms(r.speed) for r in recordings if r.voltage is not None and r.speed is not None
     ]
     volts_per_ampere = [
-        rms(r.voltage) / rms(r.current)
-        for r in recordings
-        if r.voltage is not None and r.current is not None
+        rms(r.voltage) / rms(r.current) for r in recordings if r.voltage is not None and r.current is not None
     ]
     Kb = float(np.median(volts_per_speed)) if volts_per_speed else TYPICAL_KB
     return (float(np.median(volts_per_ampere)) / 3 if volts_per_ampere else 1.0), Kb, 0.0

@@ -107,9 +107,7 @@ def search(
     if seed < 0:
         raise InputError("--seed", f"{seed} is negative", "Give zero or a positive number")
     if method not in METHODS:
-        raise InputError(
-            "--search", f"unknown search {method}", f"Choose from {', '.join(METHODS)}"
-        )
+        raise InputError("--search", f"unknown search {method}", f"Choose from {', '.join(METHODS)}")
     chosen = METHODS[method]
     size, rounds = population or chosen.population, generations or chosen.generations
     low, high = np.asarray(parameters.lower), np.asarray(parameters.upper)
@@ -133,9 +131,7 @@ def search(
                 best = min(each.fitness.min() for each in evaluated)
                 progress(f"searching, generation {generation}", float(best), generation / rounds)
             elite = cube[np.argsort(fitness)[: size // 10 + 1]]
-            if generation > MIN_GENERATIONS and np.all(
-                np.ptp((high - low) * elite, axis=0) < AGREEMENT
-            ):
+            if generation > MIN_GENERATIONS and np.all(np.ptp((high - low) * elite, axis=0) < AGREEMENT):
                 break
     except KeyboardInterrupt:
         interrupted = True
@@ -169,9 +165,7 @@ def _first_points(kind: Kind, seed: Value, *start: Value) -> Asked:
 
 
 @quickly_compiled
-def _next_points(
-    kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Value, state: Leaves
-) -> Asked:
+def _next_points(kind: Kind, seed: Value, generation: Value, cube: Value, fitness: Value, state: Leaves) -> Asked:
     """The next points to evaluate, given the fitness of those of the `cube`, and the state of the algorithm."""
     algorithm, settings = _algorithm(kind)
     start = (cube[0],) if METHODS[kind.method].distribution else (cube, fitness)
@@ -228,9 +222,7 @@ def _scattered(seed: int, size: int, dimensions: int) -> np.ndarray:
     return (strata + rng.random(strata.shape)) / size
 
 
-def _collect(
-    evaluated: Sequence[_Generation], low: np.ndarray, high: np.ndarray, interrupted: bool
-) -> SearchResult:
+def _collect(evaluated: Sequence[_Generation], low: np.ndarray, high: np.ndarray, interrupted: bool) -> SearchResult:
     cubes = np.concatenate([each.cube for each in evaluated])
     fitness = np.concatenate([each.fitness for each in evaluated])
     order = np.argsort(fitness, kind="stable")[:MAX_CANDIDATES]

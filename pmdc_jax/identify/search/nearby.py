@@ -38,21 +38,13 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     for name, factor in factors.items():
         effect, _, field = name.partition(".")
         limits = next(e for e in parameters.effects if e.name == effect).ranges[field]
-        bounds[name] = (
-            max(values[name] / factor, limits.lower),
-            min(values[name] * factor, limits.upper),
-        )
+        bounds[name] = (max(values[name] / factor, limits.lower), min(values[name] * factor, limits.upper))
     known = {name: value for name, value in values.items() if name not in factors}
     free = Parameters.of(bounds, parameters.effects, known)
     # a fit that cannot be simulated has no finite noise
     noise = np.where(np.isfinite(fit.noise), fit.noise, problem.noise)
     search_result = search(
-        free,
-        _worst_fitted_runs(problem, fit),
-        noise,
-        seed=seed,
-        population=POPULATION,
-        generations=GENERATIONS,
+        free, _worst_fitted_runs(problem, fit), noise, seed=seed, population=POPULATION, generations=GENERATIONS
     )
     places = [parameters.names.index(name) for name in free.names]
     for rank in TRIED_RANKS:
@@ -76,8 +68,6 @@ def _worst_fitted_runs(problem: Problem, fit: Fit) -> Tape:
     worst = runs[order[: max(1, np.searchsorted(samples, MAX_SAMPLES, side="right"))]]
     offset = jnp.where(tape.load_unknown, unknowns.runs.load_offset, 0.0)[tape.run]
     from_fit = replace(
-        tape,
-        load=tape.load + offset[:, None],
-        initial=jnp.stack([unknowns.runs.current, unknowns.runs.speed], 1),
+        tape, load=tape.load + offset[:, None], initial=jnp.stack([unknowns.runs.current, unknowns.runs.speed], 1)
     )
     return from_fit.of_runs(worst.tolist())

@@ -36,17 +36,13 @@ class Information(NamedTuple):
     covariance: Float[np.ndarray, "parameters parameters"]
     inflation: Float[np.ndarray, " parameters"]  # of the variance, over that for white residuals
     interval_factor: Float[np.ndarray, " parameters"]  # of a 95 % interval, in standard errors
-    unseen_variance: Float[
-        np.ndarray, " parameters"
-    ]  # part of the variance that comes from the unseen directions
+    unseen_variance: Float[np.ndarray, " parameters"]  # part of the variance that comes from the unseen directions
     unseen: tuple[np.ndarray, ...]  # unit vectors in the coordinates
 
     @property
     def unseen_share(self) -> Float[np.ndarray, " parameters"]:
         """How much of each coordinate's unit vector lies within the unseen directions, 0 to 1."""
-        return np.sqrt(
-            sum((np.square(d) for d in self.unseen), np.zeros(len(self.unseen_variance)))
-        )
+        return np.sqrt(sum((np.square(d) for d in self.unseen), np.zeros(len(self.unseen_variance))))
 
 
 class Part(NamedTuple):
@@ -132,9 +128,7 @@ def _ratio_or_one(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(b > 0, a / np.where(b > 0, b, 1.0), 1.0)
 
 
-def _jackknife(
-    parts: Sequence[Part], root: Float[np.ndarray, "parameters seen"]
-) -> tuple[np.ndarray, np.ndarray]:
+def _jackknife(parts: Sequence[Part], root: Float[np.ndarray, "parameters seen"]) -> tuple[np.ndarray, np.ndarray]:
     """Jackknife variances, zero where white noise may explain their size; and the reach of a 95 % interval in standard
     errors, from Student's t where these variances count: longer where few parts decide."""
     moved, shares = [], []

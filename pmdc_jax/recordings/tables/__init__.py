@@ -56,9 +56,7 @@ def open_table(path: Path) -> Table:
             raise InputError(str(path), "the file is empty", "Export the recording again")
         return kinds[path.suffix.lower()](path)
     except PermissionError:
-        raise InputError(
-            str(path), "no permission to read it", "Ask its owner, or copy it to your folder"
-        ) from None
+        raise InputError(str(path), "no permission to read it", "Ask its owner, or copy it to your folder") from None
     except OSError as error:
         what = f"it cannot be read ({error.strerror or error})"
         raise InputError(str(path), what, "Copy it to a local disk and try again") from None

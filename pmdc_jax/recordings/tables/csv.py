@@ -137,8 +137,7 @@ class CsvTable:
             if fields != len(self.headers):
                 raise InputError(
                     f"{self._path}, line {number}",
-                    f"it has {fields} fields where the header (line {self._header.line}) "
-                    f"has {len(self.headers)}",
+                    f"it has {fields} fields where the header (line {self._header.line}) has {len(self.headers)}",
                     "Correct or delete this line",
                 )
 

@@ -63,9 +63,7 @@ def _vectors(value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
     """Header and numbers of every vector in the `value` at this path; matrices are split into their longer vectors."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
-            yield from _vectors(
-                inner, _signal_name(value, name, path) or f"{path}.{name}".strip(".")
-            )
+            yield from _vectors(inner, _signal_name(value, name, path) or f"{path}.{name}".strip("."))
     elif isinstance(value, list):
         for k, inner in enumerate(value, 1):
             yield from _vectors(inner, f"{path}({k})")
