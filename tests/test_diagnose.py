@@ -26,8 +26,9 @@ from pmdc_jax.diagnose.evidence.rows import _batches
 from pmdc_jax.diagnose.evidence.signals import Screen, Signal, gain_common_to_waves, log_p_value
 from pmdc_jax.diagnose.experiment import difference_between
 from pmdc_jax.diagnose.hypotheses.candidates import Scales
+from pmdc_jax.diagnose.hypotheses.change import Change
 from pmdc_jax.diagnose.hypotheses.effect_relations import FULLER, are_rivals, is_simpler_form
-from pmdc_jax.diagnose.hypotheses.library import Change, Library
+from pmdc_jax.diagnose.hypotheses.library import Library
 from pmdc_jax.diagnose.hypotheses.trials import TRIALS
 from pmdc_jax.diagnose.judgement import implausible_effect, may_be_absent
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
@@ -37,7 +38,7 @@ from pmdc_jax.diagnose.selection.compare import Fitted
 from pmdc_jax.diagnose.selection.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.selection.proposals import Proposals
 from pmdc_jax.diagnose.selection.refits import Refits
-from pmdc_jax.diagnose.selection.shortlist import effect_of, most_promising, shortlist
+from pmdc_jax.diagnose.selection.shortlist import most_promising, shortlist
 from pmdc_jax.diagnose.selection.starts import Starts, common_phase
 from pmdc_jax.effects import EFFECTS, ShaftCompliance
 from pmdc_jax.identify.fit.polish import fit_at
@@ -77,7 +78,7 @@ def assessment_of(gains: dict[str, float], unexplained: float) -> Assessment:
 def test_the_shortlist_has_an_effect_that_is_larger_than_a_formula_error(gains, first):
     current = Mock(spec=Model, effects={"input_dead_zone": {"width_V": 0.8}})
     listed = shortlist(current, assessment_of(gains, unexplained=0.05))
-    assert [effect_of(signal) for signal in listed] == first
+    assert [signal.effect for signal in listed] == first
 
 
 def test_every_effect_has_trials():
@@ -166,7 +167,7 @@ def test_a_correction_of_a_formula_does_not_hide_an_effect_found_without_a_filte
 )
 def test_effects_of_little_expected_gain_are_not_tried(gains, min_gain, listed):
     found = most_promising(assessment_of(gains, unexplained=0.0).candidate_signals, set(), min_gain)
-    assert [effect_of(signal) for signal in found] == list(gains)[:listed]
+    assert [signal.effect for signal in found] == list(gains)[:listed]
 
 
 @pytest.mark.parametrize(
@@ -208,14 +209,14 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
     better = selection._step(Mock(spec=Model, effects=()))
     assert better is (tried if leaves_little else None)
     [call] = refits.with_signals.call_args_list
-    assert [effect_of(signal) for signal in call.args[1]] == list(gains)[:2]
+    assert [signal.effect for signal in call.args[1]] == list(gains)[:2]
 
 
 @pytest.mark.parametrize(("count", "p_value", "exchanges"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])
 def test_a_full_set_exchanges_the_effect_in_the_same_equation(monkeypatch, count, p_value, exchanges):
     """Of dry friction, a delay and an offset the first, if Stribeck friction has the largest expected gain."""
     effects = ("asymmetric_friction", "speed_sensor_delay", "current_sensor_offset")[:count]
-    peak = Mock(spec=Signal, candidate=Mock(effect="stribeck_friction"), gain=1.0)
+    peak = Mock(spec=Signal, effect="stribeck_friction", gain=1.0)
     monkeypatch.setattr(proposals, "clear_signals", lambda found: [peak])
     exchanged = Mock(spec=Model)
     refits = Mock(spec=Refits, with_signals=lambda current, signals, found: [exchanged])

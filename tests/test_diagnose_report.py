@@ -22,7 +22,7 @@ from pmdc_jax.diagnose.diagnosis import (
     NextExperiment,
     Region,
     breaks_electrical_equation,
-    unlike_held_out,
+    holdouts_show_more,
 )
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate
@@ -244,7 +244,7 @@ def test_a_hold_out_error_beyond_that_of_the_training_runs_is_reported(after, be
 def test_a_small_rest_of_a_large_hold_out_gap_does_not_refute_an_effect(before, unlike):
     """15 noise variances are left, of 24 or of 399."""
     gap = {"train": Gap(4.0, 1.0, 1.0), "holdout": Gap(before, 4.0, 1.0)}
-    assert unlike_held_out(gap) == unlike
+    assert holdouts_show_more(gap) == unlike
     assert "The error of the held-out runs is 4.00 times" in words(named(gap=gap))
 
 

@@ -12,7 +12,7 @@ from .diagnosis import Detectable, EffectFound, LearnedCurve, Region
 from .evidence.assessment import FALSE_ALARM
 from .evidence.regression import MIN_EIGENVALUE, Block
 from .evidence.signals import Screen, log_p_value
-from .hypotheses.library import Curve
+from .hypotheses.curves import Curve
 from .selection.naming import Naming
 
 # A knot of a curve is part of a region if its misfit is so many standard errors

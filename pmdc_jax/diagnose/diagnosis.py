@@ -134,12 +134,12 @@ class Diagnosis:
     # residual of the electrical equation over the sensors' white noise; see `electrical_misfit`
     electrical_misfit: float
     electrical_misfit_before: float  # the same without effects
-    seconds: Mapping[str, float]  # time taken: "identify", "name", "total"
     # whether what the final motor leaves is no more than noise may
     leaves_noise: bool = True
     varies: VaryingParameter | None = None  # what differs from run to run, if that is what is left
     # by training run: its misfit with a common value of what differs, and with its own
     gap_by_own_value: Mapping[str, Gap] = field(factory=dict)
+    seconds: Mapping[str, float] = field(factory=dict)  # time taken: "identify", "name", "total"
 
     @property
     def breaks_electrical_equation(self) -> bool:
@@ -174,10 +174,16 @@ def _largest_misfit(gap_of_run: Mapping[str, Gap], final: Identification) -> tup
     return worst, gap_of_run[worst].after / max(gap_of_run[second].after, 1e-300)
 
 
+def share_left(before: float, after: float, floor: float = 1.0) -> float:
+    """The share of a misfit above its floor, in squares, that is left; infinite if it was at the floor already."""
+    open_before = before**2 - floor**2
+    return (after**2 - floor**2) / open_before if open_before > 0 else np.inf
+
+
 def breaks_electrical_equation(before: float, after: float) -> bool:
     """Whether the electrical equation is violated by more than any torque or the effects added can explain, by its
     misfits before and after they were added."""
-    unexplained = after**2 - 1 > MAX_ELECTRICAL_SHARE * (before**2 - 1)
+    unexplained = share_left(before, after) > MAX_ELECTRICAL_SHARE
     return after > MAX_ELECTRICAL or (after > MAX_EXPLAINED_ELECTRICAL and unexplained)
 
 
@@ -190,15 +196,14 @@ def beyond_fitted(gap: Mapping[Role, Gap]) -> float | None:
     return ratio if ratio > MAX_HOLDOUT_RATIO else None
 
 
-def unlike_held_out(gap: Mapping[Role, Gap]) -> bool:
+def holdouts_show_more(gap: Mapping[Role, Gap]) -> bool:
     """Whether hold-outs show that something is missing that the fitted runs do not show."""
     if beyond_fitted(gap) is None:
-        return worse_held_out(gap)
-    before, after = gap["holdout"].before, gap["holdout"].after
-    return after**2 - 1 > MAX_HOLDOUT_SHARE * (before**2 - 1)
+        return effects_worsen_holdouts(gap)
+    return share_left(gap["holdout"].before, gap["holdout"].after) > MAX_HOLDOUT_SHARE
 
 
-def worse_held_out(gap: Mapping[Role, Gap]) -> bool:
+def effects_worsen_holdouts(gap: Mapping[Role, Gap]) -> bool:
     """Whether the effects added make hold-outs worse: the missing ones are then others that look alike in the fitted
     runs."""
     return "holdout" in gap and gap["holdout"].after > MAX_HOLDOUT_GROWTH * gap["holdout"].before

@@ -8,10 +8,11 @@ import numpy as np
 
 from ..identify.identification import Role, RunFit
 from ..identify.noise.sensor_noise import MIN_RELATIVE_NOISE, noise_of_sensor, rms
-from .diagnosis import Gap
+from .diagnosis import Gap, share_left
 
 CHANNELS = ("current", "speed")
-
+# Least gap, in squares over those of the noise, of which a share can be closed: less is rounding
+MIN_OPEN_GAP = 1e-9
 
 # Root mean square of the noise, by channel and by run; zero where the runs tell nothing of it
 Noise = Mapping[str, Mapping[str, float]]
@@ -51,8 +52,9 @@ def gaps_by_role(gaps: Mapping[str, Gap], fits: Fits) -> dict[Role, Gap]:
 def closed_fraction(gaps: Mapping[Role, Gap]) -> float | None:
     """The share of the gap above its floor, in squares, that the effects close; of the hold-outs if there are any."""
     gap = gaps.get("holdout") or gaps["train"]
-    open_before = gap.before**2 - gap.floor**2
-    return (gap.before**2 - gap.after**2) / open_before if open_before > 1e-9 else None
+    if gap.before**2 - gap.floor**2 <= MIN_OPEN_GAP:
+        return None
+    return 1 - share_left(gap.before, gap.after, gap.floor)
 
 
 def noise_of_runs(fits: Fits, share: float) -> Noise:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..effects import EFFECTS, ShaftCompliance
 from ..identify.identification import Identification
 from ..motor import Motor
-from .diagnosis import Verdict, breaks_electrical_equation, is_disturbed, unlike_held_out
+from .diagnosis import Verdict, breaks_electrical_equation, holdouts_show_more, is_disturbed
 from .evidence.assessment import FALSE_ALARM
 from .gap import Noise, closed_fraction, gaps_by_role, gaps_of_runs, noise_of_runs
 from .hypotheses.library import Library
@@ -91,7 +91,7 @@ def judge(
     if verdict == "none_detected" and is_disturbed(gaps, final):
         # what is left is then no noise but that of the sensors
         return "not_in_library", noise_of_runs(final.fit, share=0.0)
-    if unlike_held_out(gaps_by_role(gaps, base.fit)):
+    if holdouts_show_more(gaps_by_role(gaps, base.fit)):
         verdict = "not_in_library"
     return verdict, noise
 

@@ -55,23 +55,27 @@ def diagnose(
     report("checking the recordings")
     prepared = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
     attempt = likeliest_attempt(prepared, search, seed, report)
-    prepared, naming_ended = attempt.prepared, time.perf_counter()
+    naming_ended = time.perf_counter()
     report("estimating the uncertainty", attempt.naming.chosen.fit.fitness)
-    base = results_of(prepared, attempt.solved)
+    diagnosis = _diagnosis(attempt)
+    seconds = {
+        "identify": attempt.identifying,
+        "name": naming_ended - began - attempt.identifying,
+        "total": time.perf_counter() - began,
+    }
+    return attrs.evolve(diagnosis, final=attrs.evolve(diagnosis.final, seconds=seconds), seconds=seconds)
+
+
+def _diagnosis(attempt: Attempt) -> Diagnosis:
+    """What the effects named mean: the verdict, the motors without and with them, and what is left."""
+    base = results_of(attempt.prepared, attempt.solved)
     naming, final = _without_unneeded_effects(attempt, base)
     before, after = (electrical_misfit(m) for m in (attempt.selection.base, naming.chosen))
     verdict, noise = judge(naming, base, final, (before, after))
     gaps = gaps_of_runs(base.fit, final.fit, noise)
     by_role = gaps_by_role(gaps, base.fit)
     # what differs from run to run would look like some curve
-    tells_curves = verdict == "not_in_library" or naming.leaves_sensor_error
-    tells_curves = tells_curves and naming.varies is None
-    seconds = {
-        "identify": attempt.identifying,
-        "name": naming_ended - began - attempt.identifying,
-        "total": time.perf_counter() - began,
-    }
-    final = attrs.evolve(final, seconds=seconds)
+    reports_curves = (verdict == "not_in_library" or naming.leaves_sensor_error) and naming.varies is None
     return Diagnosis(
         verdict=verdict,
         effects=effects_found(naming, final),
@@ -80,18 +84,17 @@ def diagnose(
         gap_of_run=gaps,
         closed_fraction=closed_fraction(by_role) if naming.chosen.effects else None,
         rivals=rival_sets(naming),
-        next_experiment=next_experiment(naming, prepared.training) if verdict == "ambiguous" else None,
-        curves=learned_curves(naming) if tells_curves else (),
+        next_experiment=next_experiment(naming, attempt.prepared.training) if verdict == "ambiguous" else None,
+        curves=learned_curves(naming) if reports_curves else (),
         detectable=detectable_effects(naming.chosen_screen),
         base=base,
         final=final,
         p_nothing=naming.p_nothing,
         electrical_misfit=after,
         electrical_misfit_before=before,
-        seconds=seconds,
         leaves_noise=naming.p_nothing_more >= FALSE_ALARM,
         varies=naming.varies,
-        gap_by_own_value=(gaps_of_runs(final.fit, naming.varies.fit, noise) if naming.varies else {}),
+        gap_by_own_value=gaps_of_runs(final.fit, naming.varies.fit, noise) if naming.varies else {},
     )
 
 

@@ -14,8 +14,8 @@ from ..diagnose.diagnosis import (
     LearnedCurve,
     Region,
     VaryingParameter,
-    unlike_held_out,
-    worse_held_out,
+    effects_worsen_holdouts,
+    holdouts_show_more,
 )
 from ..diagnose.hypotheses.effect_relations import CONTAINS, unbalanced_equation
 from ..identify.identification import Estimate, Role, RunFit
@@ -86,7 +86,7 @@ def _ambiguous(diagnosis: Diagnosis) -> list[str]:
 def _not_in_library(diagnosis: Diagnosis) -> list[str]:
     sentences = [_disagreement_sentence(diagnosis)]
     if diagnosis.effects:
-        rest = "" if unlike_held_out(diagnosis.gap) else "; no effect of the library explains the rest"
+        rest = "" if holdouts_show_more(diagnosis.gap) else "; no effect of the library explains the rest"
         subject = _capitalised(_effects_in_words(diagnosis))
         verb, added = ("explain", "were") if len(diagnosis.effects) > 1 else ("explains", "was")
         sentences.append(f"{subject} {verb} part of this and {added} added to the model{rest}.")
@@ -106,7 +106,7 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
             " voltage is duty cycle times nominal voltage; or the recorded current was filtered or averaged."
         )
     sentences.append(_held_out_sentence(diagnosis))
-    if worse_held_out(diagnosis.gap):
+    if effects_worsen_holdouts(diagnosis.gap):
         sentences.append(
             "The addition increases the error of the held-out runs: something else is missing that looks alike in the"
             " training runs. Include one of the held-out runs in the fit."

@@ -6,14 +6,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
 from ...effects import EFFECTS
 from ...effects.base import AbstractEffect
+from ..hypotheses.curves import Curve
 from ..hypotheses.effect_relations import CONTAINS, FULLER, unbalanced_equation
-from ..hypotheses.library import Curve
 from ..model import Model
 from .signals import Screen, Signal
 
@@ -60,7 +61,7 @@ class Assessment(NamedTuple):
     @property
     def clearest(self) -> Signal:
         """The signal with the largest gain."""
-        return max((*self.candidate_signals, *self.curve_signals), key=_gain)
+        return max((*self.candidate_signals, *self.curve_signals), key=attrgetter("gain"))
 
     @property
     def unexplained(self) -> float:
@@ -88,7 +89,7 @@ class Assessment(NamedTuple):
             or self.best_candidate_share < EFFECT_SHARE
         ):
             return False
-        best = max(self.candidate_signals, key=_gain).candidate
+        best = max(self.candidate_signals, key=attrgetter("gain")).candidate
         return best is not None and not best.own_phase
 
     def exceeds_model_form_error(self, model: Model) -> bool:
@@ -161,16 +162,12 @@ class Assessment(NamedTuple):
         """
         if _has_refit_only(model) or self.p_value >= FALSE_ALARM or self.best_candidate_share < EFFECT_SHARE:
             return False
-        best_curve = max(self.curve_signals, key=_gain)
-        best = max(self.candidate_signals, key=_gain).candidate
+        best_curve = max(self.curve_signals, key=attrgetter("gain"))
+        best = max(self.candidate_signals, key=attrgetter("gain")).candidate
         assert isinstance(best_curve.term, Curve) and best is not None
         # of model-form error a curve over the effect's own variable explains nearly all
         own_curve = has_axes_of(model, best_curve.term) and best_curve.gain > CURVE_SHARE * self.clearest.gain
         return not (own_curve or has_axes_of(model, EFFECTS[best.effect]))
-
-
-def _gain(signal: Signal) -> float:
-    return signal.gain
 
 
 def _has_refit_only(model: Model) -> bool:

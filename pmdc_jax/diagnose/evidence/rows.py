@@ -19,7 +19,7 @@ from ...identify.noise.noise_model import Series, Whitener
 from ...motor import Motor
 from ...runtime.compiled import compiled
 from ...simulate import Tape
-from ..hypotheses.library import Change, columns_at_once
+from ..hypotheses.change import Change, columns_at_once
 from ..model import Model, RunSeries, series_of_runs
 from ..response import Path, respond
 from .quantisation import rounding_errors

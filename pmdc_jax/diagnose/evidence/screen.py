@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain
+from operator import attrgetter
 
 import numpy as np
 
 from ...identify.noise.noise_model import Series, Whitener, fit_whitener, scaling_whitener
 from ...simulate import UNKNOWNS_PER_RUN
-from ..hypotheses.library import Curve, Library, curves_along
+from ..hypotheses.curves import Curve, curves_along
+from ..hypotheses.library import Library
 from ..model import Model
 from .quantisation import ROUNDING_DRAWS
 from .regression import Block, Evidence, consecutive_blocks, gather_evidence
@@ -75,7 +77,7 @@ def _without_clearest(plain: Screen, rows: Sequence[Rows]) -> list[Series]:
     """The residuals of each run less the most significant candidate or shared curve, and all that is fitted with it."""
     candidate_signals, curve_signals = signals(plain)
     clearest = min(
-        (s for s in (*candidate_signals, *curve_signals) if s.candidate or _is_definite(s)), key=lambda s: s.log_p
+        (s for s in (*candidate_signals, *curve_signals) if s.candidate or _is_definite(s)), key=attrgetter("log_p")
     ).block
     best = plain.evidence.regress([clearest])
     columns = np.array(clearest.columns) - plain.evidence.first_column

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +12,8 @@ from scipy import special, stats
 from ...effects import EFFECTS
 from ...identify.noise.noise_model import Whitener
 from ..hypotheses.candidates import Candidate
+from ..hypotheses.curves import Curve
 from ..hypotheses.effect_relations import unbalanced_equation
-from ..hypotheses.library import Curve
 from .regression import Block, Evidence
 
 # Factor by which slow noise may be stronger at the slowest sinusoids of the angle than at most of them
@@ -88,6 +89,12 @@ class Signal(NamedTuple):
         """The candidate, if it is one."""
         return self.term if isinstance(self.term, Candidate) else None
 
+    @property
+    def effect(self) -> str:
+        """The name of the candidate's effect."""
+        assert self.candidate is not None
+        return self.candidate.effect
+
 
 def signals(screen: Screen) -> tuple[list[Signal], list[Signal]]:
     """The signals of all possible candidates, and those of all curves; each list the most significant first."""
@@ -95,8 +102,8 @@ def signals(screen: Screen) -> tuple[list[Signal], list[Signal]]:
     gains = np.array([_gain_of_curve(screen, curve, block) for curve, block in pairs])
     ripple_gains = {c.periods: gain for c, gain in zip(screen.curves, gains, strict=True) if c.is_sensor_ripple}
     return (
-        sorted(_candidate_signals(screen, ripple_gains), key=_log_p),
-        sorted(_curve_signals(screen, gains), key=_log_p),
+        sorted(_candidate_signals(screen, ripple_gains), key=attrgetter("log_p")),
+        sorted(_curve_signals(screen, gains), key=attrgetter("log_p")),
     )
 
 
@@ -225,10 +232,6 @@ def gain_common_to_waves(evidence: Evidence, gained: Sequence[tuple[Candidate, B
             beyond = gain - stats.chi2.median(evidence.degrees_of_freedom(block))
             by_period.setdefault(candidate.effect, []).append(max(beyond, 0.0))
     return {effect: float(np.median(beyond)) for effect, beyond in by_period.items()}
-
-
-def _log_p(signal: Signal) -> float:
-    return signal.log_p
 
 
 def log_p_value(gain: float, degrees_of_freedom: int) -> float:

@@ -11,7 +11,7 @@ from ..hypotheses.effect_relations import CONTAINS, FULLER, with_split_friction
 from ..model import MAX_EFFECTS, Model
 from .compare import BIC_MARGIN, Comparison
 from .refits import Refits
-from .shortlist import COMPARABLE_GAIN, clear_signals, effect_of, of_largest_gain
+from .shortlist import COMPARABLE_GAIN, clear_signals, of_largest_gain
 
 # A simpler form may leave at most so many times the unfiltered squares of the richer one
 MAX_MISFIT_GROWTH = 1.5
@@ -62,7 +62,7 @@ class BackwardElimination:
         if len(simpler.effects) == MAX_EFFECTS:
             return None
         assessment = self.assess(simpler)
-        by_effect = {effect_of(s): s for s in clear_signals(assessment)}
+        by_effect = {s.effect: s for s in clear_signals(assessment)}
         least = COMPARABLE_GAIN * by_effect[rich].gain if rich in by_effect else 0.0
         present = set(simpler.effects)
         others = [

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import NamedTuple, TypeGuard
 
 import numpy as np
@@ -17,15 +18,14 @@ from ...identify.prepare import Prepared
 from ...identify.solve import Solved
 from ...progress import ReportProgress
 from ..diagnosis import VaryingParameter
-from ..evidence.assessment import FALSE_ALARM, REFIT_ONLY, has_axes_of
+from ..evidence.assessment import FALSE_ALARM, REFIT_ONLY, Assessment, familywise_p_value, has_axes_of
 from ..evidence.constancy import varying_parameter
 from ..evidence.periodic import Line, line_of
-from ..evidence.screen import share_beyond
-from ..evidence.signals import Screen
+from ..evidence.screen import screen, share_beyond
+from ..evidence.signals import Screen, signals
 from ..hypotheses.effect_relations import are_rivals
 from ..hypotheses.library import Library
-from ..model import Model, final_fit
-from .assessor import Assessor
+from ..model import MAX_EFFECTS, Model, final_fit
 from .compare import BIC_MARGIN, DECISIVE_RATIO, Comparison, Fitted, simplest_equivalent
 from .elimination import BackwardElimination
 from .proposals import Proposals, Proposed
@@ -72,7 +72,7 @@ class StepwiseSelection:
         self.base, self.library = base, Library(base)
         self.comparison = Comparison()
         self.refits = Refits(base, solved, self.library.scales, self.comparison, report)
-        self.assess = Assessor(base, self.library, self.comparison)
+        self.assess = cache(self._assess)
         # by effect: alternatives that were as good when it was added
         self.equivalents: dict[str, set[str]] = {}
         # models that are not returned to: by different filters, each of two may look like the better one
@@ -98,6 +98,20 @@ class StepwiseSelection:
         """The naming for the chosen set without one of its effects."""
         white = self.comparison.filter_of(named.chosen)
         return self._naming(self.refits.without(named.chosen, effect, white))
+
+    def _assess(self, model: Model) -> Assessment:
+        """The evidence against a model."""
+        evidence = screen(model, self.library)
+        candidate_signals, curve_signals = signals(evidence)
+        count = len(evidence.candidates) + len(evidence.curves)
+        count *= MAX_EFFECTS if model.effects else 1
+        p_value = 1.0 if model.is_exact else familywise_p_value(candidate_signals, curve_signals, count)
+        explained = 0.0
+        if model.effects:
+            base, fitted = (self.comparison.fitted(m, evidence.white) for m in (self.base, model))
+            explained = base.squares - fitted.squares
+        explained_unfiltered = self.base.fit.fitness - model.fit.fitness
+        return Assessment(evidence, candidate_signals, curve_signals, p_value, explained, explained_unfiltered)
 
     def _step(self, current: Model) -> Model | None:
         """The next model: of several kinds of proposals the first that is better and accepted; None if there is none.

@@ -7,6 +7,7 @@ has no column in the regression, such as backlash for a compliant shaft.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
+from operator import attrgetter
 
 from ...effects import EFFECTS
 from ..evidence.assessment import FALSE_ALARM, REFIT_ONLY, TRIAL_SHARE, Assessment
@@ -20,7 +21,6 @@ from .shortlist import (
     SHORTLIST,
     additional_effects,
     clear_signals,
-    effect_of,
     most_promising,
     of_largest_gain,
     richer_form,
@@ -74,10 +74,10 @@ class Proposals:
         motor's have moved far to compensate for two effects.
         """
         assessment = self.assess(current)
-        if not _is_room_for_another(current, assessment):
+        if not _may_add_effect(current, assessment):
             return []
         if current.effects:
-            others = [s for s in clear_signals(assessment) if effect_of(s) not in current.effects]
+            others = [s for s in clear_signals(assessment) if s.effect not in current.effects]
             likeliest = of_largest_gain(others)
         else:
             likeliest = shortlist(current, assessment)
@@ -87,12 +87,12 @@ class Proposals:
         """The current model with the effect of the largest gain among those that were clear before its own were added:
         the whitening filter of what is left now may absorb it."""
         assessment = self.assess(current)
-        if not _is_room_for_another(current, assessment):
+        if not _may_add_effect(current, assessment):
             return []
         present = set(current.effects)
         earlier = [self.assess(m) for m in self.superseded if set(m.effects) < present]
-        clear = {effect_of(s) for before in earlier for s in clear_signals(before)}
-        others = [s for s in assessment.candidate_signals if effect_of(s) in clear - present]
+        clear = {s.effect for before in earlier for s in clear_signals(before)}
+        others = [s for s in assessment.candidate_signals if s.effect in clear - present]
         return self._with_signals(current, of_largest_gain(others))
 
     def by_unfiltered_misfit(self, current: Model) -> Proposed:
@@ -113,23 +113,23 @@ class Proposals:
         assessment = self.assess(current)
         if len(current.effects) < MAX_EFFECTS or assessment.p_value >= FALSE_ALARM or assessment.is_negligible(current):
             return []
-        others = [s for s in clear_signals(assessment) if effect_of(s) not in current.effects]
+        others = [s for s in clear_signals(assessment) if s.effect not in current.effects]
         if not others:
             return []
-        new = effect_of(max(others, key=lambda s: s.gain))
+        new = max(others, key=attrgetter("gain")).effect
         tried: Proposed = []
         for old in current.effects:
             if EFFECTS[old].equation == EFFECTS[new].equation:
                 smaller = self.refits.without(current, old, assessment.screen.white)
                 signals = self.assess(smaller).candidate_signals
-                of_new = [s for s in signals if effect_of(s) == new][:1]
+                of_new = [s for s in signals if s.effect == new][:1]
                 tried += self._with_signals(smaller, of_new)
         return tried
 
     def in_other_forms(self, model: Model, added: set[str]) -> Proposed:
         """The model with the effects added last replaced by a richer or a refit-only form."""
         richer = richer_form(model, self.assess(model), TRIAL_SHARE)
-        of_added = [s for s in richer if CONTAINS[effect_of(s)] & added]
+        of_added = [s for s in richer if CONTAINS[s.effect] & added]
         replaced = self._with_signals(model, of_added)
         return replaced + self.in_refit_only_forms(model, added)
 
@@ -177,7 +177,7 @@ class Proposals:
             suspects, noise = nearest.effects, POOR_MISFIT * current.prepared.problem.outputs
         else:
             by_gain = sorted(self.assess(current).candidate_signals, key=lambda s: -s.gain)
-            suspects = tuple(dict.fromkeys(effect_of(s) for s in by_gain))[:SHORTLIST]
+            suspects = tuple(dict.fromkeys(s.effect for s in by_gain))[:SHORTLIST]
             nearest, noise = current, current.prepared.problem.outputs
         sticks = any(EFFECTS[effect].holds == "speed" for effect in suspects)
         decisive = nearest.fit.fitness / DECISIVE_RATIO
@@ -193,7 +193,7 @@ class Proposals:
         return self.refits.with_signals(current, signals, self.assess(current).screen)
 
 
-def _is_room_for_another(current: Model, assessment: Assessment) -> bool:
+def _may_add_effect(current: Model, assessment: Assessment) -> bool:
     """Whether one more effect may be missing, rather than model-form error or an error of a sensor."""
     return (
         len(current.effects) < MAX_EFFECTS

@@ -27,7 +27,6 @@ from ..hypotheses.effect_relations import FULLER
 from ..hypotheses.trials import TRIALS
 from ..model import Model, model_of, refit_from
 from .compare import Comparison
-from .shortlist import effect_of
 from .starts import Start, Starts, effects_with
 
 # Share of the gain promised by the evidence that a refit must realise; otherwise it is fitted in another way
@@ -83,7 +82,7 @@ class Refits:
 
     def _addition(self, current: Model, signal: Signal, found: Screen) -> tuple[tuple[str, ...], Refit]:
         """The effects with that of a signal added, and what fits them."""
-        effects = effects_with(current.effects, effect_of(signal))
+        effects = effects_with(current.effects, signal.effect)
         start = self.starts.from_signal(current, effects, signal, found)
 
         def refit() -> Model | None:

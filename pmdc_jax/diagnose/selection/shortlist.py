@@ -34,11 +34,11 @@ def additional_effects(current: Model, assessment: Assessment) -> list[Signal]:
     If what is left may be the model-form error of the clearest effect, only effects with `Trial.starts` are tried,
     which do more than their columns show; and none if it is a harmonic, which the teeth of a gear would imitate.
     """
-    ranked = [s for s in clear_signals(assessment) if effect_of(s) not in current.effects]
+    ranked = [s for s in clear_signals(assessment) if s.effect not in current.effects]
     if _may_be_form_of_clearest(current, assessment):
         if assessment.is_harmonic_of(current):
             return []
-        ranked = [s for s in ranked if TRIALS[effect_of(s)].starts]
+        ranked = [s for s in ranked if TRIALS[s.effect].starts]
     # by gain: what may be slow noise has less significance, but is tried for what it explains
     ranked.sort(key=lambda s: -s.gain)
     # where little is left, an effect is accepted only if it explains nearly all of it, so weak ones do no harm
@@ -59,9 +59,9 @@ def _may_be_form_of_clearest(current: Model, assessment: Assessment) -> bool:
         return False
     first = significant[0]
     return (
-        effect_of(first) in current.effects
+        first.effect in current.effects
         and first.gain > TRIAL_SHARE * max(s.gain for s in significant)
-        and EFFECTS[effect_of(first)].equation != "sensor"
+        and EFFECTS[first.effect].equation != "sensor"
     )
 
 
@@ -73,8 +73,8 @@ def most_promising(signals: Sequence[Signal], present: set[str], least: float) -
     """
     best: dict[str, Signal] = {}
     for s in sorted(signals, key=lambda s: -s.gain):
-        if effect_of(s) not in present:
-            best.setdefault(effect_of(s), s)
+        if s.effect not in present:
+            best.setdefault(s.effect, s)
     ranked = list(best.values())[:SHORTLIST]
     return [s for s in ranked if s.gain > max(TRIAL_SHARE * ranked[0].gain, least)]
 
@@ -87,7 +87,7 @@ def clear_signals(assessment: Assessment) -> list[Signal]:
     """
     best: dict[str, Signal] = {}
     for s in assessment.candidate_signals:
-        best.setdefault(effect_of(s), s)
+        best.setdefault(s.effect, s)
     log_level, curve = (np.log(FALSE_ALARM / len(assessment.screen.candidates)), assessment.curve_signals[0])
     large_gain = TRIAL_SHARE * curve.gain if curve.log_p < log_level else np.inf
     return [s for s in best.values() if s.log_p < log_level or s.gain > large_gain]
@@ -101,16 +101,10 @@ def richer_form(current: Model, assessment: Assessment, share: float = EFFECT_SH
     return [
         s
         for s in clear_signals(assessment)
-        if CONTAINS.get(effect_of(s), set()) & present and effect_of(s) not in current.effects and s.gain > least
+        if CONTAINS.get(s.effect, set()) & present and s.effect not in current.effects and s.gain > least
     ][:1]
 
 
 def of_largest_gain(signals: Sequence[Signal]) -> list[Signal]:
     """The signal of the largest gain; empty if there is none."""
     return sorted(signals, key=lambda s: -s.gain)[:1]
-
-
-def effect_of(signal: Signal) -> str:
-    """The name of the effect that a candidate's signal is of."""
-    assert signal.candidate is not None
-    return signal.candidate.effect
