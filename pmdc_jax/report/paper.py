@@ -22,11 +22,13 @@ from ..wheelchair import (
     SUFFICIENT_VOLTAGE,
     TABLE_2,
     VOLTAGE,
+    AsPrinted,
     Paper,
     Recovered,
     load_errors,
 )
 from .figures import INPUT, MEASURED, RESIDUAL, SIMULATED, style
+from .json import plain
 from .notation import pretty_unit, significant, thousands
 from .page import figure_json, write_page
 from .terminal import plain_table
@@ -128,34 +130,35 @@ def paper_tables(paper: Paper) -> RenderableType:
 
 def paper_json(paper: Paper) -> dict[str, Any]:
     """All numbers as plain dictionaries, for JSON."""
-    return {
-        "table_1": {
-            one.method: {
-                "parameters": {n: float(getattr(one.motor, n)) for n in PARAMETERS},
-                "error_percent": one.errors,
-                "evaluations": one.evaluations,
-                "seconds": one.seconds,
-            }
-            for one in paper.recovered
-        },
-        "table_2": {
-            kind: {
-                "printed": {"Overshoot": printed.overshoot, "SettlingTime": printed.settling},
-                "simulated_as_printed": _as_printed_json(paper, kind),
-                "ours": dict(paper.tunings[kind].metrics),
-            }
-            for kind, printed in TABLE_2.items()
-        },
-        "fastest_possible_settling_s": {f"{volts:g} V": s for volts, s in paper.fastest.items()},
-        "reach_rad_s": {f"{VOLTAGE:g} V": paper.reach},
-        "remarks": remarks(paper),
-    }
+    return plain(
+        {
+            "table_1": {
+                one.method: {
+                    "parameters": {name: float(getattr(one.motor, name)) for name in PARAMETERS},
+                    "error_percent": one.errors,
+                    "evaluations": one.evaluations,
+                    "seconds": one.seconds,
+                }
+                for one in paper.recovered
+            },
+            "table_2": {
+                kind: {
+                    "printed": {"Overshoot": printed.overshoot, "SettlingTime": printed.settling},
+                    "simulated_as_printed": _as_printed_json(paper.as_printed.get(kind)),
+                    "ours": paper.tunings[kind].metrics,
+                }
+                for kind, printed in TABLE_2.items()
+            },
+            "fastest_possible_settling_s": {f"{volts:g} V": s for volts, s in paper.fastest.items()},
+            "reach_rad_s": {f"{VOLTAGE:g} V": paper.reach},
+            "remarks": remarks(paper),
+        }
+    )
 
 
-def _as_printed_json(paper: Paper, kind: str) -> dict[str, float] | None:
-    if kind not in paper.as_printed:
+def _as_printed_json(printed: AsPrinted | None) -> dict[str, float] | None:
+    if printed is None:
         return None
-    printed = paper.as_printed[kind]
     return {"Overshoot": printed.overshoot, "SettlingTime": printed.settling, "PeakVoltage": printed.peak_voltage}
 
 

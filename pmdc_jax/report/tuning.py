@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from attrs import asdict
+from attrs import asdict, filters
 from rich.console import Group, RenderableType
 from rich.text import Text
 
@@ -15,6 +15,7 @@ from ..control.objective import SECOND_SETPOINT
 from ..control.remarks import CURRENT_TO_REPORT
 from ..control.specification import NO_OVERSHOOT
 from ..control.tuning import Tuning
+from .json import plain
 from .notation import NARROW_SPACE, UNKNOWN, percent, pretty_unit, significant
 from .terminal import plain_table
 
@@ -41,49 +42,43 @@ COMPARISON_HEADINGS = (
 
 def tuning_json(tuning: Tuning) -> dict[str, Any]:
     """A tuning as plain dictionaries, lists, finite numbers and None, for JSON."""
-    content = law_content(tuning.law)
-    limits = content.pop("limits")
-    content.pop("format")
-    return {
-        "controller": content,
-        "limits": limits,
-        "setpoint_rad_s": tuning.setpoint,
-        "metrics": dict(tuning.metrics),
-        "fastest_possible_settling_s": tuning.fastest_possible_settling,
-        "robust": _robust_json(tuning.robust),
-        "load": {"torque_Nm": tuning.load_torque, **tuning.load},
-        "second_step": {"to_rad_s": SECOND_SETPOINT * tuning.setpoint, **tuning.candidates[0].second_step},
-        "small_step": {"to_rad_s": SMALL_STEP * tuning.setpoint, **tuning.candidates[0].small_step},
-        "margins": asdict(tuning.margins),
-        "noise": {"speed_rad_s": tuning.requirements.sensor_noise, "voltage_V": tuning.voltage_noise},
-        "peak_current_A": tuning.peak_current,
-        "meets_specification": tuning.meets_specification,
-        "candidates": [_candidate_json(one) for one in tuning.candidates],
-        "seed": tuning.seed,
-        "seconds": dict(tuning.seconds),
-        "messages": list(tuning.messages),
-    }
+    law = law_content(tuning.law)
+    return plain(
+        {
+            "controller": {name: value for name, value in law.items() if name not in ("format", "limits")},
+            "limits": law["limits"],
+            "setpoint_rad_s": tuning.setpoint,
+            "metrics": tuning.metrics,
+            "fastest_possible_settling_s": tuning.fastest_possible_settling,
+            "robust": _robust_json(tuning.robust),
+            "load": {"torque_Nm": tuning.load_torque, **tuning.load},
+            "second_step": {"to_rad_s": SECOND_SETPOINT * tuning.setpoint, **tuning.candidates[0].second_step},
+            "small_step": {"to_rad_s": SMALL_STEP * tuning.setpoint, **tuning.candidates[0].small_step},
+            "margins": tuning.margins,
+            "noise": {"speed_rad_s": tuning.requirements.sensor_noise, "voltage_V": tuning.voltage_noise},
+            "peak_current_A": tuning.peak_current,
+            "meets_specification": tuning.meets_specification,
+            "candidates": [_candidate_json(one) for one in tuning.candidates],
+            "seed": tuning.seed,
+            "seconds": tuning.seconds,
+            "messages": tuning.messages,
+        }
+    )
 
 
 def _candidate_json(one: EvaluatedController) -> dict[str, Any]:
     return {
         "name": one.name,
         "gains": gains_of(one.controller),
-        "metrics": dict(one.metrics),
+        "metrics": one.metrics,
         "robust": _robust_json(one.robust),
         "stable": one.stable,
     }
 
 
 def _robust_json(robust: Robustness | None) -> dict[str, Any] | None:
-    if robust is None:
-        return None
-    return {
-        "samples": robust.samples,
-        "Overshoot_p95": robust.Overshoot_p95,
-        "SettlingTime_p95": robust.SettlingTime_p95,
-        "PeakCurrent_p95": robust.PeakCurrent_p95,
-    }
+    """The percentiles, without the values of every motor."""
+    return None if robust is None else asdict(robust, filter=filters.exclude("overshoot", "settling"))
 
 
 def summary(tuning: Tuning) -> list[str]:
