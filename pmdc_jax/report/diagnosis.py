@@ -8,8 +8,7 @@ from typing import Any
 
 import plotly.graph_objects as go
 
-from ..diagnose.diagnosis import Diagnosis, EffectFound, Gap, LearnedCurve, NextExperiment, Region
-from ..effects import EFFECTS
+from ..diagnose.diagnosis import Diagnosis, Gap, LearnedCurve, NextExperiment, Region
 from ..identify.identification import RunFit
 from ..words import enumerate_words
 from .diagnosis_figures import (
@@ -21,29 +20,12 @@ from .diagnosis_figures import (
     residual_over_variable_figure,
     where_figure,
 )
-from .diagnosis_sentences import (
-    VERDICTS,
-    detectable_others,
-    drift_words,
-    drifts,
-    intervals_in_words,
-    judged_role,
-    verdict_sentences,
-)
+from .diagnosis_sentences import VERDICTS, intervals_in_words, judged_role, verdict_sentences
+from .diagnosis_tables import detectable_rows, drift_rows, effect_rows, gap_rows
 from .figures import points_per_trace
 from .identification import identification_content
 from .identification_sentences import role_word, runs_in_order
-from .notation import (
-    effect_words,
-    field_words,
-    fixed,
-    formula_text,
-    p_value_words,
-    percent,
-    significant,
-    value_with_unit,
-    write_estimate,
-)
+from .notation import effect_words, fixed, p_value_words, percent, significant, write_estimate
 from .page import figure_json, write_page
 
 # traces of one run in the figure of its residuals, and in that of its simulation: they share the points drawn
@@ -59,19 +41,19 @@ def write_diagnosis_report(diagnosis: Diagnosis, path: str | Path) -> None:
         verdict=diagnosis.verdict,
         summary=verdict_sentences(diagnosis),
         tiles=_tiles(diagnosis),
-        effects=[_effect(effect) for effect in diagnosis.effects],
+        effects=effect_rows(diagnosis),
         rivals=[enumerate_words([effect_words(e) for e in one]) for one in diagnosis.rivals],
         experiment=_experiment(diagnosis.next_experiment),
         where=[_region(region) for region in diagnosis.where],
         where_figure=_where_figure(diagnosis),
-        gaps=_gaps(diagnosis),
+        gaps=gap_rows(diagnosis),
         gap_figure=figure_json(_gap_figure(diagnosis)),
         residuals=_residuals(diagnosis),
         against=_residual_over_variable(diagnosis),
         varies=_varies(diagnosis),
         curves=[_curve(curve) for curve in diagnosis.curves],
-        drifts=_drifts(diagnosis),
-        detectable=_detectable(diagnosis),
+        drifts=drift_rows(diagnosis),
+        detectable=detectable_rows(diagnosis),
         **identification_content(diagnosis.final, TRACES_OF_RESIDUALS * len(diagnosis.final.fit)),
     )
 
@@ -93,19 +75,6 @@ def _tiles(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
         tiles.append(("Gap closed", percent(100 * diagnosis.closed_fraction), ""))
     tiles.append(("Effects added", str(len(diagnosis.effects)), ""))
     return tiles
-
-
-def _effect(effect: EffectFound) -> dict[str, Any]:
-    parameters = [
-        (field_words(effect.name, field), write_estimate(estimate)) for field, estimate in effect.parameters.items()
-    ]
-    return {
-        "label": EFFECTS[effect.name].label,
-        "formula": formula_text(effect.name),
-        "equation": effect.equation,
-        "parameters": parameters,
-        "chance": p_value_words(effect.p_value),
-    }
 
 
 def _experiment(experiment: NextExperiment | None) -> dict[str, Any] | None:
@@ -159,20 +128,6 @@ def _gap_by_run(diagnosis: Diagnosis) -> dict[str, Gap]:
     return {run: diagnosis.gap_of_run[run] for run, _ in runs_in_order(diagnosis.final)}
 
 
-def _gaps(diagnosis: Diagnosis) -> list[dict[str, str]]:
-    fits = diagnosis.final.fit
-    return [
-        {
-            "run": run,
-            "role": role_word(fits[run].role),
-            "before": significant(gap.before),
-            "after": significant(gap.after),
-            "floor": significant(gap.floor),
-        }
-        for run, gap in _gap_by_run(diagnosis).items()
-    ]
-
-
 def _residuals(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """A figure for each run of its residuals by two models; none if there is only one."""
     models = _compared(diagnosis)
@@ -217,18 +172,6 @@ def _curve(curve: LearnedCurve) -> dict[str, Any]:
     }
 
 
-def _drifts(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": one.name,
-            "before": write_estimate(one.before),
-            "after": write_estimate(one.after),
-            "moved": drift_words(one),
-        }
-        for one in (drifts(diagnosis) if diagnosis.effects else ())
-    ]
-
-
 def _varies(diagnosis: Diagnosis) -> dict[str, Any] | None:
     varies = diagnosis.varies
     if varies is None:
@@ -242,10 +185,3 @@ def _varies(diagnosis: Diagnosis) -> dict[str, Any] | None:
             for run, gap in diagnosis.gap_by_own_value.items()
         ],
     }
-
-
-def _detectable(diagnosis: Diagnosis) -> list[tuple[str, str, str]]:
-    return [
-        (EFFECTS[one.effect].label, field_words(one.effect, one.parameter), value_with_unit(one.amplitude, one.unit, 2))
-        for one in detectable_others(diagnosis)
-    ]

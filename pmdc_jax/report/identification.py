@@ -17,19 +17,10 @@ from .figures import (
     run_figure,
     search_figure,
 )
-from .identification_sentences import role_word, runs_in_order, status_word, summary
-from .notation import (
-    PARAMETER_NAMES,
-    EstimateText,
-    fixed,
-    parameter_words,
-    percent,
-    search_name,
-    significant,
-    thousands,
-    write_estimate,
-)
+from .identification_sentences import status_word, summary
+from .notation import PARAMETER_NAMES, EstimateText, parameter_words, percent, search_name, thousands, write_estimate
 from .page import figure_json, write_page
+from .terminal import FitRow, fit_rows
 
 
 def write_identification_report(identification: Identification, path: str | Path) -> None:
@@ -74,10 +65,8 @@ class _Parameter:
 
 @frozen
 class _Run:
-    name: str
+    row: FitRow
     anchor: str
-    role: str
-    numbers: dict[str, str]
     figure: str
     caption: str
 
@@ -116,30 +105,12 @@ def _parameters(identification: Identification) -> list[_Parameter]:
 
 
 def _runs(identification: Identification, points: int) -> list[_Run]:
-    return [
-        _Run(
-            name=name,
-            anchor=f"run-{number}",
-            role=role_word(fit.role),
-            numbers=_numbers(fit),
-            figure=figure_json(run_figure(fit, identification.noise, points)),
-            caption=_caption(fit, points),
-        )
-        for number, (name, fit) in enumerate(runs_in_order(identification), start=1)
-    ]
-
-
-def _numbers(fit: RunFit) -> dict[str, str]:
-    duration = fit.time[-1] - fit.time[0] if len(fit.time) else 0.0
-    return {
-        "samples": thousands(len(fit.time)),
-        "duration": f"{fixed(duration, 2)} s",
-        "speed_rmse": significant(fit.speed_rmse),
-        "speed_fit": percent(fit.speed_fit_percent),
-        "current_rmse": significant(fit.current_rmse),
-        "current_fit": percent(fit.current_fit_percent),
-        "load_offset": significant(fit.load_offset),
-    }
+    runs = []
+    for number, row in enumerate(fit_rows(identification), start=1):
+        fit = identification.fit[row.run]
+        figure = figure_json(run_figure(fit, identification.noise, points))
+        runs.append(_Run(row, f"run-{number}", figure, _caption(fit, points)))
+    return runs
 
 
 def _caption(fit: RunFit, points: int) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
-from attrs import evolve
+from attrs import evolve, frozen
 from rich.console import Console, Group, OverflowMethod, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -16,7 +16,7 @@ from ..progress import ReportProgress, silent
 from ..recordings.recording import Finding
 from ..words import enumerate_words
 from .identification_sentences import role_word, runs_in_order, status_word, summary
-from .notation import percent, significant, write_estimate
+from .notation import fixed, percent, significant, thousands, write_estimate
 
 STATUS_STYLES = {"identified": "green", "at_bound": "yellow", "not_identifiable": "red"}
 SEVERITY_STYLES = {"error": "red", "warning": "yellow"}
@@ -91,20 +91,45 @@ def status_text(estimate: Estimate) -> Text:
     return Text(status_word(estimate.status), STATUS_STYLES.get(estimate.status, ""))
 
 
-def _fit_table(identification: Identification) -> Table:
-    quantities = ("Speed RMSE\n[rad/s]", "Speed fit", "Current RMSE\n[A]", "Current fit")
-    rows = [
-        (
-            name,
+@frozen
+class FitRow:
+    """How a run is reproduced, as texts."""
+
+    run: str
+    role: str
+    samples: str
+    duration: str
+    speed_rmse: str
+    speed_fit: str
+    current_rmse: str
+    current_fit: str
+    load_offset: str
+
+
+def fit_rows(identification: Identification) -> list[FitRow]:
+    """A row for each run, hold-outs first."""
+    return [
+        FitRow(
+            run,
             role_word(fit.role),
+            thousands(len(fit.time)),
+            f"{fixed(fit.time[-1] - fit.time[0] if len(fit.time) else 0.0, 2)} s",
             significant(fit.speed_rmse),
             percent(fit.speed_fit_percent),
             significant(fit.current_rmse),
             percent(fit.current_fit_percent),
+            significant(fit.load_offset),
         )
-        for name, fit in runs_in_order(identification)
+        for run, fit in runs_in_order(identification)
     ]
-    headings = ("Run", "Role", *quantities)
+
+
+def _fit_table(identification: Identification) -> Table:
+    headings = ("Run", "Role", "Speed RMSE\n[rad/s]", "Speed fit", "Current RMSE\n[A]", "Current fit")
+    rows = [
+        (one.run, one.role, one.speed_rmse, one.speed_fit, one.current_rmse, one.current_fit)
+        for one in fit_rows(identification)
+    ]
     return plain_table("Free-run simulation", headings, rows, left=(0, 1), first_wraps="fold")
 
 
