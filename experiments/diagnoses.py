@@ -15,7 +15,7 @@ from rich.table import Table
 
 from experiments import emps, undcmotor
 from pmdc_jax import Diagnosis, diagnose
-from pmdc_jax.report.diagnosis import write_diagnosis_report
+from pmdc_jax.report.diagnosis.page import write_diagnosis_report
 
 OUT = Path(__file__).parent / "out"
 

@@ -4,7 +4,7 @@ from rich.console import Console
 
 from experiments.figures import OUT
 from pmdc_jax import paper
-from pmdc_jax.report.paper import paper_tables
+from pmdc_jax.report.paper.tables import paper_tables
 
 
 def main() -> None:

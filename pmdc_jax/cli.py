@@ -109,12 +109,12 @@ def identify(
     from .identify import identify
 
     identification = _read_and_fit(identify, runs, holdout, columns, options)
-    from .report.json import identification_json
-    from .report.terminal import identification_tables
+    from .report.identification.json import identification_json
+    from .report.identification.tables import identification_tables
 
     _print_findings_and_save(identification, save)
     if report:
-        from .report.identification import write_identification_report
+        from .report.identification.page import write_identification_report
 
         write_identification_report(identification, report)
     _write_and_print(identification, json, identification_json, identification_tables)
@@ -150,8 +150,8 @@ def diagnose(
     from .diagnose import diagnose
 
     diagnosis = _read_and_fit(diagnose, runs, holdout, columns, options)
-    from .report.diagnosis_tables import diagnosis_tables
-    from .report.json import diagnosis_json
+    from .report.diagnosis.json import diagnosis_json
+    from .report.diagnosis.tables import diagnosis_tables
 
     _print_findings_and_save(diagnosis.final, save)
     if experiment:
@@ -160,7 +160,7 @@ def diagnose(
         if not write_experiment(diagnosis, experiment):
             typer.echo(f"note: no experiment was designed, so {experiment} was not written", err=True)
     if report:
-        from .report.diagnosis import write_diagnosis_report
+        from .report.diagnosis.page import write_diagnosis_report
 
         write_diagnosis_report(diagnosis, report)
     _write_and_print(diagnosis, json, diagnosis_json, diagnosis_tables)
@@ -236,7 +236,8 @@ def tune(
             seed=seed,
             progress=on_progress,
         )
-    from .report.tuning import tuning_json, tuning_tables, write_tuning_report
+    from .report.tuning.json import tuning_json
+    from .report.tuning.tables import tuning_tables
 
     print_messages(tuning.messages)
     if save:
@@ -244,6 +245,8 @@ def tune(
 
         save_controller(save, tuning.law)
     if report:
+        from .report.tuning.page import write_tuning_report
+
         write_tuning_report(tuning, report)
     _write_and_print(tuning, json, tuning_json, tuning_tables)
 
@@ -270,7 +273,7 @@ def paper(out: Folder = Path("paper_out")) -> None:
     Prints its tables beside ours, and writes paper.html and paper.json with its figures to a folder.
     """
     from .paper import paper
-    from .report.paper import paper_tables
+    from .report.paper.tables import paper_tables
     from .report.terminal import print_tables, progress
 
     with progress() as on_progress:
@@ -288,9 +291,9 @@ def demo(out: Folder = Path("demo_out"), seed: Seed = 0) -> None:
     reports to a folder.
     """
     from .demo import FILES, demo
-    from .report.diagnosis_tables import diagnosis_tables
+    from .report.diagnosis.tables import diagnosis_tables
     from .report.terminal import print_findings, print_messages, print_tables, progress
-    from .report.tuning import tuning_tables
+    from .report.tuning.tables import tuning_tables
 
     with progress() as on_progress:
         diagnosis, tuning = demo(out, seed=seed, progress=on_progress)

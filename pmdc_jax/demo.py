@@ -37,9 +37,10 @@ def demo(out: str | Path = "demo_out", seed: int = 0, progress: ReportProgress |
     from .control.pipeline import tune
     from .diagnose import diagnose
     from .motor_file import save_motor
-    from .report.diagnosis import write_diagnosis_report
-    from .report.json import diagnosis_json, write_json
-    from .report.tuning import write_tuning_report
+    from .report.diagnosis.json import diagnosis_json
+    from .report.diagnosis.page import write_diagnosis_report
+    from .report.json import write_json
+    from .report.tuning.page import write_tuning_report
 
     report, content, motor, page, controller = (folder / name for name in FILES)
     training, held_out = ([SAMPLE / f"{name}.csv" for name in names] for names in (TRAINING, HOLDOUT))

@@ -19,7 +19,8 @@ def paper(out: str | Path = "paper_out", progress: ReportProgress | None = None)
     drawn again; Table 2 is compared with what is physically possible.
     """
     from .report.json import write_json
-    from .report.paper import paper_json, write_paper_report
+    from .report.paper.json import paper_json
+    from .report.paper.page import write_paper_report
     from .wheelchair import reproduce
 
     folder = result_folder(Path(out), "paper.html")

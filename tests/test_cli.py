@@ -310,9 +310,10 @@ def faked_tuning(monkeypatch):
 
     replace_function(monkeypatch, "pmdc_jax.control.pipeline", "tune", tune)
     replace_function(monkeypatch, "pmdc_jax.control.controller_file", "save_controller", write)
-    report = "pmdc_jax.report.tuning"
-    replace_function(monkeypatch, report, "write_tuning_report", lambda tuning, path: write(path))
-    replace_function(monkeypatch, report, "tuning_tables", lambda tuning: "gains")
+    replace_function(
+        monkeypatch, "pmdc_jax.report.tuning.page", "write_tuning_report", lambda tuning, path: write(path)
+    )
+    replace_function(monkeypatch, "pmdc_jax.report.tuning.tables", "tuning_tables", lambda tuning: "gains")
     return calls
 
 

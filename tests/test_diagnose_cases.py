@@ -17,7 +17,7 @@ from experiments.bench import recording
 from pmdc_jax import Recording
 from pmdc_jax.diagnose import Diagnosis, diagnose
 from pmdc_jax.recordings.recording_file import read_recording
-from pmdc_jax.report.diagnosis_sentences import verdict_sentences
+from pmdc_jax.report.diagnosis.sentences import verdict_sentences
 
 
 def excitations(rng: np.random.Generator) -> dict[str, vb.Excitation]:

@@ -28,12 +28,14 @@ from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify.identification import Estimate
 from pmdc_jax.recordings.recording import Finding
 from pmdc_jax.report import notation
-from pmdc_jax.report.diagnosis import write_diagnosis_report
-from pmdc_jax.report.diagnosis_figures import averages
-from pmdc_jax.report.diagnosis_sentences import drifts, intervals_in_words, verdict_sentences
-from pmdc_jax.report.diagnosis_tables import diagnosis_tables
+from pmdc_jax.report.diagnosis.drift import drifts
+from pmdc_jax.report.diagnosis.figures import averages
+from pmdc_jax.report.diagnosis.json import diagnosis_json
+from pmdc_jax.report.diagnosis.page import write_diagnosis_report
+from pmdc_jax.report.diagnosis.places import intervals_in_words
+from pmdc_jax.report.diagnosis.sentences import verdict_sentences
+from pmdc_jax.report.diagnosis.tables import diagnosis_tables
 from pmdc_jax.report.experiment import write_experiment
-from pmdc_jax.report.json import diagnosis_json
 from pmdc_jax.report.notation import formula_text
 
 STRIBECK = {

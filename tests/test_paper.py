@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pmdc_jax.paper import paper
-from pmdc_jax.report.paper import table_1
+from pmdc_jax.report.paper.tables import table_1
 from pmdc_jax.wheelchair import (
     FILTER_RATIO,
     PRINTED,

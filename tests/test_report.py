@@ -16,12 +16,15 @@ from pmdc_jax.errors import InputError
 from pmdc_jax.identify.identification import Direction, Estimate, Identification, RunFit, Search
 from pmdc_jax.motor import Motor
 from pmdc_jax.recordings.recording import Finding
-from pmdc_jax.report import figures, notation
-from pmdc_jax.report.identification import write_identification_report
-from pmdc_jax.report.identification_sentences import MODEL_ASSUMPTION, summary
-from pmdc_jax.report.json import identification_json, write_json
+from pmdc_jax.report import notation
+from pmdc_jax.report.figures import envelope
+from pmdc_jax.report.identification.figures import correlations, run_figure
+from pmdc_jax.report.identification.json import identification_json
+from pmdc_jax.report.identification.page import write_identification_report
+from pmdc_jax.report.identification.sentences import MODEL_ASSUMPTION, summary
+from pmdc_jax.report.identification.tables import identification_tables
+from pmdc_jax.report.json import write_json
 from pmdc_jax.report.page import _commands
-from pmdc_jax.report.terminal import identification_tables
 
 TRUTH = {"R": 0.157, "L": 84e-6, "Kb": 0.0501, "Kt": 0.0501, "J": 1.21e-3, "f": 2.3e-4}
 UNITS = {"R": "ohm", "L": "H", "Kb": "V s/rad", "Kt": "N m/A", "J": "kg m^2", "f": "N m s/rad"}
@@ -236,9 +239,9 @@ def test_hold_out_runs_are_shown_first(tmp_path):
 
 def test_missing_quantities_are_left_out_of_the_figure():
     fits = partial_identification().fit
-    no_voltage = figures.run_figure(fits["coast <down> & out"], {}, 1000)
+    no_voltage = run_figure(fits["coast <down> & out"], {}, 1000)
     assert [trace.name for trace in no_voltage.data] == ["measured", "simulated", "measured", "residual"]
-    no_current = figures.run_figure(fits["speed only"], {}, 1000)
+    no_current = run_figure(fits["speed only"], {}, 1000)
     assert [trace.name for trace in no_current.data] == [*("measured", "simulated", "simulated", "applied", "residual")]
 
 
@@ -260,20 +263,20 @@ def test_envelope_keeps_peaks_order_and_gaps():
     values = rng.standard_normal(10_001)
     values[7_777], values[3_333] = 50.0, -50.0
     values[:500] = np.nan
-    thin_time, thin = figures.envelope(time, values, 400)
+    thin_time, thin = envelope(time, values, 400)
     assert len(thin) <= 400
     assert np.nanmax(thin) == 50
     assert np.nanmin(thin) == -50
     assert np.all(np.diff(thin_time) >= 0)
     assert np.isnan(thin[:4]).all()
-    short_time, short = figures.envelope(time[:50], values[600:650], 400)
+    short_time, short = envelope(time[:50], values[600:650], 400)
     np.testing.assert_allclose(short, values[600:650], rtol=1e-6)
     np.testing.assert_allclose(short_time, time[:50], rtol=1e-6)
 
 
 def test_correlations_omit_fixed_parameters():
     covariance = np.array([[4.0, 0.0, 3.0], [0.0, 0.0, 0.0], [3.0, 0.0, 9.0]])
-    matrix, names = figures.correlations(covariance, ("R", "L", "Kb"))
+    matrix, names = correlations(covariance, ("R", "L", "Kb"))
     assert names == ("R", "Kb")
     np.testing.assert_allclose(matrix, [[1, 0.5], [0.5, 1]])
 

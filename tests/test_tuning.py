@@ -20,8 +20,10 @@ from pmdc_jax.control.tuning import Tuning
 from pmdc_jax.effects import CoggingTorque, SpeedSensorDelay
 from pmdc_jax.motor import Motor
 from pmdc_jax.report.notation import NARROW_SPACE
-from pmdc_jax.report.tuning import _current_sentence, summary, tuning_json, write_tuning_report
-from pmdc_jax.report.tuning_figures import _range, loop_figure
+from pmdc_jax.report.tuning.figures import _range, loop_figure
+from pmdc_jax.report.tuning.json import tuning_json
+from pmdc_jax.report.tuning.page import write_tuning_report
+from pmdc_jax.report.tuning.sentences import _current_sentence, summary
 
 MOTOR = Motor(**{name: np.asarray(value) for name, value in PAPER.items()})
 

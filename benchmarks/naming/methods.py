@@ -18,7 +18,7 @@ Runs = Mapping[str, Columns]
 def ours(runs: Runs, holdout: Runs) -> Answer:
     """`pmdc_jax.diagnose`."""
     import pmdc_jax
-    from pmdc_jax.report.json import diagnosis_json
+    from pmdc_jax.report.diagnosis.json import diagnosis_json
 
     result = pmdc_jax.diagnose(_recordings(runs), holdout=_recordings(holdout))
     return diagnosis_json(result)

@@ -8,7 +8,7 @@ from math import floor, isfinite, log10
 from attrs import evolve, frozen
 
 from ..effects import EFFECTS
-from ..identify.identification import Estimate
+from ..identify.identification import Estimate, Role, Status
 
 UNKNOWN = "–"
 NARROW_SPACE = "\u202f"  # narrow no-break space
@@ -73,6 +73,12 @@ def significant(value: float | None, digits: int = 3) -> str:
     return fixed(value, max(0, digits - 1 - _magnitude(value)))
 
 
+def estimate_words(estimate: Estimate) -> str:
+    """An estimate in running text, without its error: "61.20 mN·m"."""
+    written = write_estimate(estimate)
+    return f"{written.value} {written.unit}".strip()
+
+
 def value_with_unit(value: float, unit: str, digits: int = 3) -> str:
     """A number with its scaled unit: (0.00321, "N m") as "3.21 mN·m"."""
     exponent = engineering_exponent(value, unit)
@@ -124,6 +130,16 @@ def fixed(value: float | None, decimals: int) -> str:
     if value is None or not isfinite(value):
         return UNKNOWN
     return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def status_word(status: Status) -> str:
+    """The status of an estimate as printed in all reports."""
+    return status.replace("_", " ")
+
+
+def role_word(role: Role) -> str:
+    """The role of a run as printed in all reports."""
+    return "hold-out" if role == "holdout" else "training"
 
 
 def search_name(method: str) -> str:

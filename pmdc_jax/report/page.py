@@ -15,13 +15,14 @@ from plotly.offline import get_plotlyjs
 
 from ..files import write_text
 
+TEMPLATES = Path(__file__).parent / "templates"
 PACKAGES = ("pmdc_jax", "jax", "diffrax", "equinox", "optimistix", "evosax", "numpy", "plotly")
 
 
 def write_page(path: str | Path, template: str, **content: Any) -> None:
-    """Render a template of this folder with `content`, and write the page atomically."""
+    """Render a template of `TEMPLATES` with `content`, and write the page atomically."""
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,  # run and column names come from files
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

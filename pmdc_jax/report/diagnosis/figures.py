@@ -9,12 +9,11 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from ..diagnose.diagnosis import LearnedCurve, NextExperiment, Region
-from ..identify.identification import RunFit
-from .figures import INK, INPUT, RESIDUAL, RESIDUALS, SIMULATED, envelope, mark_noise, style
+from ...diagnose.diagnosis import LearnedCurve, NextExperiment, Region
+from ...identify.identification import RunFit
+from ..figures import INK, INPUT, RESIDUAL, RESIDUALS, SIMULATED, envelope, mark_noise, style
 
 T = TypeVar("T")
-
 # colours: without the effects, and with them
 BEFORE = RESIDUAL
 AFTER = SIMULATED

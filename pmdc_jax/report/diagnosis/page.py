@@ -1,4 +1,4 @@
-"""The report of a diagnosis: one HTML page, the identified motor at its end."""
+"""The HTML page of a diagnosis, the identified motor at its end."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ from typing import Any
 
 import plotly.graph_objects as go
 
-from ..diagnose.diagnosis import Diagnosis, Gap, LearnedCurve, NextExperiment, Region
-from ..identify.identification import RunFit
-from ..words import enumerate_words
-from .diagnosis_figures import (
+from ...diagnose.diagnosis import Diagnosis, Gap, LearnedCurve, NextExperiment, Region
+from ...identify.identification import RunFit
+from ...words import enumerate_words
+from ..figures import points_per_trace
+from ..identification.page import identification_content
+from ..identification.tables import runs_in_order
+from ..notation import effect_words, fixed, p_value_words, percent, role_word, significant, write_estimate
+from ..page import figure_json, write_page
+from .figures import (
     AXIS_TITLES,
     curve_figure,
     experiment_figure,
@@ -20,13 +25,9 @@ from .diagnosis_figures import (
     residual_over_variable_figure,
     where_figure,
 )
-from .diagnosis_sentences import VERDICTS, intervals_in_words, judged_role, verdict_sentences
-from .diagnosis_tables import detectable_rows, drift_rows, effect_rows, gap_rows
-from .figures import points_per_trace
-from .identification import identification_content
-from .identification_sentences import role_word, runs_in_order
-from .notation import effect_words, fixed, p_value_words, percent, significant, write_estimate
-from .page import figure_json, write_page
+from .places import intervals_in_words
+from .sentences import VERDICTS, judged_role, verdict_sentences
+from .tables import detectable_rows, drift_rows, effect_rows, gap_rows
 
 # traces of one run in the figure of its residuals, and in that of its simulation: they share the points drawn
 TRACES_OF_RESIDUALS = 4

@@ -7,20 +7,22 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from ..diagnose.diagnosis import Diagnosis
-from ..effects import EFFECTS
-from .diagnosis_sentences import detectable_others, drift_words, drifts, verdict_sentences
-from .identification_sentences import role_word, runs_in_order
-from .notation import (
+from ...diagnose.diagnosis import Diagnosis
+from ...effects import EFFECTS
+from ..identification.tables import parameter_table, runs_in_order, status_text
+from ..notation import (
     EstimateText,
     field_words,
     formula_text,
     p_value_words,
+    role_word,
     significant,
     value_with_unit,
     write_estimate,
 )
-from .terminal import parameter_table, plain_table, status_text
+from ..terminal import plain_table
+from .drift import drift_words, drifts
+from .sentences import detectable_others, verdict_sentences
 
 
 @frozen

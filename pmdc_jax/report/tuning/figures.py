@@ -9,10 +9,10 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from ..control.metrics import BAND
-from ..control.objective import SECOND_SETPOINT
-from ..control.tuning import Tuning
-from .figures import INPUT, MEASURED, RESIDUAL, SIMULATED, style
+from ...control.metrics import BAND
+from ...control.objective import SECOND_SETPOINT
+from ...control.tuning import Tuning
+from ..figures import INPUT, MEASURED, RESIDUAL, SIMULATED, style
 
 # rows of the loop figure
 SPEED = 1
@@ -20,10 +20,10 @@ VOLTAGE = 2
 CURRENT = 3
 AXIS_TITLES = {SPEED: "speed<br>[rad/s]", VOLTAGE: "voltage<br>[V]", CURRENT: "current<br>[A]"}
 HEIGHTS = [1.0, 0.6, 0.6]
-
 SPREAD_COLOUR = "rgba(163,176,192,0.35)"  # MEASURED, translucent
 LIMIT_LINE = {"color": RESIDUAL, "width": 0.8, "dash": "dot"}
 EVENT_LINE = {"color": RESIDUAL, "width": 1, "dash": "dash"}
+
 
 Traces = Iterator[tuple[int, go.Scatter]]  # each trace with its row
 

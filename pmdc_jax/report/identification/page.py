@@ -1,4 +1,4 @@
-"""The report of an identification: one HTML page."""
+"""The HTML page of an identification."""
 
 from __future__ import annotations
 
@@ -7,20 +7,22 @@ from typing import Any
 
 from attrs import frozen
 
-from ..identify.identification import Estimate, Identification, RunFit
-from .figures import (
-    correlation_figure,
-    correlations,
-    count_traces,
-    group_size,
-    points_per_trace,
-    run_figure,
-    search_figure,
+from ...identify.identification import Estimate, Identification, RunFit
+from ..figures import group_size, points_per_trace
+from ..notation import (
+    PARAMETER_NAMES,
+    EstimateText,
+    parameter_words,
+    percent,
+    search_name,
+    status_word,
+    thousands,
+    write_estimate,
 )
-from .identification_sentences import status_word, summary
-from .notation import PARAMETER_NAMES, EstimateText, parameter_words, percent, search_name, thousands, write_estimate
-from .page import figure_json, write_page
-from .terminal import FitRow, fit_rows
+from ..page import figure_json, write_page
+from .figures import correlation_figure, correlations, count_traces, run_figure, search_figure
+from .sentences import summary
+from .tables import FitRow, fit_rows
 
 
 def write_identification_report(identification: Identification, path: str | Path) -> None:

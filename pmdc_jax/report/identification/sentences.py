@@ -5,17 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from ..identify.identification import Estimate, Identification, Role, RunFit
-from ..words import enumerate_words
-from .notation import NARROW_SPACE, percent, significant
+from ...identify.identification import Estimate, Identification, RunFit
+from ...words import enumerate_words
+from ..notation import NARROW_SPACE, percent, significant
 
-STATUS_WORDS = {
-    "identified": "identified",
-    "at_bound": "at bound",
-    "tied": "tied",
-    "known": "known",
-    "not_identifiable": "not identifiable",
-}
 MODEL_ASSUMPTION = "The standard errors assume that the model lacks no effect: `pmdc diagnose` tests that."
 # an RMS residual up to this multiple of the noise counts as noise: the RMS of few samples scatters as much
 MAX_RMSE_TO_NOISE = 1.25
@@ -23,16 +16,6 @@ MAX_RMSE_TO_NOISE = 1.25
 MAX_CONSTANT_RATIO = 1.5
 # A refinement that stalls within so many standard errors of the best fit has found it all the same
 MAX_STALLED_DISTANCE = 3.0
-
-
-def status_word(status: str) -> str:
-    """The status as printed in all reports."""
-    return STATUS_WORDS.get(status, status.replace("_", " "))
-
-
-def role_word(role: Role) -> str:
-    """The role of a run as printed in all reports."""
-    return "hold-out" if role == "holdout" else "training"
 
 
 def summary(identification: Identification) -> list[str]:
@@ -99,11 +82,6 @@ def _unconverged_sentence(identification: Identification) -> str:
     )
 
 
-def runs_in_order(identification: Identification) -> list[tuple[str, RunFit]]:
-    """The runs, hold-outs first, because they are what tests the fit."""
-    return sorted(identification.fit.items(), key=lambda item: item[1].role != "holdout")
-
-
 def _identified_sentence(identification: Identification) -> str:
     parameters = identification.parameters
     identified = _with_status(identification, "identified")
@@ -138,7 +116,7 @@ def _precision_clause(estimates: dict[str, Estimate]) -> str:
 
 
 def _holdout_sentence(identification: Identification) -> str:
-    held_out = {name: fit for name, fit in runs_in_order(identification) if fit.role == "holdout"}
+    held_out = {name: fit for name, fit in identification.fit.items() if fit.role == "holdout"}
     if not held_out:
         return (
             "No run was held out, so the motor was not validated on data outside the fit:"

@@ -1,0 +1,1 @@
+"""The report of an identification: sentences, tables, figures, the HTML page, JSON."""

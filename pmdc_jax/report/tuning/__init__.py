@@ -1,0 +1,1 @@
+"""The report of a tuning: sentences, tables, figures, the HTML page, JSON."""
