@@ -22,7 +22,7 @@ from pmdc_jax.control.evaluation import Robustness
 from pmdc_jax.control.pipeline import VALIDATION_MOTORS, robustness, tune
 from pmdc_jax.control.spread import drawn_motors, even_spread
 from pmdc_jax.control.tuning import Tuning
-from pmdc_jax.wheelchair import PRINTED, SETPOINT
+from pmdc_jax.paper.printed import PRINTED, SETPOINT
 
 KINDS = ("pi", "pid", "state-feedback")
 IDEAL = {"sample_time": 1e-4, "delay": 0, "max_overshoot": 0.06}

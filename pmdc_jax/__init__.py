@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .identify.pipeline import identify
     from .motor import Motor
     from .motor_file import load_motor, load_speed_noise, load_uncertainty, save_motor
-    from .paper import paper
+    from .paper.pipeline import paper
     from .recordings.recording import Recording
     from .recordings.recording_file import read_recording, write_recording
     from .simulate import simulate
@@ -43,7 +43,7 @@ _HOME = {
     "load_motor": "motor_file",
     "load_speed_noise": "motor_file",
     "load_uncertainty": "motor_file",
-    "paper": "paper",
+    "paper": "paper.pipeline",
     "read_recording": "recordings.recording_file",
     "save_controller": "control.controller_file",
     "save_motor": "motor_file",

@@ -272,7 +272,7 @@ def paper(out: Folder = Path("paper_out")) -> None:
 
     Prints its tables beside ours, and writes paper.html and paper.json with its figures to a folder.
     """
-    from .paper import paper
+    from .paper.pipeline import paper
     from .report.paper.tables import paper_tables
     from .report.terminal import print_tables, progress
 

@@ -37,9 +37,9 @@ ALLOWED_IMPORTS = {
         "files",
         "identify",
         "motor",
+        "paper",
         "progress",
         "recordings",
-        "wheelchair",
         "words",
     },
 }

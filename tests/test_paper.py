@@ -6,18 +6,10 @@ import control
 import numpy as np
 import pytest
 
-from pmdc_jax.paper import paper
+from pmdc_jax.paper.pipeline import paper
+from pmdc_jax.paper.printed import PRINTED, SETPOINT, TABLE_1, TABLE_2
+from pmdc_jax.paper.reproduction import FILTER_RATIO, Paper, Recovered, simulated_as_printed
 from pmdc_jax.report.paper.tables import table_1
-from pmdc_jax.wheelchair import (
-    FILTER_RATIO,
-    PRINTED,
-    SETPOINT,
-    TABLE_1,
-    TABLE_2,
-    Paper,
-    Recovered,
-    simulated_as_printed,
-)
 
 
 @pytest.mark.parametrize("kind", ["pi", "pid"])

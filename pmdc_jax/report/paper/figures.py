@@ -7,7 +7,8 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from ...control.controllers import CONTROLLERS
-from ...wheelchair import LOADS, LOWER_SETPOINT, SETPOINT, Paper, Recovered, load_errors
+from ...paper.printed import LOADS, LOWER_SETPOINT, SETPOINT
+from ...paper.reproduction import Paper, Recovered, load_errors
 from ..figures import INPUT, MEASURED, RESIDUAL, SIMULATED, style
 
 COLOURS = (RESIDUAL, SIMULATED, INPUT)

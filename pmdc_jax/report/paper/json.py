@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from ...motor import PARAMETERS
-from ...wheelchair import TABLE_2, VOLTAGE, AsPrinted, Paper
+from ...paper.printed import TABLE_2, VOLTAGE
+from ...paper.reproduction import AsPrinted, Paper
 from ..json import plain
 from .sentences import remarks
 

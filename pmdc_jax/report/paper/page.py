@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...wheelchair import LOWER_SETPOINT, SETPOINT, Paper
+from ...paper.printed import LOWER_SETPOINT, SETPOINT
+from ...paper.reproduction import Paper
 from ..page import figure_json, write_page
 from .figures import errors_figure, fitness_figure, steps_figure
 from .sentences import remarks

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ...control.controllers import CONTROLLERS
-from ...wheelchair import SETPOINT, SUFFICIENT_VOLTAGE, TABLE_2, VOLTAGE, Paper
+from ...paper.printed import SETPOINT, TABLE_2, VOLTAGE
+from ...paper.reproduction import SUFFICIENT_VOLTAGE, Paper
 
 
 def remarks(paper: Paper) -> list[str]:

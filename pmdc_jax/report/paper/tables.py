@@ -9,7 +9,8 @@ from rich.text import Text
 
 from ...control.controllers import CONTROLLERS
 from ...motor import PARAMETERS
-from ...wheelchair import PRINTED, SETPOINT, SUFFICIENT_VOLTAGE, TABLE_2, VOLTAGE, Paper, Recovered
+from ...paper.printed import PRINTED, SETPOINT, TABLE_2, VOLTAGE
+from ...paper.reproduction import SUFFICIENT_VOLTAGE, Paper, Recovered
 from ..notation import pretty_unit, significant, thousands
 from ..terminal import plain_table
 from .sentences import remarks

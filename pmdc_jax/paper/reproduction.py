@@ -1,4 +1,4 @@
-"""The wheelchair-motor paper: its printed values and their reproduction."""
+"""The tables and figures of the wheelchair-motor paper, reproduced from its printed motor."""
 
 from __future__ import annotations
 
@@ -11,41 +11,20 @@ import jax
 import numpy as np
 from attrs import field, frozen
 
-from .motor import PARAMETERS, Motor
-from .progress import ReportProgress, silent
+from ..motor import PARAMETERS, Motor
+from ..progress import ReportProgress, silent
+from .printed import LOADS, LOWER_SETPOINT, PRINTED, SETPOINT, TABLE_2, VOLTAGE
 
 if TYPE_CHECKING:
-    from .control.loop import Response
-    from .control.tuning import Tuning
-    from .recordings.recording import Recording
+    from ..control.loop import Response
+    from ..control.tuning import Tuning
+    from ..recordings.recording import Recording
 
-TABLE_1 = {"R": 0.157378, "L": 0.0003137, "Kb": 0.0492, "Kt": 0.0501, "J": 0.000466, "f": 0.0002546}
-PRINTED = Motor(**{name: np.asarray(TABLE_1[name]) for name in PARAMETERS}, effects=())
-VOLTAGE = 24.0  # V
-SETPOINT = 481.0  # rad/s
-LOWER_SETPOINT = 240.5  # rad/s
 # V, enough for the printed settling time of 0.08 s
 SUFFICIENT_VOLTAGE = 25.0
-LOADS = np.linspace(0.0, 1.0, 9)  # N m
 NOISE = {"current": 0.1, "speed": 0.5}  # A, rad/s
 # time constant of the derivative filter over Kd / Kp; the paper prints none, a tenth is the textbook value
 FILTER_RATIO = 0.1
-
-
-@frozen
-class PrintedRow:
-    """A row of Table 2: overshoot, %, settling time, s, and gains Kp, V s/rad, Ki, V/rad, Kd, V s^2/rad, if printed."""
-
-    overshoot: float
-    settling: float
-    gains: tuple[float, float, float] | None
-
-
-TABLE_2: Mapping[str, PrintedRow] = {
-    "pi": PrintedRow(37.83, 0.16, (0.042346, 3.69, 0.0)),
-    "pid": PrintedRow(11.02, 0.18, (0.084618, 5.4121, 0.00022659)),
-    "state-feedback": PrintedRow(0.06, 0.08, None),
-}
 
 
 @frozen
@@ -89,8 +68,8 @@ class Paper:
 
 def reproduce(progress: ReportProgress | None = None) -> Paper:
     """Reproduce all tables and figures of the paper."""
-    from .control.pipeline import tune
-    from .control.time_optimal import fastest_settling
+    from ..control.pipeline import tune
+    from ..control.time_optimal import fastest_settling
 
     report = progress or silent
     report("recovering Table 1", fraction=0.0)
@@ -115,8 +94,8 @@ def reproduce(progress: ReportProgress | None = None) -> Paper:
 
 def load_test(seed: int = 0) -> Recording:
     """The virtual load test: 24 V from rest, then the load rises in steps to 1 N m; 1 ms samples, noisy sensors."""
-    from .recordings.recording import Recording
-    from .simulate import simulate
+    from ..recordings.recording import Recording
+    from ..simulate import simulate
 
     rng = np.random.default_rng(seed)
     samples = 200 * len(LOADS)
@@ -135,10 +114,10 @@ def load_test(seed: int = 0) -> Recording:
 
 def recovered_by_paper_ga(seed: int = 0) -> Recovered:
     """Identify by the paper's binary genetic algorithm alone: 20 chromosomes of 60 bits."""
-    from .identify.parameters import Parameters
-    from .identify.search.bounds import search_bounds
-    from .identify.search.evolution import search
-    from .simulate import Tape, uniform
+    from ..identify.parameters import Parameters
+    from ..identify.search.bounds import search_bounds
+    from ..identify.search.evolution import search
+    from ..simulate import Tape, uniform
 
     run = load_test()
     begin = time.perf_counter()
@@ -154,7 +133,7 @@ def recovered_by_paper_ga(seed: int = 0) -> Recovered:
 
 def recovered_by_identify(seed: int = 0) -> Recovered:
     """Identify by `identify`: evolution strategy, then least squares."""
-    from .identify import identify
+    from ..identify import identify
 
     run = load_test()
     begin = time.perf_counter()
@@ -176,7 +155,7 @@ def load_errors(motor: Motor) -> dict[str, np.ndarray]:
 
 def step_up_and_down(tuning: Tuning) -> Response:
     """Simulated step from rest to 481 rad/s and, 200 samples later, to 240.5 rad/s."""
-    from .control.loop import Course, Response, closed_loop_jit
+    from ..control.loop import Course, Response, closed_loop_jit
 
     with jax.enable_x64(True):
         samples = 200
@@ -190,7 +169,7 @@ def simulated_as_printed(proportional: float, integral: float, derivative: float
     """Ideal loop of equation (9) with PI or PID, filtered derivative of the error; simulated by `scipy.signal`."""
     from scipy.signal import lsim
 
-    from .control.metrics import step_metrics
+    from ..control.metrics import step_metrics
 
     s, lag = np.poly1d([1.0, 0.0]), FILTER_RATIO * derivative / proportional
     controller_numerator = (proportional * s + integral) * (lag * s + 1) + derivative * s * s

@@ -1,0 +1,1 @@
+"""The wheelchair-motor paper: its printed values and their reproduction."""
