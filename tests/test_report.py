@@ -14,6 +14,7 @@ from attrs import evolve
 from pmdc_jax import files
 from pmdc_jax.errors import InputError
 from pmdc_jax.identify.identification import Direction, Estimate, Identification, RunFit, Search
+from pmdc_jax.identify.search.evolution import METHODS
 from pmdc_jax.motor import Motor
 from pmdc_jax.recordings.recording import Finding
 from pmdc_jax.report import notation
@@ -144,7 +145,7 @@ def partial_identification() -> Identification:
         distance=np.inf,
         findings=(Finding("prbs", "current_A", "warning", "saturated at 60 A", "2.31 s to 2.35 s", "Widen it"),),
         messages=("Runs without voltage were used for the mechanical half only.",),
-        search=Search("genetic", 0, np.zeros(0), np.zeros(0), np.zeros(0), 0),
+        search=Search("particle_swarm", 0, np.zeros(0), np.zeros(0), np.zeros(0), 0),
         covariance=np.zeros((6, 6)),
     )
 
@@ -437,9 +438,8 @@ def test_powers_of_ten(value, text):
     assert notation.significant(value) == text
 
 
-def test_searches_have_their_names():
-    assert notation.search_name("cma_es") == "CMA-ES"
-    assert notation.search_name("another_one") == "Another one"
+def test_every_search_has_a_name():
+    assert set(notation.SEARCH_NAMES) == set(METHODS)
 
 
 def test_formulas_are_written_in_greek():

@@ -142,11 +142,6 @@ def role_word(role: Role) -> str:
     return "hold-out" if role == "holdout" else "training"
 
 
-def search_name(method: str) -> str:
-    """A global search as printed in reports."""
-    return SEARCH_NAMES.get(method, method.replace("_", " ").capitalize())
-
-
 def formula_text(effect: str) -> str:
     """The formula of an effect, in which the speed is ω."""
     return re.sub(r"\bw(?![a-zA-Z0-9])", "ω", EFFECTS[effect].formula).replace("-", "−")

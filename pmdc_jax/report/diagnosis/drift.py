@@ -41,9 +41,8 @@ def drifts(diagnosis: Diagnosis) -> list[Drift]:
 
 def drift_words(one: Drift) -> str:
     """The change in per cent with its sign."""
-    if one.percent is None:
-        return percent(None)
-    return ("+" if one.percent > 0 else "") + percent(one.percent)
+    sign = "+" if (one.percent or 0.0) > 0 else ""
+    return sign + percent(one.percent)
 
 
 def drift_sentence(diagnosis: Diagnosis) -> str:

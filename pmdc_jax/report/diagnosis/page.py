@@ -82,7 +82,6 @@ def _experiment(experiment: NextExperiment | None) -> dict[str, Any] | None:
     if experiment is None:
         return None
     return {
-        "why": experiment.why,
         "description": experiment.description,
         "power": percent(100 * experiment.power),
         "figure": figure_json(experiment_figure(experiment, 4000)),

@@ -46,19 +46,19 @@ def intervals_in_words(variable: str, intervals: Sequence[Interval], largest: fl
     if variable == "time":
         parts = [f"{percent(100 * low)} to {percent(100 * high)}" for low, high in joined]
         return f"from {enumerate_words(parts)} of the run"
-    unit = VARIABLE_UNITS.get(variable, "")
+    unit = VARIABLE_UNITS[variable]
+    named = "" if variable == "speed" else f"at a {variable} "
     ends = _symmetric(joined)
     if ends is None:
         parts = [f"from {significant(low)} to {significant(high)} {unit}" for low, high in joined]
-        named = "" if variable == "speed" else f"at a {variable} "
         return named + enumerate_words(parts)
     low, high = ends
-    size = f"from {significant(low)} to {significant(high)} {unit}"
-    if low == 0:
-        size = f"below {significant(high)} {unit}"
-    if largest is not None and low == 0 and high > 0.95 * largest:
+    if low > 0:
+        size = f"from {significant(low)} to {significant(high)} {unit}"
+    elif largest is not None and high > 0.95 * largest:
         return f"at every {variable}, in both directions"
-    named = "" if variable == "speed" else f"at a {variable} "
+    else:
+        size = f"below {significant(high)} {unit}"
     return f"{named}{size}, in both directions"
 
 
@@ -94,4 +94,4 @@ def place_in_words(variable: str, value: float) -> str:
     """Where on the axis of a variable."""
     if variable == "time":
         return f"at {percent(100 * float(value))} of the run"
-    return f"at {significant(float(value))} {VARIABLE_UNITS.get(variable, '')}".strip()
+    return f"at {significant(float(value))} {VARIABLE_UNITS[variable]}"

@@ -20,46 +20,57 @@ REASONS = {
 }
 
 
-def formula_sentence(diagnosis: Diagnosis) -> str:
-    """What is left beside noise after effects were added; empty if nothing is."""
+def rest_sentence(diagnosis: Diagnosis) -> str:
+    """What is left beside noise; empty if nothing is."""
     if diagnosis.varies:
-        return f"Not only noise is left. {varying_sentence(diagnosis, diagnosis.varies)}"
-    if diagnosis.leaves_noise or not diagnosis.effects:
+        rest = varying_sentence(diagnosis, diagnosis.varies)
+    elif diagnosis.leaves_noise or not diagnosis.effects:
         return ""
-    if diagnosis.curves:
-        return f"Not only noise is left. {curve_sentence(diagnosis.curves[0])}"
-    return (
-        "The remaining error is small compared with the effect, but exceeds the noise: as much as another formula of"
-        " the same effect would leave. The intervals do not cover it."
-    )
+    elif diagnosis.curves:
+        rest = curve_sentence(diagnosis.curves[0])
+    else:
+        return (
+            "The remaining error is small compared with the effect, but exceeds the noise: as much as another formula"
+            " of the same effect would leave. The intervals do not cover it."
+        )
+    return f"Not only noise is left. {rest}"
 
 
 def curve_sentence(curve: LearnedCurve) -> str:
     """What the clearest unknown term looks like."""
-    chance = p_value_words(curve.p_value)
     if curve.variable == "current_rate":
-        late = -curve.value[-1] / curve.x[-1]
-        when = "late" if late > 0 else "early"
-        return (
-            f"Estimated from the data, it looks most like a current that is read {when}, by"
-            f" {value_with_unit(abs(late), 's')} ({chance}): current, voltage and speed are not filtered alike. Record"
-            " all of them unfiltered, or filter all in the same way."
-        )
-    if curve.equation == "sensor":
-        times, share = 2 * np.pi / curve.x[-1], 100 * float(np.max(np.abs(curve.value)))
-        return (
-            f"Estimated from the data, it looks most like a speed reading that oscillates {significant(times)} times"
-            f" per turn, by {percent(share)} of the speed ({chance}): tachometer ripple, or an eccentric encoder."
-        )
+        looks = _late_current(curve)
+    elif curve.equation == "sensor":
+        looks = _oscillating_speed(curve)
+    else:
+        looks = _missing_term(curve)
+    return f"Estimated from the data, it looks most like a {looks}"
+
+
+def _late_current(curve: LearnedCurve) -> str:
+    late = -curve.value[-1] / curve.x[-1]
+    when = "late" if late > 0 else "early"
+    return (
+        f"current that is read {when}, by {value_with_unit(abs(late), 's')} ({p_value_words(curve.p_value)}): current,"
+        " voltage and speed are not filtered alike. Record all of them unfiltered, or filter all in the same way."
+    )
+
+
+def _oscillating_speed(curve: LearnedCurve) -> str:
+    times, share = 2 * np.pi / curve.x[-1], 100 * float(np.max(np.abs(curve.value)))
+    return (
+        f"speed reading that oscillates {significant(times)} times per turn, by {percent(share)} of the speed"
+        f" ({p_value_words(curve.p_value)}): tachometer ripple, or an eccentric encoder."
+    )
+
+
+def _missing_term(curve: LearnedCurve) -> str:
     known = curve.stderr > 0
     peak = int(np.argmax(np.abs(curve.value) / np.where(known, curve.stderr, np.inf)))
     torque = "friction torque" if curve.reverses else "torque opposing motion"
     kind = torque if curve.unit == "N m" else "voltage at the terminals"
-    value = value_with_unit(curve.value[peak], curve.unit)
-    return (
-        f"Estimated from the data, it looks most like a {kind} over {curve.variable}, most significant with"
-        f" {value} {place_in_words(curve.variable, curve.x[peak])} ({chance})."
-    )
+    value, place = value_with_unit(curve.value[peak], curve.unit), place_in_words(curve.variable, curve.x[peak])
+    return f"{kind} over {curve.variable}, most significant with {value} {place} ({p_value_words(curve.p_value)})."
 
 
 def varying_sentence(diagnosis: Diagnosis, varies: VaryingParameter) -> str:

@@ -21,8 +21,8 @@ from .drift import drift_sentence
 from .places import disagreement
 from .remainder import (
     curve_sentence,
-    formula_sentence,
     held_out_sentence,
+    rest_sentence,
     run_apart_sentence,
     slow_rest_sentence,
     varying_sentence,
@@ -50,7 +50,7 @@ def verdict_sentences(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.effects:
         sentences += [_gap_sentence(diagnosis), drift_sentence(diagnosis)]
     if diagnosis.verdict != "not_in_library":
-        sentences += [formula_sentence(diagnosis), slow_rest_sentence(diagnosis), held_out_sentence(diagnosis)]
+        sentences += [rest_sentence(diagnosis), slow_rest_sentence(diagnosis), held_out_sentence(diagnosis)]
     sentences.append(run_apart_sentence(diagnosis))
     return [sentence for sentence in sentences if sentence] + cautions(diagnosis.final)
 
@@ -159,8 +159,7 @@ def _detectable_sentence(begin: str, diagnosis: Diagnosis) -> str:
     parts = [f"{effect_words(x.effect)} above {value_with_unit(x.amplitude, x.unit)}" for x in told]
     if not parts:
         return ""
-    sentence = f"{begin}{enumerate_words(parts)} would have been detected with 90 % probability."
-    return sentence[0].upper() + sentence[1:]
+    return _capitalised(f"{begin}{enumerate_words(parts)} would have been detected with 90 % probability.")
 
 
 def judged_role(diagnosis: Diagnosis) -> Role:

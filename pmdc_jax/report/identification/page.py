@@ -11,10 +11,10 @@ from ...identify.identification import Estimate, Identification, RunFit
 from ..figures import group_size, points_per_trace
 from ..notation import (
     PARAMETER_NAMES,
+    SEARCH_NAMES,
     EstimateText,
     parameter_words,
     percent,
-    search_name,
     status_word,
     thousands,
     write_estimate,
@@ -99,7 +99,7 @@ def _parameters(identification: Identification) -> list[_Parameter]:
         if "." in symbol:  # a parameter of an effect has a name but no symbol
             symbol, name = "", parameter_words(*symbol.split("."))
         else:
-            name = PARAMETER_NAMES.get(symbol, "")
+            name = PARAMETER_NAMES[symbol]
         word = status_word(estimate.status)
         return _Parameter(symbol, name, write_estimate(estimate), estimate.status, word)
 
@@ -130,7 +130,7 @@ def _search(identification: Identification) -> dict[str, Any]:
     search = identification.search
     drawn = len(search.best) + len(search.refined) > 0
     return {
-        "method": search_name(search.method),
+        "method": SEARCH_NAMES[search.method],
         "evaluations": thousands(search.evaluations),
         "starts": len(search.refined),
         "times_found": search.times_found,

@@ -173,5 +173,6 @@ def _with_status(identification: Identification, status: str) -> list[str]:
 
 
 def as_sentence(text: str) -> str:
+    """The text with a full stop, if it has none."""
     text = text.strip()
     return text if not text or text[-1] in ".!?" else f"{text}."
