@@ -1,10 +1,10 @@
 """Speed controllers: the voltage command of each and the rates of its states, continuous and sampled."""
 
-from __future__ import annotations
-
+# no deferred annotations: Equinox would take a deferred AbstractVar for a field
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from ..effects.base import Scalars
@@ -38,7 +38,7 @@ class AbstractController(eqx.Module):
     c_command: ClassVar[str]
     # if true, `command` gets current and speed predicted for the moment when the voltage takes effect
     feeds_back_current: ClassVar[bool] = False
-    integrates: ClassVar[bool] = True
+    integrates: ClassVar[bool] = False
     filters_derivative: ClassVar[bool] = False
 
     def command(self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number) -> Number:
@@ -50,8 +50,10 @@ class AbstractController(eqx.Module):
         raise NotImplementedError
 
     def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
-        """Rates of the memory, per second; `excess`, V, is the applied minus the commanded voltage."""
-        raise NotImplementedError
+        """Rates of the memory, per second, zero for a state that is not used; `excess`, V, is the applied minus the
+        commanded voltage."""
+        del reference, speed, excess, step
+        return jax.tree.map(jnp.zeros_like, memory)
 
     def equilibrium(self, reference: Number, speed: Number, current: Number, voltage: Number, step: Number) -> Memory:
         """Memory in steady state: the filter holds `speed`, the integral, if any, makes the command `voltage`."""
@@ -62,15 +64,24 @@ class AbstractController(eqx.Module):
         return memory._replace(integral=integral)
 
 
-def _integral_rate(integral: Number, tracking_time: Number, error: Number, excess: Number, step: Number) -> Number:
-    """Rate of the integral, with back-calculation over `tracking_time` while the voltage is limited.
+class _Integrating(AbstractController):
+    """A controller with integral action, and with back-calculation over `tracking_time` while the voltage is limited.
 
     **Source**: Astrom, Hagglund, "Advanced PID Control" (2006), section 3.5, back-calculation.
     """
-    return integral * error + excess / jnp.maximum(tracking_time, step)
+
+    integrates: ClassVar = True
+
+    integral: eqx.AbstractVar[Number]
+    tracking_time: eqx.AbstractVar[Number]
+
+    def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
+        tracking = excess / jnp.maximum(self.tracking_time, step)
+        rates = super().rates(memory, reference, speed, excess, step)
+        return rates._replace(integral=self.integral * (reference - speed) + tracking)
 
 
-class PI(AbstractController):
+class PI(_Integrating):
     """PI controller with set-point weight and back-calculation.
 
     u = Kp (b r - w) + I,  dI/dt = Ki (r - w) + (v - u) / Tt
@@ -94,12 +105,8 @@ class PI(AbstractController):
         del current, step
         return self.proportional * (self.setpoint_weight * reference - speed) + memory.integral
 
-    def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
-        integral = _integral_rate(self.integral, self.tracking_time, reference - speed, excess, step)
-        return Memory(integral, jnp.zeros_like(memory.filtered))
 
-
-class PID(AbstractController):
+class PID(_Integrating):
     """PID controller; the derivative acts on the measured speed only, through a first-order filter.
 
     u = Kp (b r - w) + I - Kd (w - z) / Tf,  dz/dt = (w - z) / Tf,  dI/dt = Ki (r - w) + (v - u) / Tt
@@ -130,13 +137,17 @@ class PID(AbstractController):
 
     def command(self, memory: Memory, reference: Number, speed: Number, current: Number, step: Number) -> Number:
         del current
-        slope = (speed - memory.filtered) / (self.filter_time + step)
+        slope = self._slope(memory, speed, step)
         proportional = self.proportional * (self.setpoint_weight * reference - speed)
         return proportional + memory.integral - self.derivative * slope
 
     def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
-        integral = _integral_rate(self.integral, self.tracking_time, reference - speed, excess, step)
-        return Memory(integral, (speed - memory.filtered) / (self.filter_time + step))
+        rates = super().rates(memory, reference, speed, excess, step)
+        return rates._replace(filtered=self._slope(memory, speed, step))
+
+    def _slope(self, memory: Memory, speed: Number, step: Number) -> Number:
+        """The filtered derivative of the speed, rad/s^2: also the rate of the filter."""
+        return (speed - memory.filtered) / (self.filter_time + step)
 
 
 class StateFeedback(AbstractController):
@@ -153,7 +164,6 @@ class StateFeedback(AbstractController):
     coordinates: ClassVar = ("stiffness", "derivative_time")
     c_command: ClassVar = "PMDC_REFERENCE_GAIN * reference - (PMDC_CURRENT_GAIN * current + PMDC_SPEED_GAIN * ahead)"
     feeds_back_current: ClassVar = True
-    integrates: ClassVar = False
 
     reference_gain: Number
     current_gain: Number
@@ -164,13 +174,8 @@ class StateFeedback(AbstractController):
         feedback = self.current_gain * current + self.speed_gain * speed
         return self.reference_gain * reference - feedback
 
-    def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
-        del reference, speed, excess, step
-        zero = jnp.zeros_like(memory.integral)
-        return Memory(zero, zero)
 
-
-class StateFeedbackIntegral(AbstractController):
+class StateFeedbackIntegral(_Integrating):
     """State feedback with integral action and back-calculation.
 
     u = Kr r - K1 i - K2 w + I,  dI/dt = Ki (r - w) + (v - u) / Tt
@@ -195,10 +200,6 @@ class StateFeedbackIntegral(AbstractController):
         del step
         feedback = self.current_gain * current + self.speed_gain * speed
         return self.reference_gain * reference - feedback + memory.integral
-
-    def rates(self, memory: Memory, reference: Number, speed: Number, excess: Number, step: Number) -> Memory:
-        integral = _integral_rate(self.integral, self.tracking_time, reference - speed, excess, step)
-        return Memory(integral, jnp.zeros_like(memory.filtered))
 
 
 CONTROLLERS: dict[str, type[AbstractController]] = {
