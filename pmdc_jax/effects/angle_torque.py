@@ -1,7 +1,6 @@
 """Torque that changes with the angle of the rotor."""
 
-from __future__ import annotations
-
+# no deferred annotations: Equinox would take a deferred AbstractVar for a field
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -21,21 +20,43 @@ PERIODS_RANGE = ParameterRange("", 0.5, 200.0)
 SMALL_TURN = 0.02
 
 
-class _Angular(AbstractEffect):
-    """An effect that depends on the rotor's angle, which it adds as a state."""
+class _AngleWave(AbstractEffect):
+    """An effect that is a wave over the rotor's angle, sin(n angle + phase); it adds the angle as a state."""
 
+    variable: ClassVar = "angle"
     states: ClassVar = ("angle",)
+
+    phase_rad: eqx.AbstractVar[Scalars]
+    periods: eqx.AbstractVar[Scalars]
 
     def initial_states(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del speed, load
         return {"angle": angle}
 
-    def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
+    def derivative(self, motor: "Motor", state: State, load: Scalars) -> dict[str, Scalars]:
         del motor, load
         return {"angle": state.speed}
 
+    def repeats_after(self) -> dict[str, Scalars]:
+        return {"angle": 2 * jnp.pi * (1 / self.periods)}
 
-class CoggingTorque(_Angular):
+    def _wave(self, state: State) -> Scalars:
+        """sin(n angle + phase)."""
+        return sine(self.periods * state.extra["angle"] + self.phase_rad)
+
+    def _averaging_factor(self, turn: Scalars) -> Scalars:
+        """The factor with which Simpson's rule gives the exact mean of the wave over a `turn` in rad, for any number of
+        periods: without it, a wave with whole periods within a step would be aliased to a slow one.
+
+        **Source**: exponential fitting, Ixaru, Vanden Berghe, "Exponential Fitting" (2004), chapter 4.
+        """
+        half = self.periods * turn / 2
+        small = jnp.abs(half) < SMALL_TURN
+        size = jnp.where(small, 1.0, half)
+        return jnp.where(small, 1 - half**4 / 180, 3 * sine(size) / (size * (2 + cosine(size))))
+
+
+class CoggingTorque(_AngleWave):
     """Cogging: T = a sin(n angle + phase), the pull of the magnets on the teeth, independent of current.
 
     The angle is the recorded one if there is one. Otherwise it counts from the start of the first run, and the
@@ -51,7 +72,6 @@ class CoggingTorque(_Angular):
     label: ClassVar = "Cogging torque"
     formula: ClassVar = "T = a sin(n angle + phase)"
     equation: ClassVar = "mechanical"
-    variable: ClassVar = "angle"
     ranges: ClassVar = {
         "amplitude_Nm": ParameterRange("N m", 1e-10, 1e4),
         "phase_rad": PHASE_RANGE,
@@ -63,16 +83,13 @@ class CoggingTorque(_Angular):
     periods: Scalars
 
     def torque(self, state: State) -> Scalars:
-        return self.amplitude_Nm * _wave(self, state)
+        return self.amplitude_Nm * self._wave(state)
 
     def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
-        return replace(self, amplitude_Nm=self.amplitude_Nm * _averaging_factor(self, state.speed * seconds))
-
-    def repeats_after(self) -> dict[str, Scalars]:
-        return _period(self)
+        return replace(self, amplitude_Nm=self.amplitude_Nm * self._averaging_factor(state.speed * seconds))
 
 
-class TorqueRipple(_Angular):
+class TorqueRipple(_AngleWave):
     """Torque ripple: Kt (1 + a sin(n angle + phase)) in place of Kt, due to commutation and winding.
 
     The back-EMF has the same ripple, Kb (1 + e a sin(n angle + phase)), except for the share 1 - e that the brushes
@@ -88,7 +105,6 @@ class TorqueRipple(_Angular):
     label: ClassVar = "Torque ripple"
     formula: ClassVar = "T_m = Kt i (1 + a sin(n angle + phase)), e = Kb w (1 + e_s a sin(n angle + phase))"
     equation: ClassVar = "mechanical"
-    variable: ClassVar = "angle"
     ranges: ClassVar = {
         "amplitude": ParameterRange("", 1e-5, 1.0),
         "phase_rad": PHASE_RANGE,
@@ -102,35 +118,10 @@ class TorqueRipple(_Angular):
     periods: Scalars
     emf_share: Scalars
 
-    def parameters(self, motor: Motor, state: State) -> Motor:
-        ripple = self.amplitude * _wave(self, state)
+    def parameters(self, motor: "Motor", state: State) -> "Motor":
+        ripple = self.amplitude * self._wave(state)
         constants = motor.Kt * (1 + ripple), motor.Kb * (1 + self.emf_share * ripple)
         return eqx.tree_at(lambda m: (m.Kt, m.Kb), motor, constants)
 
     def averaged_over_step(self, state: State, seconds: Scalars) -> AbstractEffect:
-        return replace(self, amplitude=self.amplitude * _averaging_factor(self, state.speed * seconds))
-
-    def repeats_after(self) -> dict[str, Scalars]:
-        return _period(self)
-
-
-def _wave(effect: CoggingTorque | TorqueRipple, state: State) -> Scalars:
-    """sin(n angle + phase)."""
-    return sine(effect.periods * state.extra["angle"] + effect.phase_rad)
-
-
-def _period(effect: CoggingTorque | TorqueRipple) -> dict[str, Scalars]:
-    """The angle after which the torque repeats, rad."""
-    return {"angle": 2 * jnp.pi * (1 / effect.periods)}
-
-
-def _averaging_factor(effect: CoggingTorque | TorqueRipple, turn: Scalars) -> Scalars:
-    """The factor with which Simpson's rule gives the exact mean of the wave over a `turn` in rad, for any number of
-    periods: without it, a wave with whole periods within a step would be aliased to a slow one.
-
-    **Source**: exponential fitting, Ixaru, Vanden Berghe, "Exponential Fitting" (2004), chapter 4.
-    """
-    half = effect.periods * turn / 2
-    small = jnp.abs(half) < SMALL_TURN
-    size = jnp.where(small, 1.0, half)
-    return jnp.where(small, 1 - half**4 / 180, 3 * sine(size) / (size * (2 + cosine(size))))
+        return replace(self, amplitude=self.amplitude * self._averaging_factor(state.speed * seconds))

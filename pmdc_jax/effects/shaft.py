@@ -106,12 +106,7 @@ class GearBacklash(_TwoInertias):
     affine: ClassVar = True
     contact_state: ClassVar = "gear_twist"
     spring_state: ClassVar = "gear_twist"
-    ranges: ClassVar = {
-        "stiffness_Nm_rad": ParameterRange("N m/rad", 1e-6, 1e9),
-        "damping_Nms_rad": ParameterRange("N m s/rad", 1e-11, 1e6),
-        "load_share": ParameterRange("", 1e-2, 0.99, limit=1.0),
-        "gap_rad": ParameterRange("rad", 1e-6, 10.0),
-    }
+    ranges: ClassVar = ShaftCompliance.ranges | {"gap_rad": ParameterRange("rad", 1e-6, 10.0)}
 
     gap_rad: Scalars
 
