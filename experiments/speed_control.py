@@ -16,8 +16,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from experiments.continuous_loop import continuous_loop
 from pmdc_jax.control import fastest_settling, step_metrics
-from pmdc_jax.control.continuous import continuous_loop
 from pmdc_jax.control.evaluation import Robustness
 from pmdc_jax.control.pipeline import VALIDATION_MOTORS, robustness, tune
 from pmdc_jax.control.spread import drawn_motors, even_spread

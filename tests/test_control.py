@@ -13,6 +13,7 @@ import pytest
 from linear_motor import PAPER, exact_step, state_space
 from scipy.optimize import brentq
 
+from experiments.continuous_loop import continuous_loop
 from pmdc_jax import InputError
 from pmdc_jax.control import (
     CONTROLLERS,
@@ -30,7 +31,6 @@ from pmdc_jax.control import (
     step_metrics,
 )
 from pmdc_jax.control.classical import ackermann, state_feedback, ultimate_gain, ziegler_nichols
-from pmdc_jax.control.continuous import continuous_loop
 from pmdc_jax.control.gains import RANGES
 from pmdc_jax.control.margins import linear_loop, loop_gain, margins, sensitivity_peak
 from pmdc_jax.control.metrics import smooth_overshoot, smooth_settling
