@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from attrs import frozen
 
 from .effects import EFFECTS, AbstractEffect
 from .errors import InputError
@@ -57,26 +58,78 @@ class Uncertainty(NamedTuple):
     undetermined: tuple[str, ...] = ()
 
 
+@frozen
+class MotorFile:
+    """The content of a motor file. Each part of it is checked only when asked for: if it is not valid, an `InputError`
+    is raised."""
+
+    where: str
+    content: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, path: str | Path) -> MotorFile:
+        """**Raises**: `InputError` if the file cannot be read, or its entries are not of the right types."""
+        where, content = str(path), read_object(path, FORMAT, MEND)
+        if not isinstance(content.get("parameters"), dict):
+            raise InputError(where, 'has no "parameters"', MEND)
+        for name in ("status", "noise", "units"):
+            if not isinstance(content.get(name, {}), dict):
+                raise InputError(where, f'"{name}" is not an object', MEND)
+        return cls(where, content)
+
+    @property
+    def motor(self) -> Motor:
+        for name, unit in self.content.get("units", {}).items():
+            if unit != PARAMETERS.get(name, unit):
+                what = f"the unit of {name} is {unit!r}, but values are read in {PARAMETERS[name]}"
+                raise InputError(self.where, what, f"Convert the value to {PARAMETERS[name]}")
+        constants = _numbers(self.where, self.content["parameters"], PARAMETERS, "parameters")
+        return Motor(**constants, effects=_effects(self.where, self.content.get("effects", [])))
+
+    @property
+    def uncertainty(self) -> Uncertainty | None:
+        """None if the file has no covariance."""
+        covariance = self.content.get("covariance")
+        if covariance is None:
+            return None
+        try:
+            names = tuple(covariance["names"])
+            matrix = np.array(covariance["matrix"], float).reshape(len(names), len(names))
+            if not _is_covariance(names, matrix):
+                raise ValueError
+        except (KeyError, TypeError, ValueError, OverflowError):
+            what = '"covariance" is not a matrix with its names'
+            raise InputError(self.where, what, MEND) from None
+        statuses = self.content.get("status", {})
+        undetermined = (name for name, status in statuses.items() if status in UNDETERMINED)
+        return Uncertainty(names, matrix, tuple(undetermined))
+
+    @property
+    def speed_noise(self) -> float | None:
+        """White noise of the recorded speeds, rad/s; None if the file has none."""
+        speed = self.content.get("noise", {}).get("speed_rad_s")
+        if speed is None:
+            return None
+        noise = finite_number(self.where, "the noise of the speed", speed, MEND)
+        if noise < 0:
+            raise InputError(self.where, f"the noise of the speed is {noise}, negative", MEND)
+        return noise
+
+
+def load_motor(path: str | Path) -> Motor:
+    """Read a motor written by `save_motor` or by hand; only "parameters" is required.
+
+    **Raises**: `InputError` if the file is missing, is not JSON, or has missing or invalid entries.
+    """
+    return MotorFile.read(path).motor
+
+
 def load_uncertainty(path: str | Path) -> Uncertainty | None:
     """The uncertainty that an identification saved in a motor file; None if the file has no covariance.
 
     **Raises**: `InputError` if the covariance is not valid, or the file cannot be read.
     """
-    where, content = str(path), _content(path)
-    covariance = content.get("covariance")
-    if covariance is None:
-        return None
-    try:
-        names = tuple(covariance["names"])
-        matrix = np.array(covariance["matrix"], float).reshape(len(names), len(names))
-        if not _is_covariance(names, matrix):
-            raise ValueError
-    except (KeyError, TypeError, ValueError, OverflowError):
-        what = '"covariance" is not a matrix with its names'
-        raise InputError(where, what, MEND) from None
-    statuses = content.get("status", {})
-    undetermined = (name for name, status in statuses.items() if status in UNDETERMINED)
-    return Uncertainty(names, matrix, tuple(undetermined))
+    return MotorFile.read(path).uncertainty
 
 
 def load_speed_noise(path: str | Path) -> float | None:
@@ -85,13 +138,7 @@ def load_speed_noise(path: str | Path) -> float | None:
 
     **Raises**: `InputError` if it is not a number of at least 0, or the file cannot be read.
     """
-    speed = _content(path).get("noise", {}).get("speed_rad_s")
-    if speed is None:
-        return None
-    noise = finite_number(str(path), "the noise of the speed", speed, MEND)
-    if noise < 0:
-        raise InputError(str(path), f"the noise of the speed is {noise}, negative", MEND)
-    return noise
+    return MotorFile.read(path).speed_noise
 
 
 def _is_covariance(names: Sequence[str], matrix: np.ndarray) -> bool:
@@ -100,30 +147,6 @@ def _is_covariance(names: Sequence[str], matrix: np.ndarray) -> bool:
     once = known.issuperset(names) and len(set(names)) == len(names)
     alike = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=1e-6)
     return bool(once and alike and np.all(np.diag(matrix) >= 0))
-
-
-def load_motor(path: str | Path) -> Motor:
-    """Read a motor written by `save_motor` or by hand; only "parameters" is required.
-
-    **Raises**: `InputError` if the file is missing, is not JSON, or has missing or invalid entries.
-    """
-    where, content = str(path), _content(path)
-    for name, unit in content.get("units", {}).items():
-        if unit != PARAMETERS.get(name, unit):
-            what = f"the unit of {name} is {unit!r}, but values are read in {PARAMETERS[name]}"
-            raise InputError(where, what, f"Convert the value to {PARAMETERS[name]}")
-    constants = _numbers(where, content["parameters"], PARAMETERS, "parameters")
-    return Motor(**constants, effects=_effects(where, content.get("effects", [])))
-
-
-def _content(path: str | Path) -> dict[str, Any]:
-    where, content = str(path), read_object(path, FORMAT, MEND)
-    if not isinstance(content.get("parameters"), dict):
-        raise InputError(where, 'has no "parameters"', MEND)
-    for name in ("status", "noise", "units"):
-        if not isinstance(content.get(name, {}), dict):
-            raise InputError(where, f'"{name}" is not an object', MEND)
-    return content
 
 
 def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..motor import Motor
-from ..motor_file import Uncertainty, load_motor, load_speed_noise, load_uncertainty
+from ..motor_file import MotorFile, Uncertainty
 from ..progress import ReportProgress, silent
 from ..runtime.compiled import free_memory_maps
 from ..runtime.precision import double_precision
@@ -88,9 +88,10 @@ def tune(
     """
     begin = time.perf_counter()
     if not isinstance(motor, Motor):
-        uncertainty = uncertainty or load_uncertainty(motor)
-        recorded_noise = load_speed_noise(motor) if recorded_noise is None else recorded_noise
-        motor = load_motor(motor)
+        file = MotorFile.read(motor)
+        uncertainty = uncertainty or file.uncertainty
+        recorded_noise = file.speed_noise if recorded_noise is None else recorded_noise
+        motor = file.motor
     requirements = LoopRequirements(
         controller=controller,
         setpoint=setpoint,
