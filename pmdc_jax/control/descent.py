@@ -22,6 +22,8 @@ STARTS = 64  # the best of them, start points of descents on the first motor alo
 FINALISTS = 16  # the best results of these, start points of descents on all motors
 ITERATIONS = 100  # of each descent
 LEARNING_RATE = 0.06  # at first, in the logarithms of the gains; decays to zero
+# of Adam's means of the gradient and of its square: its usual 0.9 and 0.999 remember too long for so few iterations
+DECAY_RATES = 0.8, 0.95
 INITIAL_WIDTH = 0.5  # of the smooth metrics, in bands
 FINAL_WIDTH = 0.05  # their width in the second half of the iterations
 DIVERGED_COST = 1e6  # cost of gains with which the simulated speed overflows
@@ -103,7 +105,7 @@ def _descend(
     """Descend from all starts at once: the gradient of the summed costs holds that of each start's own cost."""
     lower, upper = (jnp.asarray(bound) for bound in space.bounds())
     schedule = optax.cosine_decay_schedule(LEARNING_RATE, ITERATIONS)
-    optimiser = optax.adam(schedule, b1=0.8, b2=0.95)
+    optimiser = optax.adam(schedule, *DECAY_RATES)
 
     def summed_costs(x: Coordinates, width: Number) -> tuple[Float[Array, ""], Costs]:
         costs = _smooth_costs(task, space, model, motors, x, width)

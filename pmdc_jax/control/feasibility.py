@@ -8,6 +8,9 @@ from ..errors import InputError
 from ..motor import Motor
 from .steady import steady_state
 
+BISECTIONS = 20  # in the search for the highest speed: to a millionth of the set point, of which tenths are shown
+DEFAULT_LOAD_SHARE = 0.5  # default load step over the load torque that the limits still hold
+
 
 def check_reachable(
     motor: Motor,
@@ -42,7 +45,7 @@ def _highest_speed(motor: Motor, setpoint: float, voltage_limit: float, load: fl
     if not motor.effects:
         return max(0.0, float(motor.steady_speed(voltage_limit, load)))
     low, high = 0.0, abs(setpoint)
-    for _ in range(20):
+    for _ in range(BISECTIONS):
         middle = (low + high) / 2
         voltage = abs(float(steady_state(motor, math.copysign(middle, setpoint), load)[1]))
         low, high = (middle, high) if voltage <= voltage_limit else (low, middle)
@@ -73,4 +76,4 @@ def default_load_torque(motor: Motor, setpoint: float, voltage_limit: float, cur
     spare_current = (voltage_limit - abs(float(voltage))) / float(motor.R)
     if current_limit is not None:
         spare_current = min(spare_current, current_limit - abs(float(state.current)))
-    return math.copysign(0.5 * max(0.0, spare_current) * float(motor.Kt), setpoint)
+    return math.copysign(DEFAULT_LOAD_SHARE * max(0.0, spare_current) * float(motor.Kt), setpoint)

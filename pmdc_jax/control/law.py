@@ -13,6 +13,10 @@ from ..simulate.propagator import make_propagator
 from .controllers import AbstractController, Memory, Number
 from .hardware import Hardware
 
+# Least distance of an eigenvalue of the motor from the mean of the two, over that mean: at a critically damped motor,
+# where they are equal, the formula for the peak of the current has a limit, but divides by zero
+LEAST_SPLIT = 1e-6
+
 
 class SampledMotor(NamedTuple):
     """The law's discrete model of the linear motor: i[k+1] = ii i[k] + iw w[k] + iv v[k], and w[k+1] likewise.
@@ -56,8 +60,8 @@ def _time_to_peak_current(motor: Motor) -> Number:
     A, _ = motor.state_space()
     middle, decay = (A[0, 0] + A[1, 1]) / 2, -A[1, 1]
     root = jnp.sqrt((middle**2 - A[0, 0] * A[1, 1] + A[0, 1] * A[1, 0]).astype(complex))
-    # critically damped, the quotient has a limit
-    root = jnp.where(jnp.abs(root) < 1e-6 * jnp.abs(middle), 1e-6 * jnp.abs(middle), root)
+    least = LEAST_SPLIT * jnp.abs(middle)
+    root = jnp.where(jnp.abs(root) < least, least, root)
     a, b = middle + root, middle - root
     return jnp.real(jnp.log((b + decay) / (a + decay)) / (a - b))
 

@@ -104,6 +104,7 @@ closed_loop_jit = compiled(closed_loop)
 
 def _delayed(past_speeds: Float[Array, " remembered"], samples: Number) -> Float[Array, ""]:
     """The speed `samples` ago, linearly interpolated."""
+    # just short of the oldest speed, because interpolation also takes the one after
     place = jnp.clip(samples, 0.0, REMEMBERED_SAMPLES - 1.001)
     k = jnp.floor(place).astype(int)
     return past_speeds[k] + (place - k) * (past_speeds[k + 1] - past_speeds[k])

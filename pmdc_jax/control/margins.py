@@ -15,7 +15,11 @@ from ..motor import Drive, Motor
 from ..simulate.propagator import make_propagator, state_of
 from .law import Law, LawState
 
-FREQUENCIES = 48  # at which a tuning evaluates the sensitivity
+# Angles, in rad per sample, at which a tuning evaluates the sensitivity, few for speed, and at which margins are found
+SENSITIVITY_ANGLES = np.geomspace(1e-3, np.pi, 48)
+MARGIN_ANGLES = np.geomspace(1e-5, np.pi, 20_000)
+UNSTABLE_FROM = 1 - 1e-12  # largest modulus of an eigenvalue: 1, but for rounding
+TINY = 1e-300  # against division by zero
 
 Matrix = Float[Array | np.ndarray, "n n"]
 Vector = Float[Array | np.ndarray, " n"]
@@ -84,7 +88,7 @@ def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
     of the sensor changes both matrices by a multiple of a matrix of rank 1, and the determinants in proportion.
     """
     eye = jnp.eye(loop.A.shape[0])
-    angle = jnp.asarray(np.geomspace(1e-3, np.pi, FREQUENCIES))
+    angle = jnp.asarray(SENSITIVITY_ANGLES)
     z_minus_1 = jnp.exp(1j * angle) - 1
 
     def determinant(matrix: Matrix) -> Complex[Array, " frequencies"]:
@@ -100,7 +104,7 @@ def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
 
     opened = seen_late(loop.A, loop.N)
     closed = seen_late(loop.closed, loop.N + loop.B * loop.D)
-    return jnp.max(jnp.abs(opened) / jnp.maximum(jnp.abs(closed), 1e-300))
+    return jnp.max(jnp.abs(opened) / jnp.maximum(jnp.abs(closed), TINY))
 
 
 def _delay(
@@ -146,12 +150,11 @@ def margins(motor: Motor, law: Law) -> Margins:
     step = float(law.hardware.sample_time)
     delayed = _with_delay_line(loop)
     closed = np.asarray(delayed.closed)
-    if np.abs(np.linalg.eigvals(closed)).max() >= 1 - 1e-12:
+    if np.abs(np.linalg.eigvals(closed)).max() >= UNSTABLE_FROM:
         return Margins(False, None, None, None, None, None, None)
-    angle = np.geomspace(1e-5, np.pi, 20_000)
-    gain = loop_gain(loop, angle)
+    gain = loop_gain(loop, MARGIN_ANGLES)
     covariance = _stationary_covariance(closed, np.asarray(delayed.N + delayed.B * delayed.D))
-    phase, delay = _phase_and_delay_margin(angle, gain, step)
+    phase, delay = _phase_and_delay_margin(MARGIN_ANGLES, gain, step)
     return Margins(
         stable=True,
         gain_margin=_gain_margin(gain),
@@ -213,7 +216,7 @@ def _gain_margin(gain: np.ndarray) -> float | None:
     """The smallest factor above 1 that brings the loop gain to -1."""
     x, y = np.real(gain), np.imag(gain)
     k = np.flatnonzero((y[:-1] * y[1:] <= 0) & (x[:-1] < 0))
-    share = y[k] / (y[k] - y[k + 1] + 1e-300)
+    share = y[k] / (y[k] - y[k + 1] + TINY)
     # of the real axis, where the gain is at half the sampling frequency, too
     crossing = np.append(x[k] + share * (x[k + 1] - x[k]), x[-1])
     factors = -1 / crossing[(crossing > -1) & (crossing < 0)]

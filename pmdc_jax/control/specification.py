@@ -35,6 +35,7 @@ LOOP_DEAD_TIMES = 4
 PART_SETTLINGS = 2.5
 PART_DEAD_TIMES = 20
 PART_TORQUE_PERIODS = 2
+ROUNDING = 1e-9  # relative, within which a number counts as round
 MIN_SAMPLES = 32  # in each part of the task
 MAX_SAMPLES = 20_000  # in each part of the task
 
@@ -243,4 +244,4 @@ def _three_digits(value: float) -> float:
 def _rounded_down(value: float) -> float:
     """Largest of 1, 2 or 5 times a power of ten that does not exceed `value`."""
     power = 10.0 ** math.floor(math.log10(value))
-    return _three_digits(max(m for m in (1, 2, 5) if m * power <= value * (1 + 1e-9)) * power)
+    return _three_digits(max(m for m in (1, 2, 5) if m * power <= value * (1 + ROUNDING)) * power)

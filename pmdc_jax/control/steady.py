@@ -10,6 +10,9 @@ from ..effects.base import State
 from ..motor import Motor
 from .controllers import Number
 
+# of Newton's method: many more than its quadratic convergence needs, since a fixed number can be differentiated
+NEWTON_STEPS = 20
+
 
 def steady_state(motor: Motor, speed: Number, load: Number = 0.0) -> tuple[State, Number]:
     """The state in which a speed is held against a load, and the voltage (V) that holds it.
@@ -40,4 +43,4 @@ def steady_state(motor: Motor, speed: Number, load: Number = 0.0) -> tuple[State
         return unknown - jnp.linalg.pinv(jax.jacfwd(rates)(unknown)) @ rates(unknown)
 
     start = jnp.stack([current, voltage, *(jnp.zeros(()) for _ in motor.states)])
-    return unpacked(jax.lax.fori_loop(0, 20, newton, start))
+    return unpacked(jax.lax.fori_loop(0, NEWTON_STEPS, newton, start))

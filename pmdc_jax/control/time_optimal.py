@@ -20,7 +20,10 @@ from .metrics import BAND
 from .steady import steady_state
 
 INSTANTS = 20_000  # of a simulated step
+FIRST_DURATION = 10  # of a simulated step, over the motor's transient time
 DOUBLINGS = 12  # of its duration, after which the band counts as out of reach
+DURATION_MARGIN = 1.2  # duration of the second, finer simulation over the time at which the band was reached
+BRAKED_DURATION = 1.5  # duration with a switch to full reverse, over that without: the band is reached later
 DRIVE = Drive()  # the voltage is the input
 
 
@@ -63,13 +66,13 @@ def fastest_settling(
     **Source**: Pontryagin et al., "The Mathematical Theory of Optimal Processes" (1962), section 5.
     """
     motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
-    duration = 10 * float(motor.transient_time)
+    duration = FIRST_DURATION * float(motor.transient_time)
     bounds = jax.tree.map(jnp.asarray, (setpoint, voltage_limit, current_limit, float(initial), float(load)))
     for _ in range(DOUBLINGS):
         entry_time = float(_bang_bang_step(motor, duration, INSTANTS, *bounds).entry_time)
         if not math.isnan(entry_time):
             # again, with the instants as close together as this duration permits
-            return _settling_with_one_switch(motor, 1.2 * entry_time, *bounds)
+            return _settling_with_one_switch(motor, DURATION_MARGIN * entry_time, *bounds)
         duration *= 2
     return None
 
@@ -86,7 +89,7 @@ def _settling_with_one_switch(motor: Motor, duration: float, *bounds: Any) -> fl
     early, late = 0, INSTANTS
     while late - early > 1:
         switch = (early + late) // 2
-        trial = _bang_bang_step(motor, 1.5 * duration, switch, *bounds)
+        trial = _bang_bang_step(motor, BRAKED_DURATION * duration, switch, *bounds)
         if not trial.stays:
             late = switch
             continue
