@@ -143,7 +143,7 @@ def test_a_small_step_is_tuned_for_what_the_sampling_allows():
 def test_slow_sampling_is_noted(sample_time, noted):
     requirements = LoopRequirements("pi", setpoint=481.0, voltage_limit=30.0, sample_time=sample_time)
     with jax.enable_x64(True):
-        notes = requirements.completed(MOTOR).notes
+        _, notes = requirements.task(MOTOR)
     assert any("takes 2.2 samples of 0.02 s" in note for note in notes) == noted
 
 
@@ -158,7 +158,7 @@ SLOW_EFFECTS = {
 def test_a_loop_is_judged_for_as_long_as_its_effects_last(effect, setpoint, least):
     requirements = LoopRequirements("pi", setpoint, voltage_limit=30.0, sample_time=1e-3)
     with jax.enable_x64(True):
-        plain, slow = (requirements.completed(motor) for motor in (MOTOR, MOTOR.with_effects([effect])))
+        plain, slow = (requirements.task(motor)[0] for motor in (MOTOR, MOTOR.with_effects([effect])))
     assert 1e-3 * slow.part_samples > least > 1e-3 * plain.part_samples
 
 
@@ -242,10 +242,10 @@ def test_a_motor_file_is_accepted_with_its_noise(motor_file, monkeypatch):
     content = json.loads((motor_file / "motor.json").read_text()) | {"noise": {"speed_rad_s": 0.5}}
     (motor_file / "motor.json").write_text(json.dumps(content))
 
-    def completed(requirements, motor):
+    def refuse(requirements, motor):
         raise InputError("asked", f"{requirements.recorded_noise} {motor.R}", "")
 
-    monkeypatch.setattr(LoopRequirements, "completed", completed)
+    monkeypatch.setattr(LoopRequirements, "task", refuse)
     with pytest.raises(InputError, match=f"asked: 0.5 {PAPER['R']}"):
         tune("motor.json", "pi")
 

@@ -99,6 +99,10 @@ class Task(eqx.Module):
     part_samples: int = eqx.field(static=True)
     substeps: int = eqx.field(static=True, default=1)
 
+    def with_noise(self, noise: Float[np.ndarray, " samples"]) -> Task:
+        """The same task with this noise, rad/s."""
+        return eqx.tree_at(lambda task: task.noise, self, jnp.asarray(noise))
+
     def course(self) -> Course:
         """Reference, load and noise at each sample of the three parts."""
         part = jnp.arange(PART_COUNT * self.part_samples) // self.part_samples

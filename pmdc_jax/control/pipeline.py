@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import attrs
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +17,6 @@ from ..progress import ReportProgress, silent
 from ..runtime.compiled import free_memory_maps
 from ..runtime.precision import double_precision
 from ..runtime.threads import one_blas_thread
-from ..simulate.propagator import steps_within
 from .classical import ZIEGLER_NICHOLS_CONTROLLERS, ziegler_nichols
 from .controllers import AbstractController
 from .descent import STARTS, best_coordinates
@@ -26,9 +24,9 @@ from .evaluation import EvaluatedController, Robustness, evaluate, evaluate_robu
 from .gains import GainSpace
 from .law import Law
 from .margins import margins
-from .objective import PART_COUNT, Task
+from .objective import Task
 from .remarks import remarks
-from .specification import MAX_SENSITIVITY, LoopRequirements, Specification
+from .specification import MAX_SENSITIVITY, LoopRequirements
 from .spread import drawn_motors, even_spread
 from .tuning import Tuning
 
@@ -112,21 +110,18 @@ def tune(
     free_memory_maps()
     report = progress or silent
     subject: Motor = jax.tree.map(lambda x: jnp.asarray(x, float), motor)
-    specification = requirements.completed(subject)
+    task, notes = requirements.task(subject)
     variation = uncertainty if spread is None else even_spread(spread)
     report("tuning from many starts")
-    task_samples = PART_COUNT * specification.part_samples
-    unit_noise = np.random.default_rng(seed).standard_normal(task_samples)
-    task = _task(specification, subject, unit_noise)
+    unit_noise = np.random.default_rng(seed).standard_normal(task.noise.size)
+    task = task.with_noise((requirements.speed_noise or 0.0) * unit_noise)
     tuning_motors = _tuning_motors(subject, variation, seed)
-    best = _best_controller(specification, task, tuning_motors, unit_noise, seed, starts)
+    best = _best_controller(requirements, task, tuning_motors, unit_noise, seed, starts)
     report("evaluating the loop", fraction=0.8)
     validation_motors = None if variation is None else _validation_motors(subject, variation, seed)
-    result = _evaluated(specification, task, subject, best, validation_motors, seed)
+    result = _evaluated(requirements, task, subject, best, validation_motors, seed)
     return attrs.evolve(
-        result,
-        messages=(*specification.notes, *remarks(result, uncertainty)),
-        seconds={"total": time.perf_counter() - begin},
+        result, messages=(*notes, *remarks(result, uncertainty)), seconds={"total": time.perf_counter() - begin}
     )
 
 
@@ -135,25 +130,6 @@ def robustness(tuning: Tuning, spread: float, seed: int) -> Robustness:
     """Metrics of a tuning over motors that it was not tuned for; `spread` as in `tune`."""
     motors = _validation_motors(tuning.motor, even_spread(spread), seed)
     return evaluate_robustness(tuning.task, tuning.motor, tuning.controller, motors)
-
-
-def _task(specification: Specification, motor: Motor, unit_noise: np.ndarray) -> Task:
-    """The task on which a controller is evaluated, with the noise of the sensor."""
-    requirements = specification.requirements
-    stall_current = float(specification.voltage_limit / motor.R)
-    max_current = min(stall_current, requirements.current_limit or stall_current)
-    return Task(
-        hardware=specification.hardware(),
-        setpoint=jnp.asarray(specification.setpoint),
-        load=jnp.asarray(specification.load_torque),
-        fastest_settling=jnp.asarray(specification.fastest_settling),
-        settling_scale=jnp.asarray(specification.settling_scale),
-        max_overshoot=jnp.asarray(requirements.allowed_overshoot),
-        max_sensitivity=None if requirements.max_sensitivity is None else jnp.asarray(requirements.max_sensitivity),
-        noise=jnp.asarray((requirements.speed_noise or 0.0) * unit_noise),
-        part_samples=specification.part_samples,
-        substeps=int(steps_within(motor, specification.sample_time, jnp.asarray(max_current))),
-    )
 
 
 def _tuning_motors(motor: Motor, variation: Uncertainty | None, seed: int) -> Motor:
@@ -171,10 +147,9 @@ def _validation_motors(motor: Motor, variation: Uncertainty, seed: int) -> Motor
 
 
 def _best_controller(
-    specification: Specification, task: Task, motors: Motor, unit_noise: np.ndarray, seed: int, starts: int
+    requirements: LoopRequirements, task: Task, motors: Motor, unit_noise: np.ndarray, seed: int, starts: int
 ) -> AbstractController:
     """Best controller of all starts, tuned with noise even if the sensor has none (`MIN_TUNING_NOISE`)."""
-    requirements = specification.requirements
     nominal = jax.tree.map(lambda leaf: leaf[0], motors)
     # of the voltage limit, which a loop needs that settles in its scale: at first the speed rises with voltage and time
     share = task.fastest_settling / task.settling_scale
@@ -186,8 +161,7 @@ def _best_controller(
         motor=nominal,
         setpoint=task.setpoint,
     )
-    tuning_noise = unit_noise * _tuning_noise(requirements, abs(specification.setpoint))
-    tuning_task = eqx.tree_at(lambda t: t.noise, task, jnp.asarray(tuning_noise))
+    tuning_task = task.with_noise(unit_noise * _tuning_noise(requirements, abs(float(task.setpoint))))
     coordinates = best_coordinates(tuning_task, space, motors, seed, starts)
     return space.controller(jnp.asarray(coordinates))
 
@@ -201,7 +175,7 @@ def _tuning_noise(requirements: LoopRequirements, speed: float) -> float:
 
 
 def _evaluated(
-    specification: Specification,
+    requirements: LoopRequirements,
     task: Task,
     motor: Motor,
     controller: AbstractController,
@@ -210,7 +184,6 @@ def _evaluated(
 ) -> Tuning:
     """The result: exact metrics of the tuned controller and of its textbook rivals."""
     law = Law.of(controller, task.hardware, motor)
-    requirements = specification.requirements
     return Tuning(
         law=law,
         motor=motor,

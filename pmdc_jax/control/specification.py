@@ -1,4 +1,4 @@
-"""Specification of a loop and its hardware: defaults for what is left open, errors for what is impossible."""
+"""What a user asks of a loop, and the task of it: defaults for what is left open, errors for what is impossible."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from attrs import frozen
 
 from ..errors import InputError
 from ..motor import Motor
+from ..simulate.propagator import steps_within
 from .controllers import CONTROLLERS
 from .feasibility import check_reachable, check_settling, default_load_torque
 from .hardware import Hardware
 from .loop import REMEMBERED_SAMPLES
-from .objective import SECOND_SETPOINT
+from .objective import PART_COUNT, SECOND_SETPOINT, Task
 from .steady import steady_state
 from .time_optimal import fastest_settling
 
@@ -93,8 +94,9 @@ class LoopRequirements:
         """Largest overshoot, %, that counts as none if none is wanted."""
         return max(self.max_overshoot, NO_OVERSHOOT)
 
-    def completed(self, motor: Motor) -> Specification:
-        """The specification for a motor, with defaults for what is left open.
+    def task(self, motor: Motor) -> tuple[Task, list[str]]:
+        """The task for a motor, without noise, with defaults for what is left open, and notes on these. Its numbers are
+        arrays, so that other values do not cause recompilation.
 
         **Raises**: `InputError`, stating the limit, where no controller can meet it.
         """
@@ -107,17 +109,24 @@ class LoopRequirements:
         sample_time, sampling_notes = self._sampling(motor, fastest)
         _check_sensor(motor, sample_time)
         dead_time = _dead_time(motor, sample_time, self.delay)
-        return Specification(
-            requirements=self,
+        stall_current = voltage_limit / float(motor.R)
+        max_current = min(stall_current, self.current_limit or stall_current)
+        part_samples = _part_samples(fastest, dead_time, _torque_period(motor, setpoint), sample_time)
+        task = Task(
+            hardware=Hardware(
+                sample_time, voltage_limit, self.current_limit, self.speed_step, self.delay, self.measures_current
+            ),
             setpoint=setpoint,
-            voltage_limit=voltage_limit,
-            sample_time=sample_time,
-            load_torque=default_load_torque(*operation) if self.load_torque is None else self.load_torque,
+            load=default_load_torque(*operation) if self.load_torque is None else self.load_torque,
             fastest_settling=fastest,
             settling_scale=max(fastest, LOOP_DEAD_TIMES * dead_time),
-            part_samples=_part_samples(fastest, dead_time, _torque_period(motor, setpoint), sample_time),
-            notes=(*limit_notes, *sampling_notes),
+            max_overshoot=self.allowed_overshoot,
+            max_sensitivity=self.max_sensitivity,
+            noise=jnp.zeros(PART_COUNT * part_samples),
+            part_samples=part_samples,
+            substeps=int(steps_within(motor, sample_time, jnp.asarray(max_current))),
         )
+        return jax.tree.map(lambda x: jnp.asarray(x, float), task), [*limit_notes, *sampling_notes]
 
     def _operating_point(self, motor: Motor) -> tuple[float, float, list[str]]:
         """Set point (rad/s), voltage limit (V), and a note on each that is a default."""
@@ -157,40 +166,6 @@ class LoopRequirements:
         if suitable < self.sample_time:
             remark += f": a sample time of {suitable:g} s would perform better"
         return self.sample_time, [remark]
-
-
-@frozen
-class Specification:
-    """Complete specification of a loop.
-
-    **Fields**: `requirements`, the user's; `setpoint`, rad/s; `voltage_limit`, V; `sample_time`, s;
-    `load_torque`, N m; `fastest_settling`, s, of any controller within the limits; `settling_scale`, s, the same, or
-    what the dead time of the loop allows if that is longer; `part_samples`, in each part of the task; `notes`, on the
-    defaults chosen.
-    """
-
-    requirements: LoopRequirements
-    setpoint: float
-    voltage_limit: float
-    sample_time: float
-    load_torque: float
-    fastest_settling: float
-    settling_scale: float
-    part_samples: int
-    notes: tuple[str, ...]
-
-    def hardware(self) -> Hardware:
-        """The loop's hardware. Its numbers are arrays, so that other values do not cause recompilation."""
-        requirements = self.requirements
-        hardware = Hardware(
-            self.sample_time,
-            self.voltage_limit,
-            requirements.current_limit,
-            requirements.speed_step,
-            requirements.delay,
-            requirements.measures_current,
-        )
-        return jax.tree.map(lambda x: jnp.asarray(x, float), hardware)
 
 
 def _check_number(name: str, value: float | None, wanted: str, is_valid: Callable[[float], bool]) -> None:
