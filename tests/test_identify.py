@@ -26,6 +26,7 @@ from pmdc_jax.control.spread import drawn_motors
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify import problem as problems
 from pmdc_jax.identify.fit import polish as polishing
+from pmdc_jax.identify.fit.fitted_runs import FittedRuns
 from pmdc_jax.identify.fit.generalised_least_squares import last_fit, residuals_of, with_whitening
 from pmdc_jax.identify.fit.polish import FIRST_TO_GIVE_UP, fit_at, polish
 from pmdc_jax.identify.fit.refine import Optimum, refine
@@ -168,8 +169,9 @@ def test_hold_outs_do_not_affect_the_fit(runs):
 
 def test_a_bound_along_an_unidentifiable_direction_is_not_reported(x64):
     """A search may end anywhere along it, even where Kt is at its bound, but J and f are not identified thereby."""
-    given, solved = solve(prepare(unloaded(5), [], unloaded=True), "cma_es", seed=0)
-    names, best = given.problem.parameters.names, solved.fit.optimum
+    solved = solve(prepare(unloaded(5), [], unloaded=True), "cma_es", seed=0)
+    given, fit = solved.fitted
+    names, best = given.problem.parameters.names, fit.optimum
     at = np.array(best.unknowns.coordinates)
     down = given.problem.parameters.lower[names.index("Kt")] - at[names.index("Kt")]
     at[[names.index(name) for name in ("Kt", "J", "f")]] += down
@@ -177,7 +179,7 @@ def test_a_bound_along_an_unidentifiable_direction_is_not_reported(x64):
     assert names[3] == "Kt"
     polished = polish(given.problem, held)
     assert polished.at_bound == (3,)
-    found = results_of(given, solved._replace(fit=polished))
+    found = results_of(solved._replace(fitted=FittedRuns(given, polished)))
     assert {found.parameters[n].status for n in ("Kt", "J", "f")} == {"not_identifiable"}
     assert found.parameters["Kt"].value == pytest.approx(found.parameters["Kb"].value, rel=1e-6)
 
@@ -524,8 +526,8 @@ def test_whitening_matches_its_formula_sample_by_sample():
             np.testing.assert_allclose(found[t], expected, atol=1e-6, err_msg=f"{index} {t}")
 
 
-def _last_fit(given, plain_fit):
-    return last_fit(given, plain_fit, plain_fit, fit_whitener(residuals_of(given, plain_fit)))
+def _last_fit(plain):
+    return last_fit(plain, plain.fit, fit_whitener(residuals_of(*plain)))
 
 
 def test_whitening_of_torque_noise_reduces_standard_errors():
@@ -533,26 +535,27 @@ def test_whitening_of_torque_noise_reduces_standard_errors():
     noise = replace(NOISE, torque_Nm=0.05, torque_correlation_s=0.02)
     runs = light_and_loaded(3, noise=noise)
     with jax.enable_x64(True):
-        given, solved = solve(prepare(runs, []), "cma_es", 0)
-        whitened, last = _last_fit(given, solved.fit)
-        plain_estimates = results_of(given, solved).parameters
-        whitened_estimates = results_of(whitened, solved._replace(fit=last)).parameters
-    assert last.optimum.converged
+        solved = solve(prepare(runs, []), "cma_es", 0)
+        whitened = _last_fit(solved.fitted)
+        plain_estimates = results_of(solved).parameters
+        whitened_estimates = results_of(solved._replace(fitted=whitened)).parameters
+    assert whitened.fit.optimum.converged
     assert whitened_estimates["R"].stderr < 0.5 * plain_estimates["R"].stderr
     for name in PARAMETERS:
         assert whitened_estimates[name].stderr < 1.2 * plain_estimates[name].stderr, name
         error = abs(whitened_estimates[name].value - getattr(PAPER, name))
         assert error < 4 * whitened_estimates[name].stderr, name
     # the fitted initial states are close to the measured ones
-    initial = np.column_stack([last.unknowns.runs.current, last.unknowns.runs.speed])
+    own = whitened.fit.unknowns.runs
+    initial = np.column_stack([own.current, own.speed])
     measured = [(run.current[0], run.speed[0]) for run in runs]
     np.testing.assert_allclose(initial, measured, atol=5 * NOISE.speed_rad_s)
 
 
 def test_white_residuals_need_no_filter(runs):
     with jax.enable_x64(True):
-        given, solved = solve(prepare(runs, []), "cma_es", 0)
-        assert _last_fit(given, solved.fit)[1] is solved.fit
+        plain = solve(prepare(runs, []), "cma_es", 0).fitted
+        assert _last_fit(plain) is plain
 
 
 def test_one_start_of_the_refinement_has_a_medium_inductance():

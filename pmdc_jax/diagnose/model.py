@@ -8,6 +8,7 @@ import attrs
 import numpy as np
 
 from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction, InputDeadZone
+from ..identify.fit.fitted_runs import FittedRuns
 from ..identify.fit.gauss_newton import TRIAL_TOLERANCE
 from ..identify.fit.generalised_least_squares import last_fit, residuals_of, series_of, training_indices, with_whitening
 from ..identify.fit.polish import Fit, fit_at, reweighted
@@ -35,6 +36,11 @@ class Model:
     effects: tuple[str, ...]
     prepared: Prepared
     fit: Fit
+
+    @property
+    def fitted(self) -> FittedRuns:
+        """The recordings as prepared for it, and its fit to them."""
+        return FittedRuns(self.prepared, self.fit)
 
     @property
     def motor(self) -> Motor:
@@ -173,11 +179,11 @@ def model_of(effects: tuple[str, ...], prepared: Prepared, fit: Fit) -> Model:
     return Model(effects, prepared, fit)
 
 
-def final_fit(model: Model, white: Whitener) -> tuple[Prepared, Fit]:
+def final_fit(model: Model, white: Whitener) -> FittedRuns:
     """The last fit of a model: to whitened residuals where `last_fit` allows it, else by plain least squares."""
     known = reweighted(model.prepared.problem, model.fit)
-    prepared, unfiltered = polish_with_angle(model.prepared, model.fit.optimum, known=known)
-    return last_fit(prepared, unfiltered, model.fit, white)
+    unfiltered = polish_with_angle(model.prepared, model.fit.optimum, known=known)
+    return last_fit(unfiltered, model.fit, white)
 
 
 class RunSeries(NamedTuple):

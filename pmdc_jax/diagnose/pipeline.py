@@ -68,7 +68,7 @@ def diagnose(
 
 def _diagnosis(attempt: Attempt) -> Diagnosis:
     """What the effects named mean: the verdict, the motors without and with them, and what is left."""
-    base = results_of(attempt.prepared, attempt.solved)
+    base = results_of(attempt.solved)
     naming, final = _without_unneeded_effects(attempt, base)
     before, after = (electrical_misfit(m) for m in (attempt.selection.base, naming.chosen))
     verdict, noise = judge(naming, base, final, (before, after))
@@ -84,7 +84,7 @@ def _diagnosis(attempt: Attempt) -> Diagnosis:
         gap_of_run=gaps,
         closed_fraction=closed_fraction(by_role) if naming.chosen.effects else None,
         rivals=rival_sets(naming),
-        next_experiment=next_experiment(naming, attempt.prepared.training) if verdict == "ambiguous" else None,
+        next_experiment=next_experiment(naming, attempt.solved.fitted.prepared.training) if verdict == "ambiguous" else None,
         curves=learned_curves(naming) if reports_curves else (),
         detectable=detectable_effects(naming.chosen_screen),
         base=base,
@@ -113,5 +113,4 @@ def _without_unneeded_effects(attempt: Attempt, base: Identification) -> tuple[N
 
 def _identification(naming: Naming, solved: Solved) -> Identification:
     """The identification of the chosen motor."""
-    prepared, fit = naming.final_fit
-    return results_of(prepared, solved._replace(fit=fit))
+    return results_of(solved._replace(fitted=naming.final_fit))

@@ -8,11 +8,10 @@ import numpy as np
 
 from ..motor import Motor
 from ..recordings.recording import AROUND, OVER_BOTH, OVER_LAST
-from .identification import RunFit
+from .identification import RunFit, Search
 from .noise.sensor_noise import rms
 from .prepare import Prepared
 from .run_fits import of_training
-from .solve import Solved
 
 # An unknown load is worth a message from this share of the motor's torque on (root mean square),
 MIN_LOAD_SHARE = 0.02
@@ -31,12 +30,12 @@ AVERAGING_SPANS = {
 
 
 def messages_of(
-    prepared: Prepared, solved: Solved, motor: Motor, fit: Mapping[str, RunFit], Kt_set_to_Kb: bool
+    prepared: Prepared, search: Search, motor: Motor, fit: Mapping[str, RunFit], Kt_set_to_Kb: bool
 ) -> tuple[str, ...]:
     """What was corrected, assumed or interrupted, and what the loads and the temperatures of the runs may be."""
     messages = _corrections(prepared)
-    if solved.search.interrupted:
-        messages.append(f"the search was interrupted after {len(solved.search.best)} generations")
+    if search.interrupted:
+        messages.append(f"the search was interrupted after {len(search.best)} generations")
     if Kt_set_to_Kb:
         messages.append("Kt was set equal to Kb, as holds in SI units, and J and f scale with it")
     return (*messages, *_unknown_load(motor, of_training(fit)), *_warm_windings(fit))

@@ -53,13 +53,12 @@ def identify(
     free_memory_maps()
     report("checking the recordings")
     prepared = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded, effects=effects_named(effects))
-    prepared, solved = solve(prepared, search, seed, progress)
-    report("estimating the uncertainty", solved.fit.fitness)
-    plain_fit = solved.fit
-    friction = missing_friction(prepared, plain_fit)
-    white = fit_whitener(residuals_of(prepared, plain_fit))
-    prepared, polished = last_fit(prepared, plain_fit, plain_fit, white)
-    result = results_of(prepared, solved._replace(fit=polished))
+    solved = solve(prepared, search, seed, progress)
+    plain = solved.fitted
+    report("estimating the uncertainty", plain.fit.fitness)
+    friction = missing_friction(*plain)
+    white = fit_whitener(residuals_of(*plain))
+    result = results_of(solved._replace(fitted=last_fit(plain, plain.fit, white)))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
     residual_messages = (
         f"the residual of the {name} is {times:.3g} times its white noise: run `pmdc diagnose` to find out whether the "

@@ -21,10 +21,11 @@ from .uncertainty.covariance import information_of
 from .uncertainty.identifiability import explain_directions
 
 
-def results_of(prepared: Prepared, solved: Solved) -> Identification:
+def results_of(solved: Solved) -> Identification:
     """The result of a fit: estimates with uncertainty and status, and the fit of every run."""
+    prepared, found = solved.fitted
     problem, training = prepared.problem, prepared.training
-    released = released_from_bounds(problem, solved.fit)
+    released = released_from_bounds(problem, found)
     parameters = problem.parameters
     info = information_of(problem, released)
     chosen = with_Kt_equal_Kb(problem, released, info)
@@ -55,7 +56,7 @@ def results_of(prepared: Prepared, solved: Solved) -> Identification:
         findings=prepared.findings,
         covariance=covariance,
         covariance_names=names,
-        messages=messages_of(prepared, solved, motor, fit, Kt_set_to_Kb=chosen is not released),
+        messages=messages_of(prepared, solved.search, motor, fit, Kt_set_to_Kb=chosen is not released),
         missed=large_residuals(fit),
     )
 

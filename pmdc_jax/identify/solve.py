@@ -21,8 +21,9 @@ from .corrections.retiming import with_timing
 from .corrections.speed_averaging import with_averaging, with_evident_averaging
 from .corrections.step_times import with_step_times
 from .corrections.uneven_sampling import with_even_clock
+from .fit.fitted_runs import FittedRuns
 from .fit.gauss_newton import TOLERANCE
-from .fit.polish import Fit, polish
+from .fit.polish import polish
 from .fit.refine import Optimum, refine
 from .fit.run_unknowns import with_holdout_unknowns
 from .identification import Search
@@ -51,7 +52,7 @@ MIN_DISTANCE = 0.3
 class Solved(NamedTuple):
     """The best fit that a search and its refinements found, and how it was found."""
 
-    fit: Fit
+    fitted: FittedRuns
     search: Search
     seed: int
     seconds: Mapping[str, float]
@@ -59,33 +60,28 @@ class Solved(NamedTuple):
 
 def solve(
     prepared: Prepared, search: str, seed: int, progress: ReportProgress | None = None, timing: Timing | None = None
-) -> tuple[Prepared, Solved]:
+) -> Solved:
     """The best fit of a search, to runs corrected for artefacts of their sensors and for the timing of their inputs.
 
     **Arguments**: `timing` of the inputs, if it is known already.
-    **Returns**: the problem as `search_and_refine` returns it, corrected, and the fit to it.
     """
     recorded = with_evident_averaging(prepared)
 
-    def at(timing: Timing | None) -> tuple[Prepared, Solved]:
+    def at(timing: Timing | None) -> Solved:
         runs = with_timing(recorded, timing) if timing else recorded
-        return _corrected(*search_and_refine(runs, search, seed, progress))
+        return _corrected(search_and_refine(runs, search, seed, progress))
 
     attempts = [at(timing)]
     if timing is None:
-        prepared, solved = attempts[0]
-        attempts += map(at, other_timings(prepared, solved.fit))
-    solutions = []
-    for runs, result in attempts:
-        runs, fit = with_fitted_reading(*with_step_times(runs, result.fit))
-        solutions.append((runs, result._replace(fit=fit)))
+        attempts += map(at, other_timings(attempts[0].fitted))
+    solutions = [a._replace(fitted=with_fitted_reading(with_step_times(a.fitted))) for a in attempts]
     if len(solutions) == 1:
         return solutions[0]
-    return min(solutions, key=lambda pair: negative_log_likelihood_within(pair[0], pair[1].fit))
+    return min(solutions, key=lambda solution: negative_log_likelihood_within(solution.fitted))
 
 
 # Applied in this order: uneven sampling hides everything else, and a mean is recognised by the sensor's own noise
-CORRECTIONS: tuple[Callable[[Prepared, Fit], tuple[Prepared, Fit]], ...] = (
+CORRECTIONS: tuple[Callable[[FittedRuns], FittedRuns], ...] = (
     with_even_clock,
     without_input_noise,
     with_averaging,
@@ -93,21 +89,22 @@ CORRECTIONS: tuple[Callable[[Prepared, Fit], tuple[Prepared, Fit]], ...] = (
 )
 
 
-def _corrected(prepared: Prepared, solved: Solved) -> tuple[Prepared, Solved]:
+def _corrected(solved: Solved) -> Solved:
     """The runs corrected for artefacts of their sensors, and the fit to them."""
-    fit = with_holdout_unknowns(prepared.problem, solved.fit)
+    prepared, fit = solved.fitted
+    fitted = FittedRuns(prepared, with_holdout_unknowns(prepared.problem, fit))
     for correct in CORRECTIONS:
-        prepared, fit = correct(prepared, fit)
-    return prepared, solved._replace(fit=fit)
+        fitted = correct(fitted)
+    return solved._replace(fitted=fitted)
 
 
 def search_and_refine(
     prepared: Prepared, search: str, seed: int, progress: ReportProgress | None = None, searches: int = MAX_SEARCHES
-) -> tuple[Prepared, Solved]:
+) -> Solved:
     """Search the bounds and refine the best candidates; repeat with other seeds while the fit is poor or no two
     refinements agree, up to `searches` searches in all.
 
-    **Returns**: the problem, with the rotor angle updated from the fit where a torque depends on it, and the fit.
+    **Returns**: the fit, and the runs with the rotor angle updated from it where a torque depends on that.
     """
     began = time.perf_counter()
     report = progress or silent
@@ -131,10 +128,10 @@ def search_and_refine(
             break
         search_result = _continued(search_result, run_search(seed + attempt))
         ends = _refine_all(problem, search_result, ends)
-    prepared, polished = polish_with_angle(prepared, ends[0])
+    fitted = polish_with_angle(prepared, ends[0])
     seconds = {"search": search_ended - began, "refine": time.perf_counter() - search_ended}
     record = _search_record(search, search_result, ends, problem.outputs)
-    return prepared, Solved(polished, record, seed, seconds)
+    return Solved(fitted, record, seed, seconds)
 
 
 def _continued(before: SearchResult, search: SearchResult) -> SearchResult:
@@ -158,7 +155,7 @@ def polish_with_angle(
     tolerance: float = TOLERANCE,
     known: Evaluation | None = None,
     useful: float = np.inf,
-) -> tuple[Prepared, Fit]:
+) -> FittedRuns:
     """Polish; where a torque depends on the rotor angle, update the angle from the fit and repeat while that helps.
 
     **Arguments**: as of `polish`.
@@ -171,7 +168,7 @@ def polish_with_angle(
         if not better.fitness < (1 - MIN_ANGLE_GAIN) * polished.fitness:
             break
         prepared, polished = again, better
-    return prepared, polished
+    return FittedRuns(prepared, polished)
 
 
 def _start(tape: Tape, coordinates: jax.Array | np.ndarray) -> Unknowns:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from ...identify.fit.by_run import FitByRun, errors_by_run, fit_by_run
 from ...identify.fit.gauss_newton import squares_of_runs
-from ...identify.fit.likelihood import negative_log_likelihood
+from ...identify.fit.likelihood import negative_log_likelihood_of
 from ...identify.fit.run_unknowns import fit_run_unknowns
 from ...identify.identification import Estimate
 from ...identify.parameters import unit_of
@@ -84,7 +84,7 @@ def varying_parameter(model: Model, assessment: Assessment) -> VaryingParameter 
         min(1.0, len(variations) * float(np.exp(best.log_p))),
         alternatives,
         {run.name: fits[run.name] for run in prepared.training},
-        negative_log_likelihood(prepared, fit),
+        negative_log_likelihood_of(prepared, fit.evaluation),
     )
 
 

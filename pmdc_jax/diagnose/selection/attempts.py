@@ -11,6 +11,7 @@ from ...effects import EFFECTS
 from ...identify.corrections.initial_temperature import with_initial_temperatures
 from ...identify.corrections.input_timing import negative_log_likelihood_within, only_current_is_late, other_timings
 from ...identify.corrections.speed_averaging import with_averaging
+from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN
 from ...identify.prepare import Prepared
 from ...identify.solve import Solved, polish_with_angle, solve
@@ -27,8 +28,7 @@ SAME_LEAD = 0.05
 class Attempt(NamedTuple):
     """Effects named for one timing of the voltages and one set of runs that begin with a warm winding."""
 
-    prepared: Prepared
-    solved: Solved
+    solved: Solved  # the motor without effects, and the runs with this timing
     selection: StepwiseSelection
     naming: Naming
     identifying: float  # s that the identification of the motor without effects took
@@ -39,17 +39,17 @@ def likeliest_attempt(prepared: Prepared, search: str, seed: int, report: Report
     runs that begin with a warm winding."""
     attempt = _of_likeliest_timing(prepared, search, seed, report)
     chosen = attempt.naming.chosen
-    if chosen.effects and chosen.prepared.averaging == OVER_LAST:
-        counted, _ = with_averaging(chosen.prepared, chosen.fit)
-        if counted.averaging == AROUND:
-            around = prepared._replace(averaging=AROUND)
-            attempt = _likelier(attempt, _of_likeliest_timing(around, search, seed, report))
-            chosen = attempt.naming.chosen
-    warm, _ = with_initial_temperatures(chosen.prepared, chosen.fit)
-    if warm is chosen.prepared:
+    over_last = chosen.effects and chosen.prepared.averaging == OVER_LAST
+    if over_last and with_averaging(chosen.fitted).prepared.averaging == AROUND:
+        around = prepared._replace(averaging=AROUND)
+        attempt = _likelier(attempt, _of_likeliest_timing(around, search, seed, report))
+        chosen = attempt.naming.chosen
+    warm = with_initial_temperatures(chosen.fitted)
+    if warm.prepared is chosen.prepared:
         return attempt
-    prepared = attempt.prepared.with_problem(begins_warm=warm.problem.begins_warm)
-    return _likelier(attempt, _named(prepared, attempt.solved, attempt.identifying, report))
+    prepared, fit = attempt.solved.fitted
+    begins_warm = FittedRuns(prepared.with_problem(begins_warm=warm.problem.begins_warm), fit)
+    return _likelier(attempt, _named(attempt.solved._replace(fitted=begins_warm), attempt.identifying, report))
 
 
 def _of_likeliest_timing(prepared: Prepared, search: str, seed: int, report: ReportProgress) -> Attempt:
@@ -57,37 +57,37 @@ def _of_likeliest_timing(prepared: Prepared, search: str, seed: int, report: Rep
     or those with a zero-order hold if nothing speaks against it any more."""
 
     @cache
-    def identified(timing: Timing | None) -> tuple[Prepared, Solved, float]:
+    def identified(timing: Timing | None) -> tuple[Solved, float]:
         began = time.perf_counter()
-        timed, solved = solve(prepared, search, seed, report, timing)
-        return timed, solved, time.perf_counter() - began
+        return solve(prepared, search, seed, report, timing), time.perf_counter() - began
 
     def attempt(timing: Timing | None = None) -> Attempt:
         return _named(*identified(timing), report)
 
     first = attempt()
-    zero_order, timing = first.naming.chosen, first.prepared.timing
+    zero_order, timing = first.naming.chosen, first.solved.fitted.prepared.timing
     if not zero_order.effects:
         return first
     if timing != ZERO_ORDER_HOLD:
         chosen = zero_order
-        if only_current_is_late(chosen.prepared, chosen.fit):
+        if only_current_is_late(chosen.fitted):
             return attempt(ZERO_ORDER_HOLD)
-        zero_order = _with_effects_of(chosen, identified(ZERO_ORDER_HOLD)[0])
-        gain = _negative_log_likelihood(zero_order) - _negative_log_likelihood(chosen)
+        solved, _ = identified(ZERO_ORDER_HOLD)
+        zero_order = _with_effects_of(chosen, solved.fitted.prepared)
+        gain = negative_log_likelihood_within(zero_order.fitted) - negative_log_likelihood_within(chosen.fitted)
         if not gain > MIN_LOG_LIKELIHOOD_GAIN:
             return attempt(ZERO_ORDER_HOLD)
-    likelier = other_timings(zero_order.prepared, zero_order.fit)[:1]
+    likelier = other_timings(zero_order.fitted)[:1]
     if not likelier or _is_tried(likelier[0], timing):
         return first
     return _likelier(first, attempt(likelier[0]))
 
 
-def _named(prepared: Prepared, solved: Solved, identifying: float, report: ReportProgress) -> Attempt:
+def _named(solved: Solved, identifying: float, report: ReportProgress) -> Attempt:
     """The effects named beside the motor without effects that was identified."""
-    report("gathering evidence", solved.fit.fitness)
-    selection = StepwiseSelection(model_of((), prepared, solved.fit), solved, report)
-    return Attempt(prepared, solved, selection, selection.name(), identifying)
+    report("gathering evidence", solved.fitted.fit.fitness)
+    selection = StepwiseSelection(model_of((), *solved.fitted), solved, report)
+    return Attempt(solved, selection, selection.name(), identifying)
 
 
 def _with_effects_of(model: Model, prepared: Prepared) -> Model:
@@ -98,11 +98,7 @@ def _with_effects_of(model: Model, prepared: Prepared) -> Model:
 
 def _likelier(*attempts: Attempt) -> Attempt:
     """The attempt whose effects make the runs likeliest."""
-    return min(attempts, key=lambda a: _negative_log_likelihood(a.naming.chosen))
-
-
-def _negative_log_likelihood(model: Model) -> float:
-    return negative_log_likelihood_within(model.prepared, model.fit)
+    return min(attempts, key=lambda a: negative_log_likelihood_within(a.naming.chosen.fitted))
 
 
 def _is_tried(other: Timing, timing: Timing) -> bool:

@@ -12,9 +12,8 @@ from typing import NamedTuple, TypeGuard
 import numpy as np
 
 from ...effects import EFFECTS
-from ...identify.fit.polish import Fit
+from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.noise.noise_model import Whitener
-from ...identify.prepare import Prepared
 from ...identify.solve import Solved
 from ...progress import ReportProgress
 from ..diagnosis import VaryingParameter
@@ -58,7 +57,7 @@ class Naming(NamedTuple):
     # root mean square of the chosen one's residuals beyond all curves over that of all; 1 if nothing more is missing
     noise_share: float
     p_without: dict[str, float]  # by effect of the chosen model: p-value of the data without it
-    final_fit: tuple[Prepared, Fit]  # of the chosen model
+    final_fit: FittedRuns  # of the chosen model
     line: Line | None  # a steady oscillation that the chosen model does not have
     # the parameter that differs from run to run, if that is what is left
     varies: VaryingParameter | None

@@ -129,8 +129,7 @@ class Refits:
         def search() -> Model:
             prepared = current.prepared.with_effects([EFFECTS[e] for e in effects])
             method, seed = self.solved.search.method, self.solved.seed
-            prepared, solved = search_and_refine(prepared, method, seed, searches=1)
-            return model_of(effects, prepared, solved.fit)
+            return model_of(effects, *search_and_refine(prepared, method, seed, searches=1).fitted)
 
         if (key := frozenset(effects)) in self.models:
             return self._stored_or_better(key, current, search)

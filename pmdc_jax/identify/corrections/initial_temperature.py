@@ -6,8 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
+from ..fit.fitted_runs import FittedRuns
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
-from ..fit.polish import Fit, polish
+from ..fit.polish import Fit
+from ..fit.refine import Optimum
 from ..prepare import Prepared
 from ..problem import Problem
 
@@ -15,23 +17,23 @@ from ..problem import Problem
 MAX_STDERR = 0.02
 
 
-def with_initial_temperatures(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def with_initial_temperatures(cold: FittedRuns) -> FittedRuns:
     """The runs with the initial rise of the resistance fitted in all but the coolest one, and the fit to them; both
     unchanged unless that is clearly likelier than that all begin cold."""
-    telling = _runs_that_tell(prepared.problem, fit)
-    if len(telling) < 2:
-        return prepared, fit
-    coolest = int(telling[0])
-    warm = _with_cold_run(prepared, fit, telling, coolest)
-    rises = np.asarray(warm[1].unknowns.runs.rise)
-    if (below := int(telling[np.argmin(rises[telling])])) != coolest:
-        again = _with_cold_run(prepared, _relative_to(warm, float(rises[below])), telling, below)
-        warm = min(warm, again, key=lambda pair: pair[1].cost)
-    gain = negative_log_likelihood(prepared, fit) - negative_log_likelihood(*warm)
-    return warm if gain > MIN_LOG_LIKELIHOOD_GAIN else (prepared, fit)
+    informative = _informative_runs(cold.problem, cold.fit)
+    if len(informative) < 2:
+        return cold
+    coolest = int(informative[0])
+    warm = _with_cold_run(cold.prepared, cold.fit.optimum, informative, coolest)
+    rises = np.asarray(warm.fit.unknowns.runs.rise)
+    if (below := int(informative[np.argmin(rises[informative])])) != coolest:
+        again = _with_cold_run(cold.prepared, _relative_to(warm, float(rises[below])), informative, below)
+        warm = min(warm, again, key=lambda fitted: fitted.fit.cost)
+    gain = negative_log_likelihood(cold) - negative_log_likelihood(warm)
+    return warm if gain > MIN_LOG_LIKELIHOOD_GAIN else cold
 
 
-def _runs_that_tell(problem: Problem, fit: Fit) -> Int[np.ndarray, " telling"]:
+def _informative_runs(problem: Problem, fit: Fit) -> Int[np.ndarray, " informative"]:
     """The training runs that tell how warm they begin."""
     names = problem.parameters.names
     if not problem.has_temperature or "R" not in names:
@@ -43,21 +45,19 @@ def _runs_that_tell(problem: Problem, fit: Fit) -> Int[np.ndarray, " telling"]:
 
 
 def _with_cold_run(
-    prepared: Prepared, fit: Fit, telling: Int[np.ndarray, " telling"], cold: int
-) -> tuple[Prepared, Fit]:
-    """The runs that tell with an initial rise, except one that begins cold; and the fit to them."""
-    warm = prepared.problem.begins_warm.at[telling].set(True).at[cold].set(False)
-    prepared = prepared.with_problem(begins_warm=warm)
-    return prepared, polish(prepared.problem, fit.optimum)
+    prepared: Prepared, start: Optimum, informative: Int[np.ndarray, " informative"], cold: int
+) -> FittedRuns:
+    """The informative runs with an initial rise, except one that begins cold; and the fit to them."""
+    warm = prepared.problem.begins_warm.at[informative].set(True).at[cold].set(False)
+    return FittedRuns.polished(prepared.with_problem(begins_warm=warm), start)
 
 
-def _relative_to(warm: tuple[Prepared, Fit], rise: float) -> Fit:
-    """The fit with R and the initial rises relative to the temperature at which a run with this rise begins."""
-    prepared, fit = warm
-    parameters, unknowns = prepared.problem.parameters, fit.unknowns
+def _relative_to(warm: FittedRuns, rise: float) -> Optimum:
+    """The optimum with R and the initial rises relative to the temperature at which a run with this rise begins."""
+    parameters, fit = warm.problem.parameters, warm.fit
     coordinates = np.array(fit.coordinates)
     coordinates[parameters.names.index("R")] += np.log1p(rise)
-    runs = unknowns.runs
+    runs = fit.unknowns.runs
     rises = (1 + runs.rise) / (1 + rise) - 1
-    moved = unknowns._replace(coordinates=jnp.asarray(coordinates), runs=runs._replace(rise=rises))
-    return fit._replace(optimum=fit.optimum._replace(unknowns=moved))
+    relative = fit.unknowns._replace(coordinates=jnp.asarray(coordinates), runs=runs._replace(rise=rises))
+    return fit.optimum._replace(unknowns=relative)

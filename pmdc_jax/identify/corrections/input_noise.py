@@ -8,8 +8,6 @@ response to the rough part, or they do not.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import attrs
 import jax
 import jax.numpy as jnp
@@ -18,12 +16,12 @@ from jaxtyping import Float
 
 from ...recordings.white_noise import noise_by_differences
 from ...simulate import Tape, uniform
+from ..fit.fitted_runs import FittedRuns
 from ..fit.generalised_least_squares import series_of
 from ..fit.likelihood import negative_log_likelihood
-from ..fit.polish import Fit, fit_at, polish
+from ..fit.polish import Fit, fit_at
 from ..noise.noise_model import fit_whitener
 from ..prepare import Prepared
-from ..problem import Problem
 
 # Noise below this share of the largest value is rounding
 MIN_RELATIVE_NOISE = 1e-7
@@ -43,39 +41,37 @@ MIN_Z_SCORE = 5.0
 MAX_SQUARES_RATIO = 1.1
 
 
-def without_input_noise(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def without_input_noise(recorded: FittedRuns) -> FittedRuns:
     """The runs with their drives smoothed where the motor did not feel the rough part, and the fit to them.
 
-    **Arguments**: `fit`, to the runs as they are. **Returns**: both unchanged if nothing was found, or if smoothing
-    makes the runs less likely: where most of the residuals have another cause, their regression may mislead.
+    **Returns**: both unchanged if nothing was found, or if smoothing makes the runs less likely: where most of the
+    residuals have another cause, their regression may mislead.
     """
+    prepared, fit = recorded
     drives = [np.asarray(getattr(run.recorded, run.drive)) for run in prepared.runs]
     rough = [drive - denoised(drive) for drive in drives]
     if not any(map(np.any, rough)):
-        return prepared, fit
+        return recorded
     smooth = _with_drives(prepared, [d - r for d, r in zip(drives, rough, strict=True)])
-    felt = _felt_shares(prepared, fit, fit_at(smooth, fit.optimum))
+    felt = _felt_shares(prepared, fit, fit_at(smooth.problem, fit.optimum))
     if not any(share < 1 for share in felt):
-        return prepared, fit
+        return recorded
     lost = [(1 - share) * r for share, r in zip(felt, rough, strict=True)]
-    problem = _with_drives(prepared, [d - x for d, x in zip(drives, lost, strict=True)])
-    better = polish(problem, fit.optimum)
-    if negative_log_likelihood(prepared, better) > negative_log_likelihood(prepared, fit):
-        return prepared, fit
-    taken = {run.name: float(np.std(x)) for run, x in zip(prepared.runs, lost, strict=True) if np.any(x)}
-    return prepared._replace(problem=problem, input_noise=taken), better
+    removed = {run.name: float(np.std(x)) for run, x in zip(prepared.runs, lost, strict=True) if np.any(x)}
+    cleaned = _with_drives(prepared, [d - x for d, x in zip(drives, lost, strict=True)])
+    better = FittedRuns.polished(cleaned._replace(input_noise=removed), fit.optimum)
+    return recorded if negative_log_likelihood(better) > negative_log_likelihood(recorded) else better
 
 
-def _with_drives(prepared: Prepared, drives: list[np.ndarray]) -> Problem:
-    """The problem with these drives of the runs."""
+def _with_drives(prepared: Prepared, drives: list[np.ndarray]) -> Prepared:
+    """The runs with these drives on their tape."""
     runs = [
         uniform(attrs.evolve(run.recorded, **{run.drive: drive}))
         for run, drive in zip(prepared.runs, drives, strict=True)
     ]
-    tape = prepared.problem.tape
     driven = Tape.from_recordings(runs, timing=prepared.timing)
     value, rise = jax.tree.map(jnp.asarray, (driven.value, driven.rise))
-    return replace(prepared.problem, tape=replace(tape, value=value, rise=rise))
+    return prepared.with_tape(value=value, rise=rise)
 
 
 def _felt_shares(prepared: Prepared, rough: Fit, smooth: Fit) -> list[float]:

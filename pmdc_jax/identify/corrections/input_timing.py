@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
 from ...simulate import FIRST_ORDER_HOLD, RECORDED_EARLY, RECORDED_LATE, SMOOTH, Timing
+from ..fit.fitted_runs import FittedRuns
 from ..fit.gauss_newton import TRIAL_TOLERANCE
 from ..fit.generalised_least_squares import training_indices
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
@@ -47,15 +48,16 @@ MIN_LEAD = 0.3
 MIN_LEAD_ERRORS = 5.0
 
 
-def other_timings(prepared: Prepared, fit: Fit) -> list[Timing]:
+def other_timings(fitted: FittedRuns) -> list[Timing]:
     """The timings of the voltages that are clearly likelier than the assumed one, the likeliest first.
 
-    **Arguments**: `prepared`, the runs with the effects of their sensors corrected; `fit`, to these.
+    **Arguments**: the runs with the effects of their sensors corrected.
     """
+    prepared = fitted.prepared
     if not all(prepared.problem.samples > 0) or not any(r.drive == "voltage" for r in prepared.runs):
         return []  # without a current, or without a speed, only a delay would show
-    trials = _Trials(prepared, fit)
-    proposed = [*_at_samples(prepared, fit), *_by_electrical_equation(trials)]
+    trials = _Trials(fitted)
+    proposed = [*_at_samples(fitted), *_by_electrical_equation(trials)]
     plausible, score = _likelier(trials, proposed), trials.negative_log_likelihood
     if any(run.load is not None for run in prepared.training):
         plausible = [t if t.reading else min(t, t._replace(load=True), key=score) for t in plausible]
@@ -69,31 +71,31 @@ def other_timings(prepared: Prepared, fit: Fit) -> list[Timing]:
 class _Trials:
     """Fits of the runs with other timings, each made once."""
 
-    def __init__(self, prepared: Prepared, fit: Fit) -> None:
+    def __init__(self, assumed: FittedRuns) -> None:
         """**Arguments**: as of `other_timings`."""
-        self.prepared, self.fit = prepared, fit
-        self.equation = electrical_equation(prepared, fit)
+        self.assumed = assumed
+        self.equation = electrical_equation(*assumed)
         self.voltages = two_voltages(self.equation) if self.equation else None
-        self._fitted: dict[Timing, tuple[Prepared, Fit]] = {}
+        self._fitted: dict[Timing, FittedRuns] = {}
 
-    def fitted(self, timing: Timing) -> tuple[Prepared, Fit]:
+    def fitted(self, timing: Timing) -> FittedRuns:
         """The runs with this timing, and the fit to them."""
         if timing not in self._fitted:
-            timed = without_averaging(with_timing(self.prepared, timing))
-            refit = self._refitted(timed, self.fit)
+            timed = without_averaging(with_timing(self.assumed.prepared, timing))
+            refit = self._refitted(timed, self.assumed.fit)
             # only a fit with the right timing can tell a mean over the last sample from a delay
-            self._fitted[timing] = with_averaging(*with_even_clock(*refit))
+            self._fitted[timing] = with_averaging(with_even_clock(refit))
         return self._fitted[timing]
 
     def negative_log_likelihood(self, timing: Timing) -> float:
         """The negative log-likelihood of this timing."""
-        return negative_log_likelihood_within(*self.fitted(timing))
+        return negative_log_likelihood_within(self.fitted(timing))
 
     def with_fitted_rate(self, timing: Timing) -> Timing:
         """The timing of smooth voltages with the rate R / L of the motor fitted to them."""
         for _ in range(2):  # the first fit takes it for slow
-            prepared, fit = self.fitted(timing)
-            timing = timing._replace(smooth=electrical_rate(prepared.problem, fit))
+            fitted = self.fitted(timing)
+            timing = timing._replace(smooth=electrical_rate(fitted.problem, fitted.fit))
         return timing
 
     def likelier(self, timings: Sequence[Timing], than: float) -> list[Timing]:
@@ -103,23 +105,23 @@ class _Trials:
 
     def is_right(self, timing: Timing) -> bool:
         """Whether nothing but noise is left with this timing, and not because the current alone was late."""
-        prepared, fit = self.fitted(timing)
-        return leaves_only_noise(prepared, fit) and not only_current_is_late(prepared, fit)
+        fitted = self.fitted(timing)
+        return leaves_only_noise(fitted) and not only_current_is_late(fitted)
 
     def best_lead(self, ahead: int) -> float:
         """The lead that fits best, if the voltages act between two samples, at least so many ahead."""
-        nearest = self.fit
+        nearest = self.assumed.fit
 
         def misfit(lead: float) -> float:
             nonlocal nearest
-            _, nearest = self._refitted(with_timing(self.prepared, Timing(lead)), nearest)
+            nearest = self._refitted(with_timing(self.assumed.prepared, Timing(lead)), nearest).fit
             return nearest.cost
 
         limits, tolerance = (ahead + MARGIN, ahead + 1 - MARGIN), {"xatol": LEAD_TOLERANCE}
         best = minimize_scalar(misfit, bounds=limits, method="bounded", options=tolerance)
         return float(best.x)
 
-    def _refitted(self, other: Prepared, start: Fit) -> tuple[Prepared, Fit]:
+    def _refitted(self, other: Prepared, start: Fit) -> FittedRuns:
         """The best fit from a start to the runs with another timing, from the inductance with which the currents depend
         on two voltages as they were seen to."""
         timing, voltages = other.timing, self.voltages
@@ -133,20 +135,19 @@ class _Trials:
 def _likelier(trials: _Trials, proposed: Sequence[Timing]) -> list[Timing]:
     """The proposed timings that are clearly likelier than the assumed one; smooth voltages only if they are likelier
     than straight ones, too."""
-    prepared, fit = trials.prepared, trials.fit
-    likely = trials.likelier(proposed, negative_log_likelihood_within(prepared, fit))
+    likely = trials.likelier(proposed, negative_log_likelihood_within(trials.assumed))
     first_order = trials.negative_log_likelihood(FIRST_ORDER_HOLD) if FIRST_ORDER_HOLD in likely else np.inf
     if SMOOTH in likely and not trials.likelier([SMOOTH], first_order):
         likely.remove(SMOOTH)
     # of a slow difference the whitening filter takes most for noise
-    if SMOOTH in proposed and not likely and not leaves_only_noise(prepared, fit):
+    if SMOOTH in proposed and not likely and not leaves_only_noise(trials.assumed):
         likely = [SMOOTH] if trials.is_right(SMOOTH) else []
     return [t if t.smooth is None else trials.with_fitted_rate(t) for t in likely]
 
 
-def _at_samples(prepared: Prepared, fit: Fit) -> list[Timing]:
+def _at_samples(fitted: FittedRuns) -> list[Timing]:
     """The timings without an instant between samples that the residuals make plausible."""
-    lead, largest = _apparent_leads(prepared, fit)
+    prepared, (lead, largest) = fitted.prepared, _apparent_leads(*fitted)
     # a speed that is a mean over the last sample is half a sample late, too, and may hide the shift
     hidden = prepared.averaging is None and seems_averaged(prepared)
     likely = []
@@ -176,16 +177,16 @@ def _suggested_by(trials: _Trials, voltages: TwoVoltages) -> list[Timing]:
     # the equation takes the speed as straight between samples
     between = [*told, *_between_samples(trials.best_lead(voltages.ahead))]
     # a filtered current is more like a mean than like an instant
-    late = any(only_current_is_late(*trials.fitted(timing)) for timing in between)
+    late = any(only_current_is_late(trials.fitted(timing)) for timing in between)
     return [] if late else between + means
 
 
 def _hidden(trials: _Trials, equation: ElectricalEquation) -> list[Timing]:
     """The right timings for which a wrong inductance may make up, where the current settles from one sample to the next
     or the voltages are smooth."""
-    settles = settling(equation, trials.prepared, trials.fit)
+    settles = settling(equation, *trials.assumed)
     hidden = _between_samples(trials.best_lead(-1)) if settles.sooner else []
-    if any(settles) or _current_seems_mean(trials.prepared.problem, trials.fit):
+    if any(settles) or _current_seems_mean(trials.assumed.problem, trials.assumed.fit):
         hidden.append(Timing(0, current_mean=True))
     return [timing for timing in hidden if trials.is_right(timing)]
 
@@ -202,17 +203,18 @@ def _between_samples(lead: float) -> list[Timing]:
     return [timing] if MIN_DISTANCE < lead - timing.ahead < 1 - MIN_DISTANCE else []
 
 
-def only_current_is_late(prepared: Prepared, fit: Fit) -> bool:
+def only_current_is_late(fitted: FittedRuns) -> bool:
     """Whether the current alone was read late, as behind a filter, rather than that the voltages act between samples as
     the timing of the runs says.
 
     By regression of the residuals on the change that another lead makes in both outputs, and on that of a later reading
     in the current.
     """
-    if prepared.timing.reading is None or prepared.timing.ahead >= 0:
+    timing, problem, fit = fitted.prepared.timing, fitted.problem, fitted.fit
+    if timing.reading is None or timing.ahead >= 0:
         return False
-    late, error = _lateness_of_current(prepared.problem, fit, change_by_reading(prepared.problem, fit))
-    return late > max(MIN_LATE_SHARE * abs(prepared.timing.lead), MIN_LATE_ERRORS * error)
+    late, error = _lateness_of_current(problem, fit, change_by_reading(problem, fit))
+    return late > max(MIN_LATE_SHARE * abs(timing.lead), MIN_LATE_ERRORS * error)
 
 
 def _lateness_of_current(problem: Problem, fit: Fit, *changes: Float[Array, "blocks 2 samples"]) -> tuple[float, float]:
@@ -226,10 +228,10 @@ def _lateness_of_current(problem: Problem, fit: Fit, *changes: Float[Array, "blo
     return float(amplitudes[0]), float(errors[0])
 
 
-def negative_log_likelihood_within(prepared: Prepared, fit: Fit) -> float:
+def negative_log_likelihood_within(fitted: FittedRuns) -> float:
     """Negative log-likelihood of the runs without their first and last samples: where a voltage acts later, the
     beginning of a run cannot be predicted."""
-    return negative_log_likelihood(without_ends(prepared), fit)
+    return negative_log_likelihood(fitted._replace(prepared=without_ends(fitted.prepared)))
 
 
 def _apparent_leads(prepared: Prepared, fit: Fit) -> tuple[float, float]:

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..fit.fitted_runs import FittedRuns
 from ..fit.likelihood import leaves_only_noise
-from ..fit.polish import Fit, polish
+from ..fit.polish import Fit
 from ..prepare import Prepared
 from ..problem import Nuisance, Problem, evaluate
 
@@ -25,30 +26,28 @@ DIFFERENCE = 1e-4
 MARGIN = 0.005
 
 
-def with_fitted_reading(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def with_fitted_reading(fitted: FittedRuns) -> FittedRuns:
     """The runs with the instant of reading fitted, as a nuisance parameter, and the fit to them; both unchanged where
     the outputs are read at the samples.
 
     Where something else is missing from the motor, the instant stays: it would move to make up for that.
     """
-    instant = prepared.timing.reading
+    instant = fitted.prepared.timing.reading
     if instant is None:
-        return prepared, fit
-    prepared, fit = _with_nuisance(prepared, fit)
-    moved, refit = prepared, fit
+        return fitted
+    fitted = moved = _with_nuisance(*fitted)
     for _ in range(MAX_REFITS):
-        before, instant = instant, _better_instant(moved.problem, refit)
-        moved, refit = _with_nuisance(_read_at(moved, instant), refit)
+        before, instant = instant, _better_instant(moved.problem, moved.fit)
+        moved = _with_nuisance(_read_at(moved.prepared, instant), moved.fit)
         if abs(instant - before) < TOLERANCE:
             break
-    return (moved, refit) if leaves_only_noise(moved, refit) else (prepared, fit)
+    return moved if leaves_only_noise(moved) else fitted
 
 
-def _with_nuisance(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def _with_nuisance(prepared: Prepared, fit: Fit) -> FittedRuns:
     """The runs with the instant of reading as a nuisance parameter, and the fit to them."""
     nuisance = Nuisance(change_by_reading(prepared.problem, fit)[..., None], fit.noise)
-    prepared = prepared.with_problem(nuisance=nuisance)
-    return prepared, polish(prepared.problem, fit.optimum)
+    return FittedRuns.polished(prepared.with_problem(nuisance=nuisance), fit.optimum)
 
 
 def change_by_reading(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:

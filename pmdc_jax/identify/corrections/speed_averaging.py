@@ -17,9 +17,10 @@ from jaxtyping import Float
 
 from ...recordings.recording import AROUND, OVER_BOTH, OVER_LAST, Averaging
 from ...simulate import Tape
+from ..fit.fitted_runs import FittedRuns
 from ..fit.gauss_newton import TOLERANCE
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
-from ..fit.polish import Fit, polish
+from ..fit.polish import Fit
 from ..noise.sensor_noise import quantum
 from ..prepare import Prepared
 
@@ -61,43 +62,42 @@ def with_evident_averaging(prepared: Prepared) -> Prepared:
     return _with_speeds_averaged(without_ends(prepared, SPEED), mean) if sure else prepared
 
 
-def with_averaging(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def with_averaging(fitted: FittedRuns) -> FittedRuns:
     """The runs with their speeds treated as means, where that is what was recorded, and the fit to them.
 
     A speed that lags more than a mean would is late for another reason.
 
-    **Arguments**: `fit`, to the runs as they are. **Returns**: both unchanged if no other mean was found.
+    **Returns**: both unchanged if no other mean was found.
     """
+    prepared, fit = fitted
     if prepared.averaging == OVER_LAST:
-        return _or_around(prepared, fit)
+        return _or_around(fitted)
     if prepared.averaging:
-        return prepared, fit
+        return fitted
     mean, min_gain, counted = _averaging_by_noise(prepared)
     if mean is None:
-        return prepared, fit
+        return fitted
     inner = without_ends(prepared, SPEED)
-    averaged, better = refitted(_with_speeds_averaged(inner, mean), fit)
-    unlikeliness = negative_log_likelihood(averaged, better)
-    if not negative_log_likelihood(inner, fit) - unlikeliness > min_gain:
-        return prepared, fit
+    averaged = refitted(_with_speeds_averaged(inner, mean), fit)
+    unlikeliness = negative_log_likelihood(averaged)
+    if not negative_log_likelihood(FittedRuns(inner, fit)) - unlikeliness > min_gain:
+        return fitted
     if not counted:
         # a mean over the last and the next sample has no lag: a speed that fits better a sample earlier, or as a mean
         # over the last sample, is merely late
-        last = negative_log_likelihood(*refitted(_with_speeds_averaged(inner, OVER_LAST), fit))
-        other = better if mean == OVER_LAST else fit
-        if last < unlikeliness or refitted(_shifted_earlier(inner), fit)[1].cost < other.cost:
-            return prepared, fit
-    return averaged, better
+        last = negative_log_likelihood(refitted(_with_speeds_averaged(inner, OVER_LAST), fit))
+        other = averaged.fit if mean == OVER_LAST else fit
+        if last < unlikeliness or refitted(_shifted_earlier(inner), fit).fit.cost < other.cost:
+            return fitted
+    return averaged
 
 
-def _or_around(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def _or_around(over_last: FittedRuns) -> FittedRuns:
     """The runs with their speeds treated as means around each instant, if these are clearly likelier than means over
     the last sample and leave nothing but noise, and the fit to them; otherwise both unchanged."""
-    around, other = refitted(without_averaging(prepared)._replace(averaging=AROUND), fit)
-    gain = negative_log_likelihood(prepared, fit) - negative_log_likelihood(around, other)
-    if gain > MIN_LOG_LIKELIHOOD_GAIN and leaves_only_noise(around, other):
-        return around, other
-    return prepared, fit
+    around = refitted(without_averaging(over_last.prepared)._replace(averaging=AROUND), over_last.fit)
+    gain = negative_log_likelihood(over_last) - negative_log_likelihood(around)
+    return around if gain > MIN_LOG_LIKELIHOOD_GAIN and leaves_only_noise(around) else over_last
 
 
 def without_averaging(prepared: Prepared) -> Prepared:
@@ -139,9 +139,7 @@ def _shifted_earlier(prepared: Prepared) -> Prepared:
     return prepared.with_tape(measured=jnp.asarray(laid.measured), weight=weight)
 
 
-def refitted(
-    prepared: Prepared, fit: Fit, inductance: float | None = None, tolerance: float = TOLERANCE
-) -> tuple[Prepared, Fit]:
+def refitted(prepared: Prepared, fit: Fit, inductance: float | None = None, tolerance: float = TOLERANCE) -> FittedRuns:
     """The runs, and the best fit to them that starts from `fit`, or from there with a smaller inductance: a large one
     may have compensated part of a sample of delay.
 
@@ -159,8 +157,8 @@ def refitted(
             smaller = fit.optimum.moved(parameters, -L_REDUCTION * along_L)
             if smaller.unknowns.coordinates[L] < fit.coordinates[L]:  # not at its bound
                 starts.append(smaller)
-    ends = [polish(prepared.problem, start, tolerance=tolerance) for start in starts]
-    return prepared, min(ends, key=lambda end: end.cost)
+    ends = [FittedRuns.polished(prepared, start, tolerance) for start in starts]
+    return min(ends, key=lambda end: end.fit.cost)
 
 
 def _averaging_by_noise(prepared: Prepared) -> tuple[Averaging | None, float, bool]:

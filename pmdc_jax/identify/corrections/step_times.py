@@ -19,8 +19,9 @@ from scipy.linalg import expm
 from ...recordings.recording import Averaging, Recording, jumps_of
 from ...simulate import FIRST_ORDER_HOLD, SMOOTH
 from ...simulate.tape import BLOCK, rise_like_step
+from ..fit.fitted_runs import FittedRuns
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
-from ..fit.polish import Fit, polish
+from ..fit.polish import Fit
 from ..prepare import Prepared
 from ..problem import Nuisance, Problem
 from .retiming import electrical_rate, with_timing
@@ -59,32 +60,32 @@ class VoltageSteps(NamedTuple):
     share: Float[np.ndarray, " steps"]
 
 
-def with_step_times(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def with_step_times(fitted: FittedRuns) -> FittedRuns:
     """The runs with the steps of their voltages at the times when the motor felt them, and the fit to them; both
     unchanged if the steps coincide with samples or all have the same delay, which is a matter of `reading_time`."""
-    problem = prepared.problem
+    prepared, problem = fitted.prepared, fitted.problem
     steps = [_as_laid_out(prepared, run) for run in range(len(prepared.runs))]
     count, most = sum(len(s.at) for s in steps), max(len(s.at) for s in steps)
     too_many = 2 * problem.tape.value.size * most > MAX_ELEMENTS
     if prepared.timing.reading or not all(problem.samples > 0) or count < MIN_STEPS or too_many:
-        return prepared, fit
+        return fitted
     min_gain = MIN_LOG_LIKELIHOOD_GAIN + MIN_GAIN_PER_STEP * count
-    steps, predicted_gain = _fit_times(problem, fit, steps)
+    steps, predicted_gain = _fit_times(problem, fitted.fit, steps)
     if predicted_gain < min_gain or not _are_unsynchronised(steps):
-        return prepared, fit
-    placed = _refitted(prepared, fit, steps)
+        return fitted
+    placed = _refitted(prepared, fitted.fit, steps)
     # smooth voltages look like that too, beside steps anywhere in a sample
     if prepared.timing == FIRST_ORDER_HOLD:
-        placed = min(placed, _refitted_smooth(prepared, placed), key=_negative_log_likelihood)
-    gain = negative_log_likelihood(prepared, fit) - _negative_log_likelihood(placed)
-    return (placed.prepared, placed.fit) if gain > min_gain else (prepared, fit)
+        smooth = _refitted_smooth(prepared, placed)
+        placed = min(placed, smooth, key=lambda p: negative_log_likelihood(p.fitted))
+    gain = negative_log_likelihood(fitted) - negative_log_likelihood(placed.fitted)
+    return placed.fitted if gain > min_gain else fitted
 
 
 class _Placed(NamedTuple):
     """Runs with their steps at the times that fit best, and the fit to them."""
 
-    prepared: Prepared
-    fit: Fit
+    fitted: FittedRuns
     steps: Sequence[VoltageSteps]
 
 
@@ -92,31 +93,27 @@ def _refitted(prepared: Prepared, fit: Fit, steps: Sequence[VoltageSteps]) -> _P
     """The steps at the times that fit best, from the times and the fit given."""
     placed = _placed(prepared, fit, steps)
     for _ in range(MAX_REFITS):
-        steps, _ = _fit_times(placed.prepared.problem, placed.fit, placed.steps)
+        steps, _ = _fit_times(placed.fitted.problem, placed.fitted.fit, placed.steps)
         moved = np.clip(_shares(steps), 0, 1) - np.clip(_shares(placed.steps), 0, 1)
         if np.max(np.abs(moved)) < TOLERANCE:
             break
-        placed = _placed(prepared, placed.fit, steps)
+        placed = _placed(prepared, placed.fitted.fit, steps)
     return placed
 
 
 def _placed(prepared: Prepared, fit: Fit, steps: Sequence[VoltageSteps]) -> _Placed:
     """The steps at these times, and the fit to the runs with them, from another fit."""
-    with_steps = _with_steps(prepared, fit, steps)
-    return _Placed(with_steps, polish(with_steps.problem, fit.optimum), steps)
+    return _Placed(FittedRuns.polished(_with_steps(prepared, fit, steps), fit.optimum), steps)
 
 
 def _refitted_smooth(prepared: Prepared, first_order: _Placed) -> _Placed:
     """The steps at the times that fit best if the voltages are on smooth curves between them, from the fit for straight
     voltages."""
-    rate = electrical_rate(prepared.problem, first_order.fit)
+    straight = first_order.fitted.fit
+    rate = electrical_rate(prepared.problem, straight)
     smooth = with_timing(prepared, SMOOTH._replace(smooth=rate))
     steps = [_as_laid_out(smooth, run)._replace(share=s.share) for run, s in enumerate(first_order.steps)]
-    return _refitted(smooth, first_order.fit, steps)
-
-
-def _negative_log_likelihood(placed: _Placed) -> float:
-    return negative_log_likelihood(placed.prepared, placed.fit)
+    return _refitted(smooth, straight, steps)
 
 
 def steps_of(run: Recording) -> VoltageSteps:

@@ -15,8 +15,10 @@ from ...recordings.clock import GAP
 from ...recordings.recording import Recording
 from ...simulate import Tape
 from ...simulate.uneven import simulated_at_stamps
-from ..fit.polish import Fit, fit_at, polish
+from ..fit.fitted_runs import FittedRuns
+from ..fit.polish import Fit, fit_at
 from ..prepare import Prepared
+from ..problem import Problem
 
 # Refits at most
 MAX_REFITS = 12
@@ -27,37 +29,36 @@ SHIFT_TOLERANCE = 0.01
 MAX_STEP_RATIO = 0.9
 
 
-def with_even_clock(prepared: Prepared, fit: Fit) -> tuple[Prepared, Fit]:
+def with_even_clock(fitted: FittedRuns) -> FittedRuns:
     """The runs with every sample of an uneven clock shifted to the nearest even sample along the simulated motion, and
     the fit to them; both unchanged where all clocks are even."""
-    uneven = any(run.resampled_from is not None for run in prepared.runs)
+    uneven = any(run.resampled_from is not None for run in fitted.prepared.runs)
     last = None
     for _ in range(MAX_REFITS if uneven else 0):
-        before, prepared = prepared, _shifted(prepared, fit)
-        fit, start = polish(prepared.problem, fit.optimum), fit
-        if _squares_between(before, prepared, fit) < SHIFT_TOLERANCE:
+        before, fitted = fitted, FittedRuns.polished(_shifted(*fitted), fitted.fit.optimum)
+        if _squares_between(before.problem, fitted) < SHIFT_TOLERANCE:
             break
-        step = np.asarray(fit.coordinates - start.coordinates)
+        step = np.asarray(fitted.fit.coordinates - before.fit.coordinates)
         rate = step @ last / (last @ last) if last is not None else 0.0
         last = step
         if 0 < rate < MAX_STEP_RATIO:
             # where the current settles within a sample, samples shifted with a wrong inductance reproduce most of its
             # error, and plain iteration would converge slowly
-            fit, last = _extrapolated(prepared, fit, rate / (1 - rate) * step), None
-    return prepared, fit
+            fitted, last = _extrapolated(fitted, rate / (1 - rate) * step), None
+    return fitted
 
 
-def _extrapolated(prepared: Prepared, fit: Fit, step: Float[np.ndarray, " parameters"]) -> Fit:
+def _extrapolated(fitted: FittedRuns, step: Float[np.ndarray, " parameters"]) -> FittedRuns:
     """The fit evaluated a `step` further on, within the bounds (Irons and Tuck, doi:10.1002/nme.1620010306)."""
-    further = fit.optimum.moved(prepared.problem.parameters, step)
-    return fit_at(prepared.problem, further)
+    further = fitted.fit.optimum.moved(fitted.problem.parameters, step)
+    return fitted._replace(fit=fit_at(fitted.problem, further))
 
 
-def _squares_between(before: Prepared, after: Prepared, fit: Fit) -> float:
+def _squares_between(before: Problem, after: FittedRuns) -> float:
     """Sum of squared differences between the samples of the training runs, in noise variances."""
-    one, other = before.problem.tape, after.problem.tape
+    one, other = before.tape, after.problem.tape
     moved = (np.asarray(other.measured) - np.asarray(one.measured)) * np.asarray(other.weight)
-    return float(np.square(moved / fit.noise[:, None])[after.problem.fitted_blocks].sum())
+    return float(np.square(moved / after.fit.noise[:, None])[after.problem.fitted_blocks].sum())
 
 
 def _shifted(prepared: Prepared, fit: Fit) -> Prepared:

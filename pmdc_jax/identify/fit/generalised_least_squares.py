@@ -16,6 +16,7 @@ from ..noise.noise_model import Series, Whitener
 from ..noise.sensor_noise import MIN_RELATIVE_NOISE
 from ..noise.whitening import Whitening
 from ..prepare import Prepared
+from .fitted_runs import FittedRuns
 from .gauss_newton import TOLERANCE
 from .polish import Fit, fit_at, polish, reweighted
 
@@ -25,37 +26,36 @@ MAX_STEPS = 8
 MAX_FITNESS_RATIO = 1.1
 
 
-def last_fit(prepared: Prepared, plain_fit: Fit, start: Fit, white: Whitener) -> tuple[Prepared, Fit]:
+def last_fit(plain: FittedRuns, start: Fit, white: Whitener) -> FittedRuns:
     """The fit with whitened residuals, from a `start` near it; the plain fit if its residuals are white already.
 
     The plain fit is also kept where the other one reproduces the runs clearly worse, because the motor has an effect
     that the model lacks or a formula is only approximate: the filter then takes what is missing for noise.
     """
-    if white.is_white or _is_exact(prepared, plain_fit):
-        return prepared, plain_fit
-    problem, fit = fit_whitened(prepared, start, white)
-    fitness = fit_at(prepared.problem, fit.optimum).fitness  # without whitening
-    keeps = fitness < MAX_FITNESS_RATIO * plain_fit.fitness
-    return (problem, fit) if keeps else (prepared, plain_fit)
+    if white.is_white or _is_exact(plain):
+        return plain
+    whitened = fit_whitened(plain.prepared, start, white)
+    fitness = fit_at(plain.problem, whitened.fit.optimum).fitness  # without whitening
+    return whitened if fitness < MAX_FITNESS_RATIO * plain.fit.fitness else plain
 
 
-def _is_exact(prepared: Prepared, fit: Fit) -> bool:
+def _is_exact(fitted: FittedRuns) -> bool:
     """Whether the residuals are only rounding errors, as in a fit to a simulation without noise."""
-    measured = prepared.problem.samples > 0
-    least = MIN_RELATIVE_NOISE * prepared.problem.measured_rms
-    return bool(np.all(fit.noise[measured] < 2 * least[measured]))
+    measured = fitted.problem.samples > 0
+    least = MIN_RELATIVE_NOISE * fitted.problem.measured_rms
+    return bool(np.all(fitted.fit.noise[measured] < 2 * least[measured]))
 
 
 def fit_whitened(
     prepared: Prepared, start: Fit, white: Whitener, tolerance: float = TOLERANCE, useful: float = np.inf
-) -> tuple[Prepared, Fit]:
+) -> FittedRuns:
     """The problem with whitened residuals, and its solution started from a plain fit nearby.
 
     **Arguments**: `tolerance` and `useful` as of `polish`.
     """
     prepared = with_whitening(prepared, white)
     known = reweighted(prepared.problem, start)
-    return prepared, polish(prepared.problem, start.optimum, MAX_STEPS, tolerance, known, useful)
+    return FittedRuns(prepared, polish(prepared.problem, start.optimum, MAX_STEPS, tolerance, known, useful))
 
 
 def sum_of_squares(prepared: Prepared, polished: Fit) -> float:

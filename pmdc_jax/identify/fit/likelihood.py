@@ -7,9 +7,9 @@ import numpy as np
 from ..noise.noise_model import Series, fit_whitener
 from ..noise.sensor_noise import ratio_to_noise
 from ..prepare import Prepared
-from .by_run import FitByRun
+from ..problem import Evaluation
+from .fitted_runs import FittedRuns
 from .generalised_least_squares import series_of, training_indices
-from .polish import Fit
 
 # Root mean square of residuals, over the white noise of the sensor, up to which they are nothing but that noise
 MAX_NOISE_RATIO = 1.3
@@ -17,15 +17,19 @@ MAX_NOISE_RATIO = 1.3
 MIN_LOG_LIKELIHOOD_GAIN = 30.0
 
 
-def negative_log_likelihood(prepared: Prepared, fit: Fit | FitByRun) -> float:
-    """Negative log-likelihood of the training runs as recorded, up to a constant.
+def negative_log_likelihood(fitted: FittedRuns) -> float:
+    """Negative log-likelihood of the training runs, up to a constant; see `negative_log_likelihood_of`."""
+    return negative_log_likelihood_of(fitted.prepared, fitted.fit.evaluation)
+
+
+def negative_log_likelihood_of(prepared: Prepared, evaluation: Evaluation) -> float:
+    """Negative log-likelihood of the training runs, beside a simulation of them, up to a constant.
 
     Of Gaussian innovations: the one-step prediction errors of an autoregressive model of the residuals.
 
-    **Arguments**: `fit`, to these recordings or to corrected ones.
     **Source**: Ljung, "System Identification", 2nd edition, section 7.4.
     """
-    tape, simulated, total = prepared.problem.tape, np.asarray(fit.evaluation.simulated), 0.0
+    tape, simulated, total = prepared.problem.tape, np.asarray(evaluation.simulated), 0.0
     for run in training_indices(prepared):
         measured = series_of(tape, run, np.asarray(tape.measured))
         expected = series_of(tape, run, simulated).values
@@ -39,8 +43,9 @@ def negative_log_likelihood(prepared: Prepared, fit: Fit | FitByRun) -> float:
     return float(total)
 
 
-def leaves_only_noise(prepared: Prepared, fit: Fit) -> bool:
+def leaves_only_noise(fitted: FittedRuns) -> bool:
     """Whether a fit leaves nothing of the training runs but the white noise of the sensors."""
+    prepared, fit = fitted
     tape, training = prepared.problem.tape, training_indices(prepared)
     residual = np.where(tape.weight > 0, tape.measured - fit.evaluation.simulated, np.nan)
 

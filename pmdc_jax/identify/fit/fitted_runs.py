@@ -1,0 +1,28 @@
+"""Runs together with the fit to them: what a correction takes and returns."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ..prepare import Prepared
+from ..problem import Problem
+from .gauss_newton import TOLERANCE
+from .polish import Fit, polish
+from .refine import Optimum
+
+
+class FittedRuns(NamedTuple):
+    """Prepared runs, corrected or as recorded, and the fit to them."""
+
+    prepared: Prepared
+    fit: Fit
+
+    @classmethod
+    def polished(cls, prepared: Prepared, start: Optimum, tolerance: float = TOLERANCE) -> FittedRuns:
+        """The runs, and the fit to them that `polish` finds from a start."""
+        return cls(prepared, polish(prepared.problem, start, tolerance=tolerance))
+
+    @property
+    def problem(self) -> Problem:
+        """The least-squares problem of the runs."""
+        return self.prepared.problem
