@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..effects import EFFECTS, AbstractEffect
 from ..errors import InputError
@@ -67,6 +67,11 @@ class Parameters(eqx.Module):
             lower=limits[:, 0],
             upper=limits[:, 1],
         )
+
+    @property
+    def all_free(self) -> Bool[Array, " parameters"]:
+        """The mask of a problem in which all of them are fitted."""
+        return jnp.ones(len(self.names), bool)
 
     def __call__(self, coordinates: Coordinates) -> Motor:
         """The motor, or the population of motors, at these coordinates."""

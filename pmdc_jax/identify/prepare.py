@@ -72,8 +72,7 @@ class Prepared(NamedTuple):
     def with_effects(self, effects: Sequence[type[AbstractEffect]]) -> Prepared:
         """The same runs for a motor with other effects."""
         parameters = self.parameters(effects)
-        free = jnp.ones(len(parameters.names), bool)
-        return self.with_problem(parameters=parameters, free=free, whitening=None)
+        return self.with_problem(parameters=parameters, free=parameters.all_free, whitening=None)
 
 
 def prepare(
@@ -90,69 +89,73 @@ def prepare(
     named = named_apart([*recordings, *holdout])
     refuse_copies(named)
     cleaned = without_unmeasured(named)
-    recordings, holdout = cleaned[: len(recordings)], cleaned[len(recordings) :]
-    _check_arguments(recordings, holdout, tie, known)
-    findings = check([*recordings, *holdout])
+    roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
+    known = dict(known or {})
+    _check_columns(cleaned, roles)
+    _check_options(tie, known)
+    findings = check(cleaned)
     _raise_errors(findings)
-    runs = [uniform(evenly_stamped(r)) for r in (*recordings, *holdout)]
-    training = runs[: len(recordings)]
-    noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in ("current", "speed")])
-    irrelevant = _irrelevant(training, tie)
-    parameters = Parameters.of(search_bounds(training), effects, irrelevant | dict(known or {}), tie)
-    if not parameters.names:
+    prepared = _laid_out(cleaned, roles, findings, tie, known, unloaded).with_effects(effects)
+    if not prepared.problem.parameters.names:
         raise InputError(
             "--known",
             "every parameter is known: nothing is left to identify",
             "Leave one out, for example R: its estimate then confirms or contradicts its known value",
         )
+    return prepared
+
+
+def _laid_out(
+    recordings: Sequence[Recording],
+    roles: list[Role],
+    findings: tuple[Finding, ...],
+    tie: Sequence[tuple[str, str]],
+    known: Mapping[str, float],
+    unloaded: bool,
+) -> Prepared:
+    """The recordings as a least-squares problem for the motor without effects, all of whose parameters are fitted."""
+    runs = [uniform(evenly_stamped(r)) for r in recordings]
+    training = runs[: roles.count("train")]
+    noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in ("current", "speed")])
     # hold-out runs are on the tape too, but only their own unknowns may be fitted to them
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True))
-    fitted_runs = jnp.arange(tape.runs) < len(recordings)
-    problem = Problem(
-        parameters,
-        tape,
-        jnp.asarray(noise),
-        free=jnp.ones(len(parameters.names), bool),
-        fitted_runs=fitted_runs,
-        begins_warm=~fitted_runs,
-    )
-    roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
+    fitted_runs = jnp.arange(tape.runs) < len(training)
+    plain = Parameters.of(search_bounds(training))
+    problem = Problem(plain, tape, jnp.asarray(noise), plain.all_free, fitted_runs, begins_warm=~fitted_runs)
     return Prepared(
         runs,
         roles,
         findings,
-        irrelevant,
-        dict(known or {}),
+        _irrelevant(training, tie),
+        known,
         tuple(tie),
         problem,
-        differentiated=tuple(r.speed is None and r.angle is not None for r in (*recordings, *holdout)),
+        differentiated=tuple(r.speed is None and r.angle is not None for r in recordings),
     )
 
 
-def _check_arguments(
-    recordings: Sequence[Recording],
-    holdout: Sequence[Recording],
-    tie: Sequence[tuple[str, str]],
-    known: Mapping[str, float] | None,
-) -> None:
-    if not recordings:
+def _check_columns(recordings: Sequence[Recording], roles: Sequence[Role]) -> None:
+    if "train" not in roles:
         raise InputError("RUN", "there is no recording to fit", "Give at least one")
-    for run in (*recordings, *holdout):
+    for run in recordings:
         if not run.is_identifiable:
             what = f"too few columns to identify a motor, only {', '.join(run.columns())}"
             raise InputError(run.source or run.name, what, f"Needed besides time: {NEEDED_TO_IDENTIFY}")
+
+
+def _check_options(tie: Sequence[tuple[str, str]], known: Mapping[str, float]) -> None:
     check_names("--tie", [name for pair in tie for name in pair])
-    check_names("--known", list(known or {}))
+    check_names("--known", list(known))
     targets = [target for target, _ in tie]
     for target, source in tie:
         if targets.count(target) > 1:
             raise InputError("--tie", f"{target} is tied twice", "Drop one")
-        if target == source or target in (known or {}) or target in {b for _, b in tie}:
+        if target == source or target in known or target in {b for _, b in tie}:
             raise InputError("--tie", f"{target}={source} forms a circle or ties a known value", "Drop one")
         if {target, source} != {"Kt", "Kb"}:
             what = f"{target} and {source} are measured in different units"
             raise InputError("--tie", what, "Tie Kt=Kb: in SI units these two are equal")
-    for name, value in (known or {}).items():
+    for name, value in known.items():
         if not 0 < value < np.inf:
             raise InputError("--known", f"{name}={value} is not positive", "Give a value in SI")
 
