@@ -23,6 +23,7 @@ from benchmarks.naming.plant import Plant, simulate
 from experiments.bench import recording
 from pmdc_jax import InputError, identify
 from pmdc_jax.control.spread import drawn_motors
+from pmdc_jax.diagnose.selection.nearby import best_nearby
 from pmdc_jax.effects import EFFECTS
 from pmdc_jax.identify import problem as problems
 from pmdc_jax.identify.fit import polish as polishing
@@ -43,7 +44,6 @@ from pmdc_jax.identify.rotor_angle import with_rotor_angle
 from pmdc_jax.identify.search.binary_ga import BinaryGA
 from pmdc_jax.identify.search.bounds import effect_bounds
 from pmdc_jax.identify.search.evolution import METHODS, SearchResult, search
-from pmdc_jax.identify.search.nearby import best_nearby
 from pmdc_jax.identify.solve import _distinct, solve
 from pmdc_jax.identify.uncertainty.covariance import information, long_run_variance
 from pmdc_jax.motor import PARAMETERS

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...identify.fit.by_run import FitByRun, errors_by_run, fit_by_run
 from ...identify.fit.gauss_newton import squares_of_runs
 from ...identify.fit.likelihood import negative_log_likelihood_of
 from ...identify.fit.run_unknowns import fit_run_unknowns
@@ -29,6 +28,7 @@ from ...simulate import RunUnknowns
 from ..diagnosis import VaryingParameter
 from ..model import Model
 from .assessment import FALSE_ALARM, Assessment
+from .fit_by_run import FitByRun, errors_by_run, fit_by_run
 from .regression import Block
 from .signals import Screen, dispersion_by_noise, log_p_value
 

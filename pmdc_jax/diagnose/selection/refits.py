@@ -15,7 +15,6 @@ from ...identify.fit.refine import Optimum
 from ...identify.fit.run_unknowns import best_backlash_start
 from ...identify.noise.noise_model import Whitener, fit_whitener
 from ...identify.prepare import Prepared
-from ...identify.search.nearby import best_nearby
 from ...identify.solve import POOR_FIT, Solved, search_and_refine
 from ...identify.uncertainty.covariance import information_of
 from ...identify.uncertainty.identifiability import moved_by
@@ -27,6 +26,7 @@ from ..hypotheses.effect_relations import FULLER
 from ..hypotheses.trials import TRIALS
 from ..model import Model, model_of, refit_from
 from .compare import Comparison
+from .nearby import best_nearby
 from .starts import Start, Starts, effects_with
 
 # Share of the gain promised by the evidence that a refit must realise; otherwise it is fitted in another way

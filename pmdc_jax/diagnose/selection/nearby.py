@@ -8,13 +8,13 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
+from ...identify.fit.polish import Fit, fit_at
+from ...identify.fit.refine import Optimum
+from ...identify.parameters import Parameters
+from ...identify.problem import Problem
+from ...identify.search.evolution import search
 from ...motor import PARAMETERS
 from ...simulate import Tape
-from ..fit.polish import Fit, fit_at
-from ..fit.refine import Optimum
-from ..parameters import Parameters
-from ..problem import Problem
-from .evolution import search
 
 # As fast to evaluate as a smaller one: the time goes into walking through the samples one after another
 POPULATION, GENERATIONS = 64, 20

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ...identify.fit.gauss_newton import RIDGE, gauss_newton_step, residual_noise, ridge_of, squares_of_outputs
+from ...identify.problem import Evaluation, Problem, Unknowns, evaluate, normal_matrix, scaled, select_blocks
+from ...identify.uncertainty.covariance import information
 from ...simulate import UNKNOWNS_PER_RUN, RunUnknowns
-from ..problem import Evaluation, Problem, Unknowns, evaluate, normal_matrix, scaled, select_blocks
-from ..uncertainty.covariance import information
-from .gauss_newton import RIDGE, gauss_newton_step, residual_noise, ridge_of, squares_of_outputs
 
 # Gauss-Newton steps at most, and the decrease of the cost from which another one is taken
 MAX_STEPS, MIN_DECREASE = 6, 1e-4
