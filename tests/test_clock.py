@@ -13,7 +13,8 @@ from pmdc_jax.motor import Drive, Motor
 from pmdc_jax.recordings.clock import evenly_stamped, is_even
 from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate import uniform
-from pmdc_jax.simulate.uneven import mean_and_rise, pieces_of, simulated_at_stamps
+from pmdc_jax.simulate.between_samples import mean_and_rise_of_pieces, pieces_of
+from pmdc_jax.simulate.uneven import simulated_at_stamps
 
 # the current settles within a sample, so L is identified only if the sampling times are right
 MOTOR = {"R": 1.0, "L": 3.4e-4, "Kb": 0.07, "Kt": 0.07, "J": 1.16e-4, "f": 1.1e-4}
@@ -85,7 +86,7 @@ def test_an_interpolated_voltage_keeps_its_mean_and_first_moment_in_every_even_s
     rng = np.random.default_rng(23)
     run = record(stamps("walk", 60, rng), rng, 0 * NOISE)
     even = uniform(run)
-    mean, rise = mean_and_rise(even, pieces_of(even, first_order_hold=True))
+    mean, rise = mean_and_rise_of_pieces(even, pieces_of(even, first_order_hold=True))
     share = (np.arange(2000) + 0.5) / 2000
     for k, begin in enumerate(even.time):
         drive = np.interp(begin + even.sample_time * share, run.time, run.voltage)

@@ -29,7 +29,7 @@ from pmdc_jax.simulate import (
     sensitivities,
     squared_errors,
 )
-from pmdc_jax.simulate.tape import smooth_mean_and_rise
+from pmdc_jax.simulate.between_samples import smooth_mean_and_rise
 
 # with a current that settles about as fast as it is sampled: L / R is 1.25 ms, the sample time 2 ms
 TRUE = {"R": 0.8, "L": 1e-3, "Kb": 0.04, "Kt": 0.039, "J": 4e-5, "f": 3e-5}

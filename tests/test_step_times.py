@@ -11,7 +11,7 @@ from scipy.signal import chirp, dlsim
 
 from pmdc_jax import Identification, diagnose, identify
 from pmdc_jax.recordings.recording import Recording
-from pmdc_jax.simulate.tape import rise_like_step
+from pmdc_jax.simulate.between_samples import rise_like_step
 
 TRUE = {"R": 1.2, "L": 1.8e-3, "Kb": 0.05, "Kt": 0.05, "J": 6e-5, "f": 4e-5}
 STEP, SAMPLES, CHANGES = 1e-3, 2000, 11

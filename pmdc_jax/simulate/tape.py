@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.interpolate import CubicSpline
 
 from ..motor import Drive
-from ..recordings.recording import OVER_LAST, jumps_of
+from ..recordings.recording import OVER_LAST
+from .between_samples import mean_and_rise
 from .timing import ZERO_ORDER_HOLD, Timing
-from .uneven import mean_and_rise, pieces_of, varies_linearly
 
 if TYPE_CHECKING:
     from ..recordings.recording import Recording
@@ -27,10 +26,6 @@ Samples = Array | np.ndarray
 # Samples in a block. A population is simulated block after block, one motor in all blocks in parallel: long enough that
 # the influence of a block's start has mostly decayed at its end, short enough that padding the last one costs little.
 BLOCK = 128
-# A drive jumps where it changes by this many times what it does in the samples beside, and by this share of its range
-MIN_JUMP_RATIO, MIN_JUMP_SHARE = 3.0, 0.05
-# Decays of a current over a sample, as exponents, beyond which nothing changes
-DECAYS = 1e-3, 200.0
 
 
 class Tape(eqx.Module):
@@ -195,16 +190,7 @@ class _Run:
             self.current = recording.current
             if recording.current_averaged:
                 self.current = OVER_LAST.with_ends_missing(self.current)
-        value = getattr(recording, drive)
-        linear = timing.first_order_hold or varies_linearly(recording)
-        if recording.resampled_from is not None:
-            self.value, self.rise = mean_and_rise(recording, pieces_of(recording, timing.first_order_hold))
-        elif timing.smooth is not None:
-            decay = timing.smooth * recording.sample_time
-            self.value, self.rise = smooth_mean_and_rise(value, decay)
-        else:
-            self.rise = np.diff(value, append=value[-1]) if linear else np.zeros(self.length)
-            self.value = value + self.rise / 2
+        self.value, self.rise = mean_and_rise(recording, timing)
         # rounded: two runs of one clock must share a grid even if their time stamps differ in the last bits
         self.grid: Grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held)
         self.initial = (_first(self.current), _first(self.speed))
@@ -220,55 +206,6 @@ class _Run:
     def to_blocks(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
         padding = self.blocks * BLOCK - self.length
         return np.pad(samples, (0, padding), mode="edge" if hold else "constant").reshape(-1, BLOCK)
-
-
-def smooth_mean_and_rise(
-    value: Float[np.ndarray, " samples"], decay: float
-) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
-    """Mean over each sample of a cubic spline through all samples between two jumps, and the rise of the straight line
-    that has the same mean and the same effect on the current at the end of the sample.
-
-    In the sample before a jump, the straight line before it goes on.
-
-    **Arguments**: `value` of the drive at each sample; `decay`, R / L times the sample time.
-    """
-    of_square, of_cubic = _equivalent_rises(decay)
-    mean, rise = value.copy(), np.zeros(len(value))
-    jumps = jumps_of(value, MIN_JUMP_RATIO, MIN_JUMP_SHARE)
-    for first, end in pairwise([0, *jumps, len(value)]):
-        part = value[first:end]
-        if len(part) < 2 or not np.ptp(part):
-            continue
-        cubic, square, linear, constant = CubicSpline(np.arange(len(part)), part).c
-        mean[first : end - 1] = constant + linear / 2 + square / 3 + cubic / 4
-        rise[first : end - 1] = linear + of_square * square + of_cubic * cubic
-        rise[end - 1] = part[-1] - part[-2]
-        mean[end - 1] += rise[end - 1] / 2
-    return mean, rise
-
-
-def _equivalent_rises(decay: float) -> tuple[float, float]:
-    """The rises of the straight lines that have the same mean over a sample, and the same effect on the current at its
-    end, as the square and the cube of the share of the sample that has passed."""
-    share, weight = np.polynomial.legendre.leggauss(32)
-    share, weight = (share + 1) / 2, weight / 2
-    felt = np.exp(-np.clip(decay, *DECAYS) * (1 - share))
-    felt = weight * (felt - weight @ felt)
-    square, cubic = (float(felt @ share**k / (felt @ share)) for k in (2, 3))
-    return square, cubic
-
-
-def rise_like_step(share: Float[np.ndarray, " steps"], decay: float) -> Float[np.ndarray, " steps"]:
-    """The rise of the straight line that has the same mean over a sample, and the same effect on the current at its
-    end, as a unit step with this `share` of the sample still to pass.
-
-    6 `share` (1 - `share`), the rise with the same first moment, where the current decays slowly.
-
-    **Arguments**: `decay`, R / L times the sample time.
-    """
-    decay = float(np.clip(decay, *DECAYS))
-    kept = -np.expm1(-decay)
-    return (-np.expm1(-decay * share) - kept * share) / (1 - kept / decay - kept / 2)
 
 
 def _laid_in_blocks(

@@ -1,17 +1,15 @@
-"""Records with uneven time stamps: their drive on the solver's even clock, and the simulated motion at their stamps.
-
-The solver steps along the even clock. The drive over an even sample is a straight line with the mean and the first
-moment of the recorded drive, and a recorded sample is compared with the motion within the even sample where it lies.
-"""
+"""The simulated motion at uneven time stamps: the solver steps along an even clock, and a recorded sample is compared
+with the motion within the even sample where it lies."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from ..motor import Drive, Motor
+from .between_samples import mean_and_rise_of_pieces, pieces_of
 from .exponential import scalar_phi
 
 if TYPE_CHECKING:
@@ -19,51 +17,6 @@ if TYPE_CHECKING:
 
 # Closer eigenvalues are moved apart to this relative distance, which is then the relative error, too
 MIN_EIGENVALUE_GAP = 1e-7
-
-
-class Pieces(NamedTuple):
-    """The intervals between neighbouring instants at which a sample begins, of the record or of the even clock."""
-
-    time: Float[np.ndarray, " pieces"]  # start, s
-    begins: Float[np.ndarray, " pieces"]  # start after that of the even sample, s
-    length: Float[np.ndarray, " pieces"]  # s
-    even: Int[np.ndarray, " pieces"]  # index of the even sample that it is a part of
-    value: Float[np.ndarray, " pieces"]  # driving value at the start, V, A or N m
-    slope: Float[np.ndarray, " pieces"]  # of the driving value, per second
-    load: Float[np.ndarray, " pieces"]  # N m, zero where unknown
-
-
-def varies_linearly(run: Recording) -> bool:
-    """Whether the drive always varies linearly from sample to sample, as a measured current does."""
-    return run.drive == "current"
-
-
-def pieces_of(run: Recording, first_order_hold: bool) -> Pieces:
-    """The pieces of a run on an even clock, with a zero-order hold of the recorded drive, or a first-order one."""
-    record, step = run.recorded, run.sample_time
-    drive = np.asarray(getattr(record, record.drive))
-    edges = np.union1d(np.append(run.time, run.time[-1] + step), record.time)
-    begins, length = edges[:-1], np.diff(edges)
-    even = np.searchsorted(run.time, begins, "right") - 1
-    recorded = np.searchsorted(record.time, begins, "right") - 1
-    linear = first_order_hold or varies_linearly(run)
-    slopes = np.append(np.diff(drive) / np.diff(record.time), 0.0) * linear
-    slope = slopes[recorded]
-    value = drive[recorded] + slope * (begins - record.time[recorded])
-    load = np.zeros(len(record)) if record.load is None else record.load
-    return Pieces(begins, begins - run.time[even], length, even, value, slope, load[recorded])
-
-
-def mean_and_rise(run: Recording, pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of the drive over each even sample of a run, and the rise over it of the straight line that also has the
-    drive's first moment."""
-    _, begins, length, even, value, slope, _ = pieces
-    step, rise = run.sample_time, slope * length
-    middle = begins + length / 2 - step / 2
-    integral = length * (value + rise / 2)
-    moment = integral * middle + length**2 * rise / 12
-    mean, first = (np.bincount(even, x, len(run)) / step for x in (integral, moment))
-    return mean, 12 * first / step
 
 
 def simulated_at_stamps(
@@ -80,7 +33,7 @@ def simulated_at_stamps(
     """
     pieces = pieces_of(even, first_order_hold)
     time, begins, length, index, value, slope, loads = pieces
-    mean, rise = mean_and_rise(even, pieces)
+    mean, rise = mean_and_rise_of_pieces(even, pieces)
     step, line_start, line_slope = even.sample_time, mean - rise / 2, rise / even.sample_time
     A, B = map(np.asarray, motor.state_space(drive))
     load = np.zeros(len(even)) if even.load is None else even.load

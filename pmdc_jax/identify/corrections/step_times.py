@@ -18,7 +18,8 @@ from scipy.linalg import expm
 
 from ...recordings.recording import Averaging, Recording, jumps_of
 from ...simulate import FIRST_ORDER_HOLD, SMOOTH
-from ...simulate.tape import BLOCK, rise_like_step
+from ...simulate.between_samples import rise_like_step
+from ...simulate.tape import BLOCK
 from ..fit.fitted_runs import FittedRuns
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, negative_log_likelihood
 from ..fit.polish import Fit
