@@ -32,7 +32,7 @@ from pmdc_jax.diagnose.hypotheses.library import Library
 from pmdc_jax.diagnose.hypotheses.trials import TRIALS
 from pmdc_jax.diagnose.judgement import implausible_effect, may_be_absent
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
-from pmdc_jax.diagnose.response import kicks, path_of, respond, sensor_changes
+from pmdc_jax.diagnose.response import path_of, respond, sensor_changes, state_increments
 from pmdc_jax.diagnose.selection import proposals
 from pmdc_jax.diagnose.selection.compare import Fitted
 from pmdc_jax.diagnose.selection.naming import Naming, StepwiseSelection
@@ -619,7 +619,7 @@ def test_the_first_order_response_matches_the_change_of_the_simulation(x64, name
     if EFFECTS[name].equation == "sensor":
         found = sensor_changes(motor, bare, tape, path)
     else:
-        found = respond(bare, tape, path, kicks(motor, bare, tape, path)[..., None])[..., 0]
+        found = respond(bare, tape, path, state_increments(motor, bare, tape, path)[..., None])[..., 0]
     expected = (with_it - without).transpose(2, 1, 0)
     weight = np.asarray(tape.weight).transpose(2, 1, 0)
     for c in range(2):
@@ -640,7 +640,7 @@ def test_the_response_lasts_while_the_rotor_coasts(x64):
     without, with_it = (free_run(bare.with_effects(e), tape, own) for e in ([brushes], [brushes, drag]))
     path = path_of(without, tape, jnp.zeros(1), False, True)
     motor = bare.with_effects([drag])
-    found = respond(bare, tape, path, kicks(motor, bare, tape, path)[..., None])[..., 0]
+    found = respond(bare, tape, path, state_increments(motor, bare, tape, path)[..., None])[..., 0]
     expected = tape.samples_of(0, with_it - without, 500)
     found = tape.samples_of(0, found.transpose(2, 1, 0), 500)
     assert np.mean(without[:, 0] == 0) > 0.4

@@ -181,16 +181,16 @@ def current_jumps(run: Recording) -> Iterator[Finding]:
 
 def excitation(runs: Sequence[Recording]) -> Iterator[Finding]:
     """Runs, or all runs together, in which nothing moves."""
-    still = [run for run in runs if not any(_moves(y) for y in _outputs(run).values())]
-    turning = [run for run in runs if _moves(_outputs(run).get("speed"))]
+    still = [run for run in runs if not any(_moves(y) for y in _driven_signals(run).values())]
+    turning = [run for run in runs if _moves(_driven_signals(run).get("speed"))]
     for run in runs:
-        speed = _outputs(run).get("speed")
+        speed = _driven_signals(run).get("speed")
         if run in still:
             yield Finding(
                 run.name,
                 None,
                 "error" if len(still) == len(runs) else "note",
-                f"no signal varies by more than its noise: {', '.join(_outputs(run))}",
+                f"no signal varies by more than its noise: {', '.join(_driven_signals(run))}",
                 "whole run",
                 "Record voltage steps, with the motor starting and stopping",
             )
@@ -237,7 +237,7 @@ def _count(number: int, thing: str) -> str:
     return f"{number} {thing}" + "s" * (number > 1)
 
 
-def _outputs(run: Recording) -> dict[str, np.ndarray]:
+def _driven_signals(run: Recording) -> dict[str, np.ndarray]:
     # without a voltage the current is what drives
     outputs = {"current": run.current if run.voltage is not None else None, "speed": speed_of(run)}
     return {quantity: values for quantity, values in outputs.items() if values is not None}

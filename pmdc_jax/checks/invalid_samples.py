@@ -42,13 +42,13 @@ def without_unmeasured(runs: Sequence[Recording]) -> list[Recording]:
     runs = [_without_spikes(run) for run in runs]
     clipped_at: dict[str, list[float]] = {"speed": [], "current": []}
     for run in runs:
-        for name, signal in _outputs(run).items():
+        for name, signal in _recorded_outputs(run).items():
             clipped_at[name] += [abs(extreme) for extreme, *_ in clipped_extremes(signal)]
     return [_without_frozen(_without_clipped(run, clipped_at)) for run in runs]
 
 
 def _without_spikes(run: Recording) -> Recording:
-    for name, signal in _outputs(run).items():
+    for name, signal in _recorded_outputs(run).items():
         spikes = _spikes(signal) & _drive_is_steady(run)
         if 0 < spikes.sum() <= MAX_SPIKES * len(run):
             run = _with_missing_samples(run, name, spikes, "has a single-sample spike", RANGE)
@@ -57,7 +57,7 @@ def _without_spikes(run: Recording) -> Recording:
 
 def _without_clipped(run: Recording, clipped_at: Mapping[str, Sequence[float]]) -> Recording:
     """**Arguments**: `clipped_at`, the magnitudes at which each output was clipped in any run."""
-    for name, signal in _outputs(run).items():
+    for name, signal in _recorded_outputs(run).items():
         extremes = np.array([np.nanmin(signal), np.nanmax(signal)])
         at_end = np.isclose(np.abs(extremes)[:, None], clipped_at[name], rtol=1e-6).any(1)
         clipped = np.isin(signal, extremes[at_end])
@@ -67,7 +67,7 @@ def _without_clipped(run: Recording, clipped_at: Mapping[str, Sequence[float]]) 
 
 
 def _without_frozen(run: Recording) -> Recording:
-    for name, signal in _outputs(run).items():
+    for name, signal in _recorded_outputs(run).items():
         frozen = _frozen(signal)
         if frozen.any():
             mend = "Check the sensor and its cable"
@@ -75,7 +75,7 @@ def _without_frozen(run: Recording) -> Recording:
     return run
 
 
-def _outputs(run: Recording) -> dict[str, Float[np.ndarray, " samples"]]:
+def _recorded_outputs(run: Recording) -> dict[str, Float[np.ndarray, " samples"]]:
     """The outputs of a run that were recorded, by name."""
     names = ("speed", "current") if run.drive == "voltage" else ("speed",)
     return {name: signal for name in names if (signal := getattr(run, name)) is not None}

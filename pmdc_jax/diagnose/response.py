@@ -1,7 +1,7 @@
 """What an effect would change in the recorded outputs, to first order, along a free run of the motor.
 
-An effect changes the state at the end of each sample; this change is its *kick*. The linear motor propagates the kicks,
-and their sum is the response: one column of a regression, whose coefficient is the amplitude of the effect. No measured
+An effect changes the state at the end of each sample, by a *state increment*. The linear motor propagates these, and
+their sum is the response: one column of a regression, whose coefficient is the amplitude of the effect. No measured
 signal is ever differentiated.
 """
 
@@ -69,7 +69,7 @@ def path_of(
 
 
 @compiled
-def kicks(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
+def state_increments(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
     """The difference in current and speed between `motor` and `bare` one sample after each point of the path."""
     after = _after_one_sample(motor, tape, path)
     without = _after_one_sample(bare, tape, path)
@@ -111,9 +111,9 @@ def input_gains(motor: Motor, tape: Tape) -> tuple[Outputs, Outputs]:
 
 @compiled
 def respond(
-    motor: Motor, tape: Tape, path: Path, kicks: Float[Array | np.ndarray, "samples 2 blocks columns"]
+    motor: Motor, tape: Tape, path: Path, increments: Float[Array | np.ndarray, "samples 2 blocks columns"]
 ) -> Float[Array, "samples 2 blocks columns"]:
-    """The response of the linear `motor` to the kicks of every column, in current and speed.
+    """The response of the linear `motor` to the state increments of every column, in current and speed.
 
     Blocks are simulated in parallel from zero; then the state at the end of each is carried on into the next.
     """
@@ -125,26 +125,26 @@ def respond(
         x: Columns,
         sample: tuple[Float[Array | np.ndarray, "2 blocks columns"], Float[Array, " blocks"], Float[Array, " blocks"]],
     ) -> tuple[Columns, Columns]:
-        kick, moves, conducts = sample
+        increment, moves, conducts = sample
         # written out here and below: XLA multiplies such small matrices slowly
-        after = transition[:, 0, :, None] * x[0] + transition[:, 1, :, None] * x[1] + kick
-        coasting = slowing[:, None] * x[1] + kick[1]
+        after = transition[:, 0, :, None] * x[0] + transition[:, 1, :, None] * x[1] + increment
+        coasting = slowing[:, None] * x[1] + increment[1]
         # what is held at zero keeps no change
         current = conducts[:, None] * after[0]
         speed = moves[:, None] * jnp.where(conducts[:, None] > 0, after[1], coasting)
         return jnp.stack([current, speed]), x
 
-    moves, conducts = (1.0 - held.astype(kicks.dtype) for held in (path.stuck, path.coasting))
-    zero = jnp.zeros(kicks.shape[1:])
-    end, forced = jax.lax.scan(step, zero, (kicks, moves, conducts))
-    basis = jnp.broadcast_to(jnp.eye(2)[:, None, :], (2, kicks.shape[2], 2))
-    without = jnp.zeros((*kicks.shape[:3], 2))
+    moves, conducts = (1.0 - held.astype(increments.dtype) for held in (path.stuck, path.coasting))
+    zero = jnp.zeros(increments.shape[1:])
+    end, forced = jax.lax.scan(step, zero, (increments, moves, conducts))
+    basis = jnp.broadcast_to(jnp.eye(2)[:, None, :], (2, increments.shape[2], 2))
+    without = jnp.zeros((*increments.shape[:3], 2))
     free_end, free = jax.lax.scan(step, basis, (without, moves, conducts))
 
     starts = _starts_of_blocks(tape, free_end, end)
     response = forced + free[..., :1] * starts[:, 0] + free[..., 1:] * starts[:, 1]
     varies = jnp.stack([conducts, moves], 1)[..., None]
-    return _reported_response(motor, tape, propagator, response, kicks, varies)
+    return _reported_response(motor, tape, propagator, response, increments, varies)
 
 
 def _starts_of_blocks(
@@ -152,7 +152,7 @@ def _starts_of_blocks(
 ) -> Float[Array, "blocks 2 columns"]:
     """The states at the start of each block: from zero at the start of each run, carried through the blocks.
 
-    **Arguments**: the states at the end of each block, from the unit states (`free`), and from zero with the kicks.
+    **Arguments**: the states at the end of each block, from the unit states (`free`) and from zero with increments.
     """
 
     def next_block(
@@ -171,18 +171,18 @@ def _reported_response(
     tape: Tape,
     propagator: Propagator,
     at_start: Float[Array, "samples 2 blocks columns"],
-    kicks: Float[Array | np.ndarray, "samples 2 blocks columns"],
+    increments: Float[Array | np.ndarray, "samples 2 blocks columns"],
     varies: Float[Array, "samples 2 blocks 1"],
 ) -> Float[Array, "samples 2 blocks columns"]:
     """The response when the outputs are read, as their sensors report it, from that at the start of each sample.
 
-    **Arguments**: `kicks`, each of which builds up evenly over its sample; `varies`, zero where an output is held.
+    **Arguments**: `increments`, each of which builds up evenly over its sample; `varies`, zero where an output is held.
     """
     response = at_start
     if propagator.reading is not None:
         part, share = propagator.reading
         response = (
-            jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start) + jnp.asarray(share)[:, None, :, None] * kicks
+            jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start) + jnp.asarray(share)[:, None, :, None] * increments
         )
         response = response * varies
     if propagator.mean is None:
@@ -192,7 +192,7 @@ def _reported_response(
         """Over a share of each sample."""
         assert within.mean is not None
         by_start = jnp.einsum("ijsb,sjbc->sibc", within.mean.transition, at_start)
-        return (by_start + share / 2 * kicks) * varies
+        return (by_start + share / 2 * increments) * varies
 
     simulated = [response, mean(propagator, 1.0)]
     if propagator.reading is not None:

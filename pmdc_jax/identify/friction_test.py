@@ -9,12 +9,11 @@ the end of the fit, on rows filtered so that its residuals are white. No motor i
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import expm
-from scipy.signal import lfilter, ss2tf
+from scipy.signal import cont2discrete, lfilter, ss2tf
 
 from ..motor import Motor
 from ..recordings.recording import OVER_LAST
@@ -113,8 +112,9 @@ def _regression_columns(prepared: Prepared, fit: Fit) -> list[Series]:
 def _load_filter(motor: Motor, tape: Tape, run: int) -> LoadFilter:
     """Discrete transfer functions of the linear motor, from a load held between samples to current and speed."""
     A, B = map(np.asarray, motor.state_space(tape.drive_of(run)))
-    whole = expm(tape.sample_time_of(run) * np.block([[A, B[:, 1:]], [np.zeros((1, 3))]]))
-    numerators, denominator = ss2tf(whole[:2, :2], whole[:2, 2:], np.eye(2), np.zeros((2, 1)))
+    continuous = (A, B[:, 1:], np.eye(2), np.zeros((2, 1)))
+    discrete: Any = cont2discrete(continuous, tape.sample_time_of(run), method="zoh")
+    numerators, denominator = ss2tf(*discrete[:4])
     return numerators, np.asarray(denominator)
 
 

@@ -97,7 +97,7 @@ MOTOR_SYMBOLS = {
 }
 # Quantities recognised by their unit, if only one column has it; a torque, which may also be that of the motor, only if
 # its name has a word of `LOADS`
-TOLD_BY_UNIT = ("time", "voltage", "current", "speed", "angle", "load")
+RECOGNISED_BY_UNIT = ("time", "voltage", "current", "speed", "angle", "load")
 LOADS = re.compile(r"(?i)(?<![a-z])(load|last|brak|brems|dyno)")
 # Names of columns that are the time if they hold dates with times; numbers need a unit
 DATED = ("timestamp", "time_stamp", "datetime", "date_time", "date", "datum")
@@ -165,7 +165,7 @@ def _match_by_unit_or_symbol(headers: Sequence[str], matched: Mapping[str, Colum
     taken = {column.header for column in matched.values()}
     free = [header for header in headers if header not in taken]
     known: dict[str, Column] = {}
-    for quantity in (q for q in TOLD_BY_UNIT if q not in matched):
+    for quantity in (q for q in RECOGNISED_BY_UNIT if q not in matched):
         alike = [
             evolve(_column(header, quantity, unit), by_unit=True)
             for header in free

@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 from scipy.interpolate import CubicSpline
 
 from ..recordings.recording import jumps_of
@@ -23,6 +23,7 @@ MIN_JUMP_RATIO, MIN_JUMP_SHARE = 3.0, 0.05
 # Decays of a current over a sample, as exponents, beyond which nothing changes
 DECAYS = 1e-3, 200.0
 
+Values = Float[Array | np.ndarray, "*shape"]
 # Mean of the drive over each sample, V, A or N m, and the change over it of the straight line in its place
 MeanAndRise = tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]
 
@@ -37,6 +38,11 @@ def mean_and_rise(run: Recording, timing: Timing) -> MeanAndRise:
     linear = timing.first_order_hold or varies_linearly(run)
     rise = np.diff(value, append=value[-1]) if linear else np.zeros(len(run))
     return value + rise / 2, rise
+
+
+def value_on_line(mean: Values, rise: Values | None, share: Values | float) -> Values:
+    """The value after a share of a sample of a straight line with this mean and rise; held if the rise is None."""
+    return mean if rise is None else mean + (share - 0.5) * rise
 
 
 class Pieces(NamedTuple):

@@ -93,7 +93,7 @@ def _means_at_sample_start(tape: Tape) -> tuple[Samples, Samples, Bool[Array, "b
     return moved(tape.measured), moved(tape.weight), over_last
 
 
-def _outputs(
+def _outputs_or_means(
     motors: Motor, state: State, mean: State | None, over_last: Bool[Array, "blocks 2"] | None, block: Int[Array, ""]
 ) -> tuple[Scalars, Scalars]:
     """Current and speed at a sample, or, in blocks that report means, the means from there to the next sample."""
@@ -195,7 +195,7 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
             acting = Input(drive, value, load)
             after, mean = held_step_and_mean(motors, propagator, acting, state)
             read = _when_read(motors, propagator, acting, state)
-            simulated = _outputs(motors, read, mean, over_last, block)
+            simulated = _outputs_or_means(motors, read, mean, over_last, block)
             errors = tuple(e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors))
             return (after, errors), None
 
@@ -254,7 +254,7 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
             acting = Input(drive, value, load)
             after, mean = held_step_and_mean(motors, propagator, acting, state, steps)
             read = _when_read(motors, propagator, acting, state, steps)
-            simulated = _outputs(motors, read, mean, over_last, block)
+            simulated = _outputs_or_means(motors, read, mean, over_last, block)
             errors = tuple(e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors))
             return (after, errors), None
 

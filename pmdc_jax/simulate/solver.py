@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..effects.base import Scalars, State
 from ..motor import Drive, Motor
+from .between_samples import value_on_line
 from .exponential import Matrix
 from .propagator import MeanPropagator, NonlinearStates, Propagator, Vector, Weights, linear_states, state_of, vector
 from .switches import computed_once, contact_correction, mean_correction, stick_or_reverse
@@ -32,7 +33,7 @@ class Input(NamedTuple):
 
     def at(self, share: Scalars | float) -> Scalars:
         """The driving value after this share of the step."""
-        return self.value if self.rise is None else self.value + (share - 0.5) * self.rise
+        return value_on_line(self.value, self.rise, share)
 
     def part(self, middle: Scalars | float, share: Scalars | float) -> Input:
         """The inputs over a part of the step: `middle` and length of the part as shares of the step."""

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..motor import Drive
 from ..recordings.recording import OVER_LAST
-from .between_samples import mean_and_rise
+from .between_samples import mean_and_rise, value_on_line
 from .timing import ZERO_ORDER_HOLD, Timing
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ class Tape(eqx.Module):
 
     def drive_at(self, share: float) -> Samples:
         """The drive after this share of each sample, V, A or N m."""
-        return self.value if self.rise is None else self.value + (share - 0.5) * self.rise
+        return value_on_line(self.value, self.rise, share)
 
     def blocks_of(self, run: int) -> Bool[np.ndarray, " blocks"]:
         """Mask of the blocks of one run."""

@@ -91,10 +91,10 @@ def _output_change(
 
 @compiled
 def _response(
-    bare: Motor, tape: Tape, path: Path, kicks: Float32[Array | np.ndarray, "samples 2 blocks columns"]
+    bare: Motor, tape: Tape, path: Path, increments: Float32[Array | np.ndarray, "samples 2 blocks columns"]
 ) -> Float32[Array, "blocks 2 samples columns"]:
-    """The response to kicks of the motor without effects."""
-    response = respond(bare, tape, path, kicks.astype(jnp.result_type(float)))
+    """The response to state increments of the motor without effects."""
+    response = respond(bare, tape, path, increments.astype(jnp.result_type(float)))
     is_finite = jnp.all(jnp.isfinite(response), (0, 1, 2))
     return jnp.where(is_finite, response, 0.0).astype(jnp.float32).transpose(2, 1, 0, 3)
 

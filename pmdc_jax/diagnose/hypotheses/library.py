@@ -19,7 +19,7 @@ from ...runtime.compiled import quickly_compiled
 from ...runtime.threads import run_ahead
 from ...simulate import Tape, free_run
 from ..model import Model
-from ..response import Outputs, Path, kicks, sensor_changes
+from ..response import Outputs, Path, sensor_changes, state_increments
 from .candidates import Candidate, Scales
 from .change import Change, columns_at_once
 from .trials import all_candidates
@@ -127,8 +127,8 @@ def _change_per_unit(
     tape: Tape,
     path: Path,
 ) -> Float32[Array, "samples 2 blocks columns"]:
-    """The kicks, or changes by sensors, of settings of one effect; each divided by its unit, in single precision."""
-    change = sensor_changes if effect.equation == "sensor" else kicks
+    """The state increments, or changes by sensors, of settings of one effect, each divided by its unit."""
+    change = sensor_changes if effect.equation == "sensor" else state_increments
 
     def per_unit(values: Mapping[str, Array | np.ndarray], unit: Array | np.ndarray) -> Outputs:
         return change(bare.with_effects([effect(**values)]), bare, tape, path) / unit

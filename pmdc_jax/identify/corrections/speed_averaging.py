@@ -121,8 +121,8 @@ def without_ends(prepared: Prepared, outputs: slice = BOTH) -> Prepared:
 def _with_speeds_averaged(prepared: Prepared, averaging: Averaging | None) -> Prepared:
     """The runs with their recorded speeds treated as such means, or as instantaneous for None."""
     runs = [
-        attrs.evolve(run, averaging=averaging) if run.speed is not None and not ours else run
-        for run, ours in zip(prepared.runs, prepared.differentiated, strict=True)
+        attrs.evolve(run, averaging=averaging) if run.speed is not None and not is_differentiated else run
+        for run, is_differentiated in zip(prepared.runs, prepared.differentiated, strict=True)
     ]
     laid = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, follow=True))
     averaged = prepared.with_tape(averaging=laid.averaging, turn=laid.turn)
@@ -223,8 +223,8 @@ def _speeds(prepared: Prepared) -> list[tuple[np.ndarray, float]]:
     """The recorded speeds, rad/s, of all training runs long enough to show their noise, and their sample times, s."""
     recorded = [
         (run.speed, np.diff(run.time))
-        for run, ours in zip(prepared.training, prepared.differentiated, strict=False)
-        if run.speed is not None and not ours
+        for run, is_differentiated in zip(prepared.training, prepared.differentiated, strict=False)
+        if run.speed is not None and not is_differentiated
     ]
     known = [(speed[~np.isnan(speed)], float(np.median(steps))) for speed, steps in recorded]
     return [(speed, step) for speed, step in known if len(speed) >= MIN_SAMPLES]

@@ -71,7 +71,7 @@ def with_whitening(prepared: Prepared, white: Whitener) -> Prepared:
     # hold-out runs have no filter, only the scale of the noise
     scales = [np.diag(1 / noise)] * tape.runs
     for run, A, S in zip(training_indices(prepared), white.filters, white.scales, strict=True):
-        both = np.ix_(*2 * [_outputs(tape, run)])
+        both = np.ix_(*2 * [_measured_outputs(tape, run)])
         filters[run], scales[run] = np.zeros((len(A), 2, 2)), np.zeros((2, 2))
         filters[run][:, *both], scales[run][both] = A, S
     whitening = Whitening.of(filters, scales, tape.weight, tape.run)
@@ -95,12 +95,12 @@ def series_of(tape: Tape, run: int, signal: np.ndarray) -> Series:
     part = np.moveaxis(signal[mine], 1, 2)
     values = part.reshape(-1, *part.shape[2:])
     weight = np.moveaxis(np.asarray(tape.weight)[mine], 1, 2).reshape(-1, 2) > 0
-    outputs = tuple(int(c) for c in _outputs(tape, run))
+    outputs = tuple(int(c) for c in _measured_outputs(tape, run))
     kind = (tape.sample_time_of(run), outputs)
     return Series(values[:, list(outputs)], np.asarray(weight[:, list(outputs)].all(1)), kind)
 
 
-def _outputs(tape: Tape, run: int) -> np.ndarray:
+def _measured_outputs(tape: Tape, run: int) -> np.ndarray:
     """Indices of the outputs that a run has measured."""
     weight = np.asarray(tape.weight)[tape.blocks_of(run)]
     return np.flatnonzero(weight.any((0, 2)))

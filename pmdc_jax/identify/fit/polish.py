@@ -108,7 +108,7 @@ def polish(
             share /= 4  # the last step was too long
         else:
             break
-        unknowns, stopped = _moved(problem, best.unknowns, share * step)
+        unknowns, stopped = _moved_within_bounds(problem, best.unknowns, share * step)
         fixed |= stopped
         change = np.asarray(flatten(unknowns)) - np.asarray(flatten(best.unknowns))
         trial = _evaluate_weighted(problem, unknowns, starts=predicted_starts(problem, best.evaluation, change))
@@ -130,7 +130,7 @@ def _still_held(problem: Problem, best: _WeightedPoint, fixed: set[int]) -> set[
     return {k for k in fixed if (best.matrix[k, -1] > 0) == (coordinates[k] <= low[k])}
 
 
-def _moved(problem: Problem, unknowns: Unknowns, step: np.ndarray) -> tuple[Unknowns, set[int]]:
+def _moved_within_bounds(problem: Problem, unknowns: Unknowns, step: np.ndarray) -> tuple[Unknowns, set[int]]:
     """The unknowns a step further on, within their bounds, and the coordinates that a bound stopped."""
     parameters = problem.parameters
     low, high = np.asarray(parameters.lower), np.asarray(parameters.upper)

@@ -14,7 +14,6 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from ...runtime.compiled import quickly_compiled, strongly_typed
-from ..identification import CONVERGED_DISTANCE
 from ..parameters import Parameters
 from ..problem import Problem, Unknowns, evaluate, flatten, normal_matrix, unflatten
 
@@ -31,11 +30,6 @@ class Optimum(NamedTuple):
     distance: float = np.inf
     # there, of the blocks of samples that are simulated in parallel (see `evaluate`); None where they are not known
     starts: Float[np.ndarray, "blocks states"] | None = None
-
-    @property
-    def converged(self) -> bool:
-        """Whether the minimum is near, by the gradient and not by a solver's own criterion."""
-        return self.distance <= CONVERGED_DISTANCE
 
     def moved(self, parameters: Parameters, step: Float[Array | np.ndarray, " parameters"]) -> Optimum:
         """A start whose coordinates are a step further on, within their bounds."""

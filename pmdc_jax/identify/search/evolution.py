@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import count
 from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
@@ -81,6 +82,11 @@ class _Generation(NamedTuple):
     cube: np.ndarray
     fitness: np.ndarray
 
+    def agrees(self, width: np.ndarray) -> bool:
+        """Whether the best tenth agree, given the width of the bounds."""
+        elite = self.cube[np.argsort(self.fitness)[: len(self.cube) // 10 + 1]]
+        return bool(np.all(np.ptp(width * elite, axis=0) < AGREEMENT))
+
 
 def search(
     parameters: Parameters,
@@ -113,29 +119,33 @@ def search(
     low, high = np.asarray(parameters.lower), np.asarray(parameters.upper)
     fitness_of = _Fitness(parameters, tape, noise)
 
-    kind, seeds = Kind(method, size, len(low)), np.asarray(seed)
     start = _scattered(seed, INITIAL_CANDIDATES if chosen.distribution else size, len(low))
-    first = _Generation(start, fitness_of.scattered(low + (high - low) * start, size))
-    begins_with = (start[np.argmin(first.fitness)],) if chosen.distribution else first
-    asked, state = _first_points(kind, seeds, *begins_with)
+    first = _Generation(start, fitness_of.scattered(start, size))
+    later = _later_generations(Kind(method, size, len(low)), seed, first, fitness_of)
     evaluated = [first]
-
     interrupted = False
     try:
-        for generation in range(1, rounds):
-            cube = np.asarray(asked)
-            fitness = fitness_of(low + (high - low) * cube)
-            asked, state = _next_points(kind, seeds, np.asarray(generation), cube, fitness, state)
-            evaluated.append(_Generation(cube, fitness))
+        for number, generation in zip(range(1, rounds), later, strict=False):
+            evaluated.append(generation)
             if progress:
                 best = min(each.fitness.min() for each in evaluated)
-                progress(f"searching, generation {generation}", float(best), generation / rounds)
-            elite = cube[np.argsort(fitness)[: size // 10 + 1]]
-            if generation > MIN_GENERATIONS and np.all(np.ptp((high - low) * elite, axis=0) < AGREEMENT):
+                progress(f"searching, generation {number}", float(best), number / rounds)
+            if number > MIN_GENERATIONS and generation.agrees(high - low):
                 break
     except KeyboardInterrupt:
         interrupted = True
     return _collect(evaluated, low, high, interrupted)
+
+
+def _later_generations(kind: Kind, seed: int, first: _Generation, fitness_of: _Fitness) -> Iterator[_Generation]:
+    """The generations after the first one, without end."""
+    seeds, best = np.asarray(seed), first.cube[np.argmin(first.fitness)]
+    asked, state = _first_points(kind, seeds, *((best,) if METHODS[kind.method].distribution else first))
+    for number in count(1):
+        cube = np.asarray(asked)
+        generation = _Generation(cube, fitness_of(cube))
+        yield generation
+        asked, state = _next_points(kind, seeds, np.asarray(number), *generation, state)
 
 
 Value = Array | np.ndarray
@@ -192,21 +202,22 @@ def _algorithm(kind: Kind) -> tuple[EvolutionaryAlgorithm, Params]:
 
 
 class _Fitness:
-    """Fitness of a population: coordinates (population, parameters) to (population,)."""
+    """Fitness of a population: points of the unit cube (population, parameters) to (population,)."""
 
     def __init__(self, parameters: Parameters, tape: Tape, noise: np.ndarray) -> None:
         self.parameters, self.noise = parameters, noise
+        self.low, self.high = np.asarray(parameters.lower), np.asarray(parameters.upper)
         # transferred to the device once instead of in every generation
         self.tape: Tape = jax.tree.map(jnp.asarray, tape)
         self.samples = np.maximum(np.asarray(tape.weight).sum((0, 2)), 1.0)
 
-    def scattered(self, coordinates: np.ndarray, size: int) -> np.ndarray:
+    def scattered(self, cube: np.ndarray, size: int) -> np.ndarray:
         """The fitness of many candidates, in populations of about `size`, for which the simulation is compiled."""
-        parts = np.array_split(coordinates, max(1, len(coordinates) // size))
+        parts = np.array_split(cube, max(1, len(cube) // size))
         return np.concatenate([self(part) for part in parts])
 
-    def __call__(self, coordinates: np.ndarray) -> np.ndarray:
-        motors = _motors(self.parameters, coordinates)
+    def __call__(self, cube: np.ndarray) -> np.ndarray:
+        motors = _motors(self.parameters, self.low + (self.high - self.low) * cube)
         errors = np.stack([np.asarray(e) for e in squared_errors(motors, self.tape)])
         mean_squares = errors / (self.samples * self.noise**2)[:, None]
         return np.minimum(mean_squares.sum(0), 1e300)

@@ -44,54 +44,60 @@ def explain_directions(
 
 
 def _reason(names: set[str], recordings: Sequence[Recording]) -> tuple[str, str]:
+    """Why the runs do not determine parameters that trade off against each other, and a remedy."""
     loads = [r.load for r in recordings if r.load is not None]
     loaded = any(np.ptp(load) > 0 or np.any(load != 0) for load in loads)
     electrical = any(r.voltage is not None for r in recordings)
     driven = any(r.drive == "torque" for r in recordings)
     measured = any(r.voltage is not None and r.current is not None for r in recordings)
     turning = any(r.speed is not None or r.angle is not None for r in recordings if not r.held)
+    knows_torque = loaded or driven
     listed = enumerate_words(sorted(names))
-    if electrical and not measured and names & {"R", "L", "Kb", "Kt"}:
-        return (
+    reasons: list[tuple[object, str, str]] = [
+        (
+            electrical and not measured and names & {"R", "L", "Kb", "Kt"},
             f"No run has both voltage and current, so {listed} trade off against each other",
             "Record the current too, or give values with --known",
-        )
-    if not turning and names & {"Kb", "Kt", "J", "f"}:
-        return (
+        ),
+        (
+            not turning and names & {"Kb", "Kt", "J", "f"},
             f"No run with a turning rotor has a speed or an angle, so {listed} trade off against each other",
             "Record the speed or the angle too, or give values with --known",
-        )
-    if {"J", "f"} <= names and not electrical and not loaded and not driven:
-        return (
+        ),
+        (
+            {"J", "f"} <= names and not electrical and not knows_torque,
             "No run has a voltage or a nonzero known load torque, so only the ratios of Kt, J and f are identifiable",
             "Record the voltage too, add a run with a known load torque, or give Kt with --known",
-        )
-    if {"Kt", "J"} <= names and not loaded and not driven:
-        return (
+        ),
+        (
+            {"Kt", "J"} <= names and not knows_torque,
             "No run has a nonzero known load torque, so only the ratios of Kt, J and f are identifiable",
             "Add a run with a known load torque, or tie Kt = Kb with --tie Kt=Kb",
-        )
-    if names == {"L"}:
-        return (
+        ),
+        (
+            names == {"L"},
             "The sampling is too slow, or the voltage too smooth, to show the electrical time constant",
             "Record voltage steps at a sample time below L / R, or give L with --known",
-        )
-    if names == {"f"}:
-        return (
+        ),
+        (
+            names == {"f"},
             "Viscous friction changes these runs by less than their noise",
             "Record long steady runs at several speeds with little load",
-        )
-    if "J" in names and not names & {"Kt", "Kb"}:
-        return (
+        ),
+        (
+            "J" in names and not names & {"Kt", "Kb"},
             "The speed changes too little to show the inertia",
             "Add a run with voltage steps or a rapidly changing voltage",
-        )
-    if {"R", "Kb"} & names:
-        return (
+        ),
+        (
+            {"R", "Kb"} & names,
             f"Voltage, current and speed keep the same proportions, so {listed} trade off against each other",
             "Add runs at other loads, at stall, or with voltage steps",
-        )
-    return (
-        f"The runs cannot distinguish {listed}",
-        "Add a run with more excitation: voltage steps, both directions, several speeds and loads",
-    )
+        ),
+        (
+            True,
+            f"The runs cannot distinguish {listed}",
+            "Add a run with more excitation: voltage steps, both directions, several speeds and loads",
+        ),
+    ]
+    return next((why, mend) for applies, why, mend in reasons if applies)

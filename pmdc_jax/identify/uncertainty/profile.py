@@ -62,13 +62,13 @@ def profile_interval(
 def _refitted(problem: Problem, point: _Point, index: int, value: float, close: float) -> _Point:
     """The point of the profile at a value of the coordinate, found from another point."""
     for _ in range(MAX_REFITS):
-        point = _point(problem, _moved(problem, point, index, value), index)
+        point = _point(problem, _moved_along_profile(problem, point, index, value), index)
         if not close < point.gain < np.inf:
             break
     return point
 
 
-def _moved(problem: Problem, point: _Point, index: int, value: float) -> Unknowns:
+def _moved_along_profile(problem: Problem, point: _Point, index: int, value: float) -> Unknowns:
     """The unknowns with the coordinate at a value and all others moved along the profile by a Gauss-Newton step."""
     unknowns, count = point.unknowns, len(point.unknowns.coordinates)
     delta, matrix = value - float(unknowns.coordinates[index]), point.matrix.copy()
