@@ -12,7 +12,7 @@ doi:10.1007/BF02238534 (its use for parallel time integration).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -26,6 +26,8 @@ from .blocks import MotorOnGrids, Pass, Start, Starts, pack, simulate_blocks, va
 from .propagator import grid_propagators
 from .sensing import reported
 from .tape import Tape
+
+T = TypeVar("T")
 
 # Relative gap between blocks below which no further pass follows. The last pass still corrects the gap to first order,
 # so the remaining error is about the square of this.
@@ -100,23 +102,17 @@ def sensitivities(
     """
     own = own or RunUnknowns.as_recorded(tape)
     count = len(parameters)
-    all_columns = count + UNKNOWNS_PER_RUN
 
     def prepare(parameters: Float[Array, " parameters"]) -> MotorOnGrids:
         motor = assemble(parameters)
         return motor, grid_propagators(motor, tape)
 
     motor_on_grids, d_motor_on_grids = value_and_derivatives(prepare, (parameters,), (jnp.eye(count),))
-    motor = motor_on_grids[0]
-    d_motor = jax.tree.map(lambda leaf: _pad_columns(leaf, all_columns), d_motor_on_grids[0])
-    ones = jnp.eye(UNKNOWNS_PER_RUN, all_columns, count)[:, :, None]
-    d_own = RunUnknowns(*(jnp.broadcast_to(one, (all_columns, tape.runs)) for one in ones))
-    initial, d_initial = value_and_derivatives(
-        lambda motor, own: _initial_states(motor, own, tape), (motor, own), (d_motor, d_own)
-    )
+    motor, d_motor = motor_on_grids[0], _pad_columns(d_motor_on_grids[0], count + UNKNOWNS_PER_RUN)
+    initial, d_initial = _initial_states_with_derivatives(motor, d_motor, own, tape, count)
     states = initial.shape[1]
-    columns = count + 1 + states
-    d_motor_on_grids = jax.tree.map(lambda leaf: _pad_columns(leaf, columns), d_motor_on_grids)
+    # the parameters, the load offset and the start of the block
+    d_motor_on_grids = _pad_columns(d_motor_on_grids, count + 1 + states)
 
     guess = _guessed_starts(motor, own, tape, initial)
     if starts is not None:
@@ -128,20 +124,37 @@ def sensitivities(
     # otherwise every pass has all columns, because a pass with other columns is compiled anew
     starts, _, passed, *_ = _join_blocks(motor_on_grids, d_motor_on_grids, tape, own, initial, guess, MAX_PASSES)
     joined, d_starts = _newton_correction_with_derivatives(passed, tape, starts, initial, d_initial, count)
+    simulated, d_simulated = _joined_outputs_with_derivatives(passed, joined - starts, d_starts, count)
+    if motor.speed_delay() is not None or tape.averaging is not None:
+        simulated, d_simulated = value_and_derivatives(
+            lambda motor, simulated: reported(motor, tape, simulated),
+            (motor, simulated),
+            (d_motor, jnp.moveaxis(d_simulated, -1, 0)),
+        )
+        d_simulated = jnp.moveaxis(d_simulated, 0, -1)
+    return Sensitivities(simulated, d_simulated, joined, d_starts)
 
-    by_start = passed.d_simulated[:, -states:]
-    simulated = passed.simulated + jnp.einsum("sncb,bn->scb", by_start, joined - starts)
+
+def _initial_states_with_derivatives(
+    motor: Motor, d_motor: Motor, own: RunUnknowns, tape: Tape, count: int
+) -> tuple[Starts, Float[Array, "columns blocks states"]]:
+    """Initial state of the run of each block, and its derivatives with respect to all columns."""
+    columns = count + UNKNOWNS_PER_RUN
+    ones = jnp.eye(UNKNOWNS_PER_RUN, columns, count)[:, :, None]
+    d_own = RunUnknowns(*(jnp.broadcast_to(one, (columns, tape.runs)) for one in ones))
+    return value_and_derivatives(lambda motor, own: _initial_states(motor, own, tape), (motor, own), (d_motor, d_own))
+
+
+def _joined_outputs_with_derivatives(
+    passed: Pass, change: Starts, d_starts: Float[Array, "blocks states columns"], count: int
+) -> tuple[Float[Array, "blocks outputs samples"], Float[Array, "blocks outputs samples columns"]]:
+    """The outputs of a pass after a change of its starts, to first order, and their derivatives with respect to all
+    columns."""
+    by_start = passed.d_simulated[:, -change.shape[1] :]
+    simulated = passed.simulated + jnp.einsum("sncb,bn->scb", by_start, change)
     through = jnp.einsum("sncb,bnp->scbp", by_start, d_starts)
     direct = _in_all_columns(jnp.moveaxis(passed.d_simulated[:, : count + 1], 1, -1), count)
-    d_simulated = (direct + through).transpose(2, 1, 0, 3)
-    if motor.speed_delay() is None and tape.averaging is None:
-        return Sensitivities(simulated.transpose(2, 1, 0), d_simulated, joined, d_starts)
-    simulated, d_simulated = value_and_derivatives(
-        lambda motor, simulated: reported(motor, tape, simulated),
-        (motor, simulated.transpose(2, 1, 0)),
-        (d_motor, jnp.moveaxis(d_simulated, -1, 0)),
-    )
-    return Sensitivities(simulated, jnp.moveaxis(d_simulated, 0, -1), joined, d_starts)
+    return simulated.transpose(2, 1, 0), (direct + through).transpose(2, 1, 0, 3)
 
 
 def _in_all_columns(own: Float[Array, "... own"], count: int) -> Float[Array, "... columns"]:
@@ -314,5 +327,6 @@ def _newton_correction_with_derivatives(
     return jax.lax.scan(follow, nothing, blocks)[1]
 
 
-def _pad_columns(leaf: Float[Array, "parameters ..."], columns: int) -> Float[Array, "columns ..."]:
-    return jnp.pad(leaf, [(0, columns - leaf.shape[0])] + [(0, 0)] * (leaf.ndim - 1))
+def _pad_columns(derivatives: T, columns: int) -> T:
+    """Derivatives with respect to the parameters, followed by zeros up to so many columns."""
+    return jax.tree.map(lambda d: jnp.pad(d, [(0, columns - d.shape[0])] + [(0, 0)] * (d.ndim - 1)), derivatives)
