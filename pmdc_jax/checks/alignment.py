@@ -13,6 +13,14 @@ from .plausibility import regress, speed_of
 MAX_SHIFT = 20  # samples, between channels
 SHIFTS = sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs)
 MAX_MISFIT_RATIO = 0.3  # a shift must leave less than this share of the misfit without one
+# Share of the misfit without a shift, or with one, below which that is clearly the better explanation of the speed
+CLEARLY_BETTER = 0.5
+MIN_MISFIT = 0.01  # relative, below which no shift is needed
+ABOUT_THE_LEAST = 1.5  # the smallest shift is taken whose misfit is within this factor of the least
+# Share of its largest change within the window that a current may make in its first sample
+MAX_FIRST_CHANGE = 0.9
+MAX_EDGES = 2000  # that are averaged: more would take long and add nothing
+MAX_GAP = 1.1  # length of a window over that of as many even samples, beyond which samples are missing in it
 # Change of the voltage at an edge, over those in the samples beside it, and over its range
 MIN_EDGE_RATIO, MIN_EDGE_SHARE = 2.0, 0.1
 BEFORE_EDGE = 40  # samples
@@ -29,9 +37,9 @@ def shifted_channels(run: Recording) -> Iterator[Finding]:
     electrical = {shift: _electrical_misfit(edge, shift) for shift in SHIFTS}
     mechanical = {shift: _mechanical_misfit(edge, shift) for shift in SHIFTS}
     late, behind_speed = _best_shift(electrical), _best_shift(mechanical)
-    if late and mechanical[0] < 0.5 * mechanical[late]:
+    if late and mechanical[0] < CLEARLY_BETTER * mechanical[late]:
         column, what, shift = "voltage", "current and speed are", late
-    elif late and mechanical[late] < 0.5 * mechanical[0]:
+    elif late and mechanical[late] < CLEARLY_BETTER * mechanical[0]:
         column, what, shift = "current", "the current is", late
     elif late:
         column, what, shift = "current", "the current, and perhaps the speed, is", late
@@ -52,7 +60,7 @@ def slow_sampling(run: Recording) -> Iterator[Finding]:
     if edge is None:
         return
     current = edge.current[BEFORE_EDGE:] - edge.current[BEFORE_EDGE]
-    if abs(current[1]) > 0.9 * np.max(np.abs(current)):
+    if abs(current[1]) > MAX_FIRST_CHANGE * np.max(np.abs(current)):
         what = f"the current settles within one sample ({run.sample_time:.3g} s): L may be poorly determined"
         mend = "Sample faster than L / R if the standard error of L is too large"
         yield Finding(run.name, "current", "note", what, "at voltage edges", mend)
@@ -78,11 +86,11 @@ def _average_edge(run: Recording) -> _Edge | None:
     jumps = np.diff(run.voltage)
     rows = jumps_of(run.voltage, MIN_EDGE_RATIO, MIN_EDGE_SHARE)
     rows = rows[(rows >= BEFORE_EDGE) & (rows <= len(run) - AFTER_EDGE)]
-    rows = rows[:: len(rows) // 2000 + 1]
+    rows = rows[:: len(rows) // MAX_EDGES + 1]
     about = rows[:, None] + np.arange(-BEFORE_EDGE, AFTER_EDGE)
     channels = [run.voltage[about], run.current[about], speed[about], np.sign(speed[about])]
     spans = run.time[rows + AFTER_EDGE - 1] - run.time[rows - BEFORE_EDGE]
-    steady = spans < 1.1 * (BEFORE_EDGE + AFTER_EDGE - 1) * run.sample_time
+    steady = spans < MAX_GAP * (BEFORE_EDGE + AFTER_EDGE - 1) * run.sample_time
     good = np.isfinite(channels).all((0, 2)) & steady
     if not good.any():
         return None
@@ -115,6 +123,6 @@ def _misfit(y: np.ndarray, *regressors: np.ndarray) -> float:
 def _best_shift(misfit: Mapping[int, float]) -> int:
     """The smallest shift with about the least misfit, if clearly better than no shift; otherwise 0."""
     unshifted, least = min(misfit[-1], misfit[0], misfit[1]), min(misfit.values())
-    if unshifted < 0.01 or least > MAX_MISFIT_RATIO * unshifted:
+    if unshifted < MIN_MISFIT or least > MAX_MISFIT_RATIO * unshifted:
         return 0
-    return next(shift for shift in SHIFTS if misfit[shift] <= 1.5 * least)
+    return next(shift for shift in SHIFTS if misfit[shift] <= ABOUT_THE_LEAST * least)

@@ -24,6 +24,11 @@ WINDOW_LENGTHS = (1, 4, 16)  # times the shortest: rates of noisy channels need 
 UNSIGNED = ("current", "speed")  # channels of which some sensors give no sign
 MAX_UNEXPLAINED = 0.2  # share of the voltage that these may leave, if they are given its sign
 MAX_NEGATIVE = 0.02  # share of its range to which a channel that has no sign may be negative
+# Least share of the variance that the equations explain where something is concluded from them: of what drives the
+# motor, without a current to balance it, of the angle's rate, and of the load
+MIN_EXPLAINED_DRIVE, MIN_EXPLAINED_ANGLE, MIN_EXPLAINED_LOAD = 0.7, 0.98, 0.8
+# How far the ratio of the angle's rate to the speed, relative to what it should be, may be off, and that of Kt to Kb
+ANGLE_RATIO_TOLERANCE, KT_OVER_KB_FACTOR = 0.1, 1.25
 MIN_CLARITY = 3.0  # a term is seen when it moves the fit by this many residuals
 RPM_PER_RAD_S = 30 / np.pi
 DEGREES_PER_RAD = 180 / np.pi
@@ -111,7 +116,7 @@ def _falls_when_driven(run: Recording, longer: int) -> bool:
     fit, explained = regress(w[run.drive], regressors)
     # a voltage is balanced by the back-EMF too, which has the same sign
     drag = run.drive != "voltage" or fit["speed"].value < 0
-    return explained > 0.7 and fit["speed_rate"].negative and drag
+    return explained > MIN_EXPLAINED_DRIVE and fit["speed_rate"].negative and drag
 
 
 def _electrical_balance(w: Mapping[str, np.ndarray]) -> tuple[Term, Term]:
@@ -128,7 +133,7 @@ def angle_against_speed(run: Recording) -> Iterator[Finding]:
         return
     fit, explained = regress(w["angle_rate"], {"speed": w["speed"]})
     ratio = fit["speed"].value
-    if explained < 0.98 or 0.9 < ratio < 1.1:
+    if explained < MIN_EXPLAINED_ANGLE or abs(ratio - 1) < ANGLE_RATIO_TOLERANCE:
         return
     reasons = {
         1 / RPM_PER_RAD_S: ", as if the speed were in rpm",
@@ -137,7 +142,7 @@ def angle_against_speed(run: Recording) -> Iterator[Finding]:
         1 / (2 * np.pi): ", as if the angle were in turns",
         -1.0: ", as if one of them had the wrong sign",
     }
-    why = next((why for k, why in reasons.items() if abs(ratio / k - 1) < 0.1), "")
+    why = next((why for k, why in reasons.items() if abs(ratio / k - 1) < ANGLE_RATIO_TOLERANCE), "")
     what = f"the angle changes {ratio:.4g} times as fast as the recorded speed{why}".strip()
     mend = "Correct the unit, in the header or with --column, or the sign"
     yield Finding(run.name, "angle", "warning", what, "whole run", mend)
@@ -154,7 +159,7 @@ def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
     names = ", ".join(run.name for run in runs if run.load is not None)
     constants = max((_constants(runs, longer) for longer in WINDOW_LENGTHS), key=lambda c: c.explained)
     Kb, Kt = constants.Kb, constants.Kt
-    if constants.explained < 0.8 or not (constants.R.positive and Kb.positive):
+    if constants.explained < MIN_EXPLAINED_LOAD or not (constants.R.positive and Kb.positive):
         return
     if Kt.negative:
         what = "the load rises where the current falls: its sign is reversed"
@@ -167,7 +172,9 @@ def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
         return
     ratio = Kt.value / Kb.value
     for scale, (column, unit, read) in KT_OVER_KB_IF_MISREAD.items():
-        if 0.8 < ratio / scale < 1.25 and not any(finding.column == "voltage" for finding in wrong):
+        if 1 / KT_OVER_KB_FACTOR < ratio / scale < KT_OVER_KB_FACTOR and not any(
+            finding.column == "voltage" for finding in wrong
+        ):
             what = f"Kt is {ratio:.3g} times Kb, as if the {column} were in {unit}, not {read}"
             mend = f"If so, write [{unit}] in the header, or use --column {column}=HEADER:{unit}"
             yield Finding(names, column, "warning", what, "all loaded runs", mend)

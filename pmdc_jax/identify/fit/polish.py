@@ -31,6 +31,9 @@ PATIENCE, MIN_COST_DECREASE = 5, 1e-5
 MAX_PREDICTED = 20.0
 # Gauss-Newton steps at most
 MAX_STEPS = 20
+# A step that raises the cost, by more than rounding does, is divided by this until a share so small is left of it that
+# the direction itself must be wrong
+MAX_ROUNDING, SHORTENING, MIN_STEP_SHARE = 1e-9, 4, 1e-3
 # From this evaluation on a polish is given up where it would not be useful even if the squares fell so many times
 # further than the next step is predicted to reduce them
 FIRST_TO_GIVE_UP, OPTIMISM = 3, 3.0
@@ -91,7 +94,7 @@ def polish(
             break
         if not np.isfinite(best.cost):
             break  # a failed simulation has no gradient
-        if trial.cost <= best.cost + 1e-9:
+        if trial.cost <= best.cost + MAX_ROUNDING:
             fell = (best.cost - trial.cost) * float(np.sum(problem.samples))
             best, share = trial, 1.0
             fixed = _still_held(problem, best, fixed)
@@ -104,8 +107,8 @@ def polish(
             held = frozenset(fixed)
             if len(costs) >= FIRST_TO_GIVE_UP and best.matrix[-1, -1] - OPTIMISM * gain > useful:
                 break
-        elif share > 1e-3:
-            share /= 4  # the last step was too long
+        elif share > MIN_STEP_SHARE:
+            share /= SHORTENING  # the last step was too long
         else:
             break
         unknowns, stopped = _moved_within_bounds(problem, best.unknowns, share * step)

@@ -21,6 +21,8 @@ from .whitening import band_matrix, with_history
 
 # Orders that are tried, none above `CHUNK`; the Bayesian information criterion chooses.
 ORDERS = (1, 2, 4, 8, 12, 20, 30)
+# Rows at least for each coefficient of an output: with fewer a filter would follow the noise of this very record
+MIN_ROWS_PER_COEFFICIENT = 20
 # Noise of different runs is equal if its logarithm differs by less
 MAX_LOG_NOISE_SPREAD = 0.2
 # Number of frequencies of a run, from the lowest on, that count as slow
@@ -123,7 +125,7 @@ def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order out
     best = rows * np.linalg.slogdet(gram[:outputs, :outputs] / max(rows, 1))[1]
     chosen = np.zeros((0, outputs, outputs))
     for order in ORDERS:
-        if rows < 20 * order * outputs:
+        if rows < MIN_ROWS_PER_COEFFICIENT * order * outputs:
             break
         now, past = slice(0, outputs), slice(outputs, outputs * (order + 1))
         ridge = 1e-9 * np.trace(gram[past, past]) * np.eye(order * outputs) / (order * outputs)

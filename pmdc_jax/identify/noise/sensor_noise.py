@@ -15,6 +15,12 @@ MIN_RELATIVE_NOISE = 1e-5
 MIN_NOISE = 1e-12
 # Steps below this share of the largest one are rounding errors
 ROUNDING_ERROR = 1e-9
+# A quantum is the smallest step, or this quantile of the steps, where the smallest is an outlier
+SMALLEST_QUANTILE = 0.01
+# of which this share of the steps are multiples, to within this share of it
+MIN_MULTIPLES, MULTIPLE_TOLERANCE = 0.95, 0.02
+# Largest multiples by which a quantum is refined, pass after pass: a rough one counts only small multiples right
+REACHES = (10, 100, np.inf)
 # Euclid's algorithm: a remainder below this share of the largest number is zero,
 ZERO_REMAINDER = 1e-8
 # and a common divisor below this share, 20 bits, is none
@@ -94,17 +100,17 @@ def quantum(steps: Float[np.ndarray, " steps"]) -> float:
     if not len(sizes):
         return 0.0
     # the smallest step may be an outlier, a quantile may be a multiple of the quantum
-    for smallest in (np.quantile(sizes, 0.01), np.min(sizes)):
+    for smallest in (np.quantile(sizes, SMALLEST_QUANTILE), np.min(sizes)):
         step = _refined_quantum(sizes, float(smallest))
         off = np.abs(sizes / step - np.round(sizes / step))
-        if np.mean(off < 0.02) > 0.95:
+        if np.mean(off < MULTIPLE_TOLERANCE) > MIN_MULTIPLES:
             return step
     return 0.0
 
 
 def _refined_quantum(sizes: Float[np.ndarray, " steps"], step: float) -> float:
     """The step of which the sizes are multiples, refined from a rough one: larger multiples determine it better."""
-    for reach in (10, 100, np.inf):
+    for reach in REACHES:
         near = sizes[sizes < reach * step]
         counts = np.round(near / step)
         step = float(near @ counts / (counts @ counts))

@@ -13,6 +13,9 @@ from ..parameters import Parameters
 
 # A parameter belongs to an unseen direction if it makes up at least this share of it.
 MIN_SHARE = 0.05
+# A direction scales the torques if, as a unit vector, it moves the logarithm of Kt by more than the first and that of
+# Kb by less than the second: in proportion, Kt, J and f move by 0.6 each
+MIN_MOVED_KT, MAX_MOVED_KB = 0.1, 1e-2
 
 
 def moved_by(direction: np.ndarray, parameters: Parameters) -> tuple[str, ...]:
@@ -28,7 +31,7 @@ def sees_torque_scale(unseen: Sequence[np.ndarray], names: Sequence[str]) -> boo
     if not {"Kt", "Kb"} <= set(names):
         return True
     k, b = names.index("Kt"), names.index("Kb")
-    return not any(abs(d[k]) > 0.1 and abs(d[b]) < 1e-2 for d in unseen)
+    return not any(abs(d[k]) > MIN_MOVED_KT and abs(d[b]) < MAX_MOVED_KB for d in unseen)
 
 
 def explain_directions(

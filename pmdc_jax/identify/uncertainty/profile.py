@@ -16,6 +16,13 @@ MAX_ROUNDS = 5  # of the search for each end of the interval
 MAX_REFITS = 3  # Gauss-Newton steps of the other unknowns for each trial, at most
 # Refits end when one more step would lower the sum of squares by less than this share of the rise that is sought
 REFIT_TOLERANCE = 0.05
+# An end is found where the root of the rise is within this share of the one sought: far less than an interval's own
+# uncertainty
+RISE_TOLERANCE = 0.02
+# Factors within which the distance from the optimum changes from round to round, as the rise may be far from quadratic
+CHANGE_RANGE = (0.3, 3.0)
+# Least rise that is told from rounding errors
+MIN_RISE = 1e-12
 
 
 class _Point(NamedTuple):
@@ -50,10 +57,10 @@ def profile_interval(
         for _ in range(MAX_ROUNDS):
             trial = centre + sign * min(distance, abs(limit - centre))
             point = _refitted(problem, point, index, trial, close)
-            rise = np.sqrt(max(point.squares - lowest.squares, 1e-12) / inflation)
+            rise = np.sqrt(max(point.squares - lowest.squares, MIN_RISE) / inflation)
             # the root of the rise grows linearly with distance where the sum of squares is quadratic
-            distance = abs(trial - centre) * min(max(reach / rise, 0.3), 3.0)
-            if abs(rise / reach - 1) < 0.02:
+            distance = abs(trial - centre) * float(np.clip(reach / rise, *CHANGE_RANGE))
+            if abs(rise / reach - 1) < RISE_TOLERANCE:
                 break
         ends.append(centre + sign * min(distance, abs(limit - centre)))
     return ends[0], ends[1]
