@@ -84,7 +84,9 @@ def _diagnosis(attempt: Attempt) -> Diagnosis:
         gap_of_run=gaps,
         closed_fraction=closed_fraction(by_role) if naming.chosen.effects else None,
         rivals=rival_sets(naming),
-        next_experiment=next_experiment(naming, attempt.solved.fitted.prepared.training) if verdict == "ambiguous" else None,
+        next_experiment=next_experiment(naming, attempt.solved.fitted.prepared.training)
+        if verdict == "ambiguous"
+        else None,
         curves=learned_curves(naming) if reports_curves else (),
         detectable=detectable_effects(naming.chosen_screen),
         base=base,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ...diagnose.diagnosis import Detectable, Diagnosis, EffectFound, holdouts_show_more, effects_worsen_holdouts
+from ...diagnose.diagnosis import Detectable, Diagnosis, EffectFound, effects_worsen_holdouts, holdouts_show_more
 from ...diagnose.hypotheses.effect_relations import CONTAINS, unbalanced_equation
 from ...identify.identification import Role
 from ...words import enumerate_words
