@@ -30,10 +30,19 @@ from pmdc_jax.control import (
     steady_state,
     step_metrics,
 )
-from pmdc_jax.control.classical import ackermann, state_feedback, ultimate_gain, ziegler_nichols
+from pmdc_jax.control.classical import (
+    ackermann,
+    standard_poles,
+    state_feedback,
+    textbook_controller,
+    ultimate_gain,
+    ziegler_nichols,
+)
+from pmdc_jax.control.evaluation import evaluate
 from pmdc_jax.control.gains import RANGES
 from pmdc_jax.control.margins import linear_loop, loop_gain, margins, sensitivity_peak
-from pmdc_jax.control.metrics import smooth_overshoot, smooth_settling
+from pmdc_jax.control.metrics import BAND, smooth_overshoot, smooth_settling
+from pmdc_jax.control.specification import LoopRequirements
 from pmdc_jax.control.spread import drawn_motors, even_spread
 from pmdc_jax.effects import EFFECTS, SpeedSensorDelay, SpeedSensorLag
 from pmdc_jax.motor import PARAMETERS, Motor
@@ -406,6 +415,33 @@ def test_sampled_state_feedback_has_the_given_poles(poles):
     found = np.linalg.eigvals(np.asarray(linear_loop(MOTOR, law).closed))
     for pole in poles:
         assert np.abs(found - np.exp(pole * 1e-3)).min() < 1e-7
+
+
+@pytest.mark.parametrize("overshoot", [0.1, 1.0, 20.0])
+def test_standard_poles_give_the_overshoot_and_settle_in_time(overshoot):
+    """By python-control, for the second-order system without zeros that has these poles."""
+    poles = standard_poles(0.3, overshoot)
+    denominator = np.real(np.poly(poles))
+    system = ct.tf([denominator[-1]], denominator)
+    found = ct.step_info(system, T=np.linspace(0, 1, 20_001), SettlingTimeThreshold=BAND)
+    assert found["Overshoot"] == pytest.approx(overshoot, rel=0.01)
+    assert 0.15 < found["SettlingTime"] <= 0.3
+    assert standard_poles(0.3, overshoot, with_integral=True)[2] == np.real(poles[0])
+
+
+@pytest.mark.parametrize(
+    ("kind", "rule"),
+    [("pid", "Ziegler-Nichols"), ("state-feedback", "Ackermann"), ("state-feedback-integral", "Ackermann")],
+)
+def test_the_textbook_controller_settles(kind, rule):
+    motor = jax.tree.map(jnp.asarray, MOTOR)
+    task, _ = LoopRequirements(controller=kind, setpoint=SETPOINT, voltage_limit=30.0, sample_time=1e-3).task(motor)
+    name, controller = textbook_controller(motor, task, kind)
+    assert name == rule
+    assert isinstance(controller, CONTROLLERS[kind])
+    found = evaluate(name, task, motor, controller, None)
+    assert found.stable
+    assert 1.0 < found.metrics["SettlingTime"] / float(task.fastest_settling) < 2.5
 
 
 def test_ziegler_nichols_refuses_a_loop_that_never_oscillates():

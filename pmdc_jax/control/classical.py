@@ -1,4 +1,4 @@
-"""Textbook design rules: Ziegler-Nichols and pole placement."""
+"""Textbook design rules: Ziegler-Nichols, and pole placement by Ackermann's formula."""
 
 from __future__ import annotations
 
@@ -11,15 +11,31 @@ import numpy as np
 from ..errors import InputError
 from ..motor import Motor
 from ..runtime.precision import double_precision
-from .controllers import PI, PID, StateFeedback, StateFeedbackIntegral
+from .controllers import CONTROLLERS, PI, PID, AbstractController, StateFeedback, StateFeedbackIntegral
 from .gains import reference_gain
 from .hardware import Hardware
 from .law import Law, SampledMotor
 from .margins import linear_loop, loop_gain
+from .metrics import BAND
+from .objective import Task
 
 ZIEGLER_NICHOLS_CONTROLLERS = ("pi", "pid")  # controllers with a Ziegler-Nichols rule
+MAX_TEXTBOOK_OVERSHOOT = 50.0  # %, of the poles: nearer to 100 % they hardly decay
 
 Poles = Sequence[complex | float] | np.ndarray
+
+
+def textbook_controller(motor: Motor, task: Task, kind: str) -> tuple[str, AbstractController]:
+    """The rule for a kind of controller, and the controller that it gives: Ziegler-Nichols for PI and PID, Ackermann's
+    formula for state feedback, with the poles of the fastest loop that the limits allow.
+
+    **Arguments**: `motor`; `task`, the loop with its limits; `kind`, a key of `CONTROLLERS`.
+    """
+    if kind in ZIEGLER_NICHOLS_CONTROLLERS:
+        return "Ziegler-Nichols", ziegler_nichols(motor, task.hardware, kind)
+    overshoot = min(float(task.max_overshoot), MAX_TEXTBOOK_OVERSHOOT)
+    poles = standard_poles(float(task.settling_scale), overshoot, CONTROLLERS[kind].integrates)
+    return "Ackermann", state_feedback(motor, poles, float(task.setpoint), float(task.hardware.sample_time))
 
 
 @double_precision
@@ -80,6 +96,24 @@ def ziegler_nichols(motor: Motor, hardware: Hardware | None, kind: str) -> PI | 
         setpoint_weight=1.0,
         tracking_time=integral_time,
     )
+
+
+def standard_poles(settling: float, overshoot: float, with_integral: bool = False) -> np.ndarray:
+    """The poles, rad/s, of a second-order system with this settling time and overshoot; and a real one as far from the
+    imaginary axis for integral action.
+
+    overshoot = exp(-pi zeta / sqrt(1 - zeta^2)),  settling = -ln(band sqrt(1 - zeta^2)) / (zeta omega)
+
+    **Arguments**: `settling`, s, to within the 2 % band; `overshoot`, %, between 0 and 100.
+
+    **Source**: Franklin, Powell, Emami-Naeini, "Feedback Control of Dynamic Systems" (2015), section 3.4.
+    """
+    log_overshoot = np.log(overshoot / 100)
+    damping = -log_overshoot / np.hypot(np.pi, log_overshoot)
+    decay = -np.log(BAND * np.sqrt(1 - damping**2)) / settling
+    frequency = decay * np.sqrt(1 - damping**2) / damping
+    pair = [complex(-decay, frequency), complex(-decay, -frequency)]
+    return np.array([*pair, -decay] if with_integral else pair)
 
 
 def ackermann(A: np.ndarray, B: np.ndarray, poles: Poles) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import attrs
@@ -17,10 +16,10 @@ from ..progress import ReportProgress, silent
 from ..runtime.compiled import free_memory_maps
 from ..runtime.precision import double_precision
 from ..runtime.threads import one_blas_thread
-from .classical import ZIEGLER_NICHOLS_CONTROLLERS, ziegler_nichols
+from .classical import textbook_controller
 from .controllers import AbstractController
 from .descent import STARTS, best_coordinates
-from .evaluation import EvaluatedController, Robustness, evaluate, evaluate_robustness, simulate_speeds, simulate_task
+from .evaluation import Robustness, evaluate, evaluate_robustness, simulate_speeds, simulate_task
 from .gains import GainSpace
 from .law import Law
 from .margins import margins
@@ -182,7 +181,8 @@ def _evaluated(
     validation_motors: Motor | None,
     seed: int,
 ) -> Tuning:
-    """The result: exact metrics of the tuned controller and of its textbook rivals."""
+    """The result: exact metrics of the tuned controller and of its textbook rival."""
+    rule, rival = textbook_controller(motor, task, requirements.controller)
     law = Law.of(controller, task.hardware, motor)
     return Tuning(
         law=law,
@@ -192,7 +192,7 @@ def _evaluated(
         margins=margins(motor, law),
         candidates=(
             evaluate("tuned", task, motor, controller, validation_motors),
-            *_textbook_candidates(task, motor, requirements.controller, validation_motors),
+            evaluate(rule, task, motor, rival, validation_motors),
         ),
         response=simulate_task(task, motor, law),
         validation_speeds=None
@@ -200,12 +200,3 @@ def _evaluated(
         else np.asarray(simulate_speeds(task, validation_motors, law)),
         seed=seed,
     )
-
-
-def _textbook_candidates(
-    task: Task, motor: Motor, kind: str, validation_motors: Motor | None
-) -> Iterator[EvaluatedController]:
-    """Controllers by textbook rules, for comparison."""
-    if kind in ZIEGLER_NICHOLS_CONTROLLERS:
-        controller = ziegler_nichols(motor, task.hardware, kind)
-        yield evaluate("Ziegler-Nichols", task, motor, controller, validation_motors)

@@ -27,7 +27,7 @@ class Tuning:
     task: Task
     requirements: LoopRequirements
     margins: Margins
-    candidates: tuple[EvaluatedController, ...]  # the tuned one first
+    candidates: tuple[EvaluatedController, ...]  # the tuned one, and that of a textbook rule
     response: Response = field(repr=False, converter=lambda r: Response(*map(np.asarray, r)))
     validation_speeds: np.ndarray | None = field(repr=False)  # (motors, samples) rad/s
     seed: int

@@ -52,4 +52,5 @@ def drift_sentence(diagnosis: Diagnosis) -> str:
     if not far:
         return f"No parameter determined by both fits changed by more than {MIN_DRIFT:g} %."
     drifted = enumerate_words([f"{one.name} by {drift_words(one)}" for one in far])
-    return f"Adding it changed {drifted}."
+    added = "it" if len(diagnosis.effects) == 1 else "them"
+    return f"Adding {added} changed {drifted}."
