@@ -13,7 +13,8 @@ from .plausibility import regress, speed_of
 MAX_SHIFT = 20  # samples, between channels
 SHIFTS = sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs)
 MAX_MISFIT_RATIO = 0.3  # a shift must leave less than this share of the misfit without one
-# Share of the misfit without a shift, or with one, below which that is clearly the better explanation of the speed
+# The mechanical equation tells whether a current was shifted alone or with the speed, where its misfit for one of both
+# is less than this share of that for the other
 CLEARLY_BETTER = 0.5
 MIN_MISFIT = 0.01  # relative, below which no shift is needed
 ABOUT_THE_LEAST = 1.5  # the smallest shift is taken whose misfit is within this factor of the least

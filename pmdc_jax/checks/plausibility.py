@@ -170,11 +170,9 @@ def implausible_units(runs: Sequence[Recording]) -> Iterator[Finding]:
         yield Finding(names, "load", "warning", what, "all loaded runs", mend)
     if not Kt.positive:
         return
-    ratio = Kt.value / Kb.value
+    ratio, has_wrong_voltage = Kt.value / Kb.value, any(finding.column == "voltage" for finding in wrong)
     for scale, (column, unit, read) in KT_OVER_KB_IF_MISREAD.items():
-        if 1 / KT_OVER_KB_FACTOR < ratio / scale < KT_OVER_KB_FACTOR and not any(
-            finding.column == "voltage" for finding in wrong
-        ):
+        if 1 / KT_OVER_KB_FACTOR < ratio / scale < KT_OVER_KB_FACTOR and not has_wrong_voltage:
             what = f"Kt is {ratio:.3g} times Kb, as if the {column} were in {unit}, not {read}"
             mend = f"If so, write [{unit}] in the header, or use --column {column}=HEADER:{unit}"
             yield Finding(names, column, "warning", what, "all loaded runs", mend)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -117,6 +118,43 @@ def _when_read(
 
 # State of the motors, and their squared errors of current and speed so far
 Gathered = tuple[State, tuple[Scalars, ...]]
+# Current and speed
+Two = tuple[Scalars, Scalars] | Float[Array, "2 ..."]
+
+
+def _step_and_compare(
+    motors: Motor,
+    propagator: Propagator,
+    acting: Input,
+    gathered: Gathered,
+    measured: Two,
+    weight: Two,
+    block: Int[Array, ""],
+    over_last: Bool[Array, "blocks 2"] | None,
+    steps: int | Int[Array, ""] = 1,
+) -> Gathered:
+    """The state one sample later, and the errors with those at this sample added."""
+    state, errors = gathered
+    after, mean = held_step_and_mean(motors, propagator, acting, state, steps)
+    read = _when_read(motors, propagator, acting, state, steps)
+    simulated = _outputs_or_means(motors, read, mean, over_last, block)
+    return after, tuple(e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors))
+
+
+def _begun(tape: Tape, block: Int[Array, ""], initial: State, before: State) -> State:
+    """The state at the start of a block: the initial one of a run, or that at the end of the block before."""
+    begins = tape.begins[block]
+    return jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, before)
+
+
+def _sums_over_blocks(
+    motors: Motor, tape: Tape, advance: Callable[[Carry, Int[Array, ""]], Carry], none: Scalars
+) -> list[Float[Array, "..."]]:
+    """The errors of current and speed, from `none` on, after all blocks."""
+    zero = jnp.zeros_like(motors.R)
+    start = Carry(motors.initial_state(zero, zero), (none, none))
+    errors = take_steps(StepSolver(advance), start, tape.value.shape[0], diffrax.SaveAt(t1=True)).output
+    return [e[0] for e in errors]
 
 
 class Stride(NamedTuple):
@@ -173,9 +211,7 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
         _, drive = pick_grid(grids, tape, grid)
         propagator = jax.tree.map(lambda leaf: _repeat_rows(_pick(leaf, grid), rows), grids)
         samples = (tape.value[block], tape.load[block], measured[block], weights[block])
-        initial = motors.initial_state(*tape.initial[tape.run[block]])
-        begins = tape.begins[block]
-        state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
+        state = _begun(tape, block, motors.initial_state(*tape.initial[tape.run[block]]), carry.state)
         stride = jax.tree.map(lambda leaf: leaf[grid], strides)
         end, starts = _stride_starts(stride, state, *samples[:2])
         # the samples of a stride along the first axis, then a row for each stride
@@ -190,25 +226,16 @@ def _errors_of_linear(motors: Motor, tape: Tape) -> Errors:
                 Float[Array, "2 strides 1"],
             ],
         ) -> tuple[Gathered, None]:
-            state, errors = carry
             value, load, measured, weight = samples
             acting = Input(drive, value, load)
-            after, mean = held_step_and_mean(motors, propagator, acting, state)
-            read = _when_read(motors, propagator, acting, state)
-            simulated = _outputs_or_means(motors, read, mean, over_last, block)
-            errors = tuple(e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors))
-            return (after, errors), None
+            return _step_and_compare(motors, propagator, acting, carry, measured, weight, block, over_last), None
 
         (_, errors), _ = jax.lax.scan(sample, (starts, carry.output), by_sample, unroll=STRIDE)
         return Carry(end, errors)
 
-    zero = jnp.zeros_like(motors.R)
-    nothing = jnp.zeros((rows, len(zero)))
-    start = Carry(motors.initial_state(zero, zero), (nothing, nothing))
-    saveat = diffrax.SaveAt(t1=True)
-    errors = take_steps(StepSolver(advance), start, tape.value.shape[0], saveat).output
+    errors = _sums_over_blocks(motors, tape, advance, jnp.zeros((rows, len(motors.R))))
     # rows are summed only here: XLA would fuse the sum into the arithmetic, which would lose its vector instructions
-    current, speed = (e[0].sum(0) for e in errors)
+    current, speed = (e.sum(0) for e in errors)
     return _infinite_if_failed(current), _infinite_if_failed(speed)
 
 
@@ -243,7 +270,6 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
             carry: Gathered,
             samples: tuple[Float[Array, ""], Float[Array, ""], Float[Array, "2"], Float[Array, "2"], Int[Array, ""]],
         ) -> tuple[Gathered, None]:
-            state, errors = carry
             value, load, measured, weight, k = samples
             if delay is not None:  # what is seen later is compared with what was measured later
                 late = k + jnp.round(delay / tape.sample_time[tape.grid[block]]).astype(int)
@@ -252,17 +278,12 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
                 measured = (measured[0], speeds[late])
                 weight = (weight[0], jnp.where(inside, speed_weights[late], 0.0))
             acting = Input(drive, value, load)
-            after, mean = held_step_and_mean(motors, propagator, acting, state, steps)
-            read = _when_read(motors, propagator, acting, state, steps)
-            simulated = _outputs_or_means(motors, read, mean, over_last, block)
-            errors = tuple(e + weight[c] * (simulated[c] - measured[c]) ** 2 for c, e in enumerate(errors))
-            return (after, errors), None
+            return _step_and_compare(motors, propagator, acting, carry, measured, weight, block, over_last, steps), None
 
         run = tape.run[block]
         current, speed = tape.initial[run]
         initial = motors.initial_state(current, speed, tape.load[block, 0], tape.angle[run])
-        begins = tape.begins[block]
-        state = jax.tree.map(lambda new, old: jnp.where(begins, new, old), initial, carry.state)
+        state = _begun(tape, block, initial, carry.state)
         samples = (
             tape.value[block],
             tape.load[block],
@@ -273,8 +294,5 @@ def _errors_with_effects(motors: Motor, tape: Tape) -> Errors:
         (state, errors), _ = jax.lax.scan(sample, (state, carry.output), samples)
         return Carry(state, errors)
 
-    zero = jnp.zeros_like(motors.R)
-    start = Carry(motors.initial_state(zero, zero), (zero, zero))
-    saveat = diffrax.SaveAt(t1=True)
-    errors = take_steps(StepSolver(advance), start, tape.value.shape[0], saveat).output
-    return _infinite_if_failed(errors[0][0]), _infinite_if_failed(errors[1][0])
+    current, speed = _sums_over_blocks(motors, tape, advance, jnp.zeros_like(motors.R))
+    return _infinite_if_failed(current), _infinite_if_failed(speed)
