@@ -23,7 +23,7 @@ MIN_JUMP_RATIO, MIN_JUMP_SHARE = 3.0, 0.05
 # Decays of a current over a sample, as exponents, beyond which nothing changes
 DECAYS = 1e-3, 200.0
 
-Values = Float[Array | np.ndarray, "*shape"]
+Values = Float[Array | np.ndarray, "*#shape"]
 # Mean of the drive over each sample, V, A or N m, and the change over it of the straight line in its place
 MeanAndRise = tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]
 
