@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeGuard
 import numpy as np
 
 from ...effects import EFFECTS
+from ...identify.corrections.initial_temperature import with_initial_temperatures
 from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.noise.noise_model import Whitener
 from ...identify.solve import Solved
@@ -24,7 +25,7 @@ from ..evidence.screen import screen, share_beyond
 from ..evidence.signals import Screen, signals
 from ..hypotheses.effect_relations import are_rivals
 from ..hypotheses.library import Library
-from ..model import MAX_EFFECTS, Model, final_fit
+from ..model import MAX_EFFECTS, Model, final_fit, model_of
 from .compare import BIC_MARGIN, DECISIVE_RATIO, Comparison, Fitted, simplest_equivalent
 from .elimination import BackwardElimination
 from .proposals import Proposals, Proposed
@@ -84,7 +85,7 @@ class StepwiseSelection:
         current = self.base
         self.superseded.add(current)
         while better := self._step(current):
-            current = better
+            current = self._with_warm_runs(better)
             self.superseded.add(current)
         others = self.proposals.by_swap(current, self.equivalents)
         # even if little is left: what backlash leaves is small beside what a large effect explains
@@ -111,6 +112,15 @@ class StepwiseSelection:
             explained = base.squares - fitted.squares
         explained_unfiltered = self.base.fit.fitness - model.fit.fitness
         return Assessment(evidence, candidate_signals, curve_signals, p_value, explained, explained_unfiltered)
+
+    def _with_warm_runs(self, model: Model) -> Model:
+        """The model with runs that begin with a warm winding, if that is clearly likelier: other effects would seem to
+        be missing from a model in which all begin cold."""
+        warm = with_initial_temperatures(model.fitted)
+        if warm.prepared is model.prepared:
+            return model
+        self.superseded.add(model)
+        return self.refits.replace(model_of(model.effects, *warm))
 
     def _step(self, current: Model) -> Model | None:
         """The next model: of several kinds of proposals the first that is better and accepted; None if there is none.

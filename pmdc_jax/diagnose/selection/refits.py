@@ -151,6 +151,11 @@ class Refits:
         prepared = prepared.with_problem(free=free)
         return refit_from(effects, prepared, start, white, useful)
 
+    def replace(self, model: Model) -> Model:
+        """Store a model in place of the fit of its effects, and return it."""
+        self.models[frozenset(model.effects)] = model
+        return model
+
     def without(self, model: Model, effect: str, white: Whitener) -> Model:
         """The model without one of its effects."""
         return self.without_each(model, [effect], white)[0]

@@ -19,9 +19,9 @@ MAX_STDERR = 0.02
 
 def with_initial_temperatures(cold: FittedRuns) -> FittedRuns:
     """The runs with the initial rise of the resistance fitted in all but the coolest one, and the fit to them; both
-    unchanged unless that is clearly likelier than that all begin cold."""
+    unchanged unless that is clearly likelier than that all begin cold, or if it is fitted already."""
     informative = _informative_runs(cold.problem, cold.fit)
-    if len(informative) < 2:
+    if len(informative) < 2 or np.any(np.asarray(cold.problem.begins_warm)[informative]):
         return cold
     coolest = int(informative[0])
     warm = _with_cold_run(cold.prepared, cold.fit.optimum, informative, coolest)
