@@ -37,7 +37,9 @@ REFIT_ONLY = {simple: f.effect for simple, f in FULLER.items() if f.effect not i
 MAX_DETUNING = 0.05
 # The clearest gain left, over what the effects explain, below which nothing more is worth a trial
 NEGLIGIBLE = 2e-3
-# The same for models with a refit-only form, whose fit is never exact because when teeth meet is unpredictable
+# The same below which no recording is exact enough to tell anything: a hundredth of the effects, as amplitudes
+INEXACT = 1e-4
+# The first for models with a refit-only form, whose fit is never exact because when teeth meet is unpredictable
 NEGLIGIBLE_REFIT_ONLY = 1e-2
 
 
@@ -158,9 +160,11 @@ class Assessment(NamedTuple):
         model's, so that these cannot have left it.
 
         Never beside a refit-only form: what gear teeth leave, which meet at unpredictable times, can look like any
-        effect.
+        effect; nor if so little is left (`INEXACT`).
         """
         if _has_refit_only(model) or self.p_value >= FALSE_ALARM or self.best_candidate_share < EFFECT_SHARE:
+            return False
+        if self.unexplained < INEXACT:
             return False
         best_curve = max(self.curve_signals, key=attrgetter("gain"))
         best = max(self.candidate_signals, key=attrgetter("gain")).candidate
