@@ -33,7 +33,7 @@ from pmdc_jax.diagnose.hypotheses.trials import TRIALS
 from pmdc_jax.diagnose.judgement import implausible_effect, may_be_absent
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
 from pmdc_jax.diagnose.response import path_of, respond, sensor_changes, state_increments
-from pmdc_jax.diagnose.selection import proposals
+from pmdc_jax.diagnose.selection import naming, proposals
 from pmdc_jax.diagnose.selection.compare import Fitted
 from pmdc_jax.diagnose.selection.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.selection.proposals import Proposals
@@ -41,6 +41,7 @@ from pmdc_jax.diagnose.selection.refits import Refits
 from pmdc_jax.diagnose.selection.shortlist import most_promising, shortlist
 from pmdc_jax.diagnose.selection.starts import Starts, common_phase
 from pmdc_jax.effects import EFFECTS, ShaftCompliance
+from pmdc_jax.identify.fit.fitted_runs import FittedRuns
 from pmdc_jax.identify.fit.polish import fit_at
 from pmdc_jax.identify.fit.refine import Optimum
 from pmdc_jax.identify.identification import Estimate, Identification
@@ -137,6 +138,7 @@ class UndecidedSelection(StepwiseSelection):
         return [self.other if current is self.one else self.one]
 
     _best = staticmethod(lambda tried, white: tried[0])
+    _with_warm_runs = staticmethod(lambda model: model)
     elimination = Mock(reduced=lambda model: model)
     _is_genuine_improvement = staticmethod(lambda *models: True)
     _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))
@@ -146,6 +148,18 @@ def test_the_selection_does_not_return_to_a_superseded_model():
     selection = UndecidedSelection()
     assert selection.name().chosen is selection.other
     assert selection.trials == 3
+
+
+def test_a_model_with_warm_runs_takes_the_place_of_one_in_which_all_begin_cold(monkeypatch):
+    selection, warm = UndecidedSelection(), Mock(spec=Model, effects=("resistance_heating",))
+    cold = Mock(spec=Model, effects=("resistance_heating",), fitted=Mock(prepared="cold"), prepared="cold")
+    selection.refits = Mock(spec=Refits, replace=lambda model: model)
+    monkeypatch.setattr(naming, "with_initial_temperatures", lambda fitted: FittedRuns("warm", "fit"))
+    monkeypatch.setattr(naming, "model_of", lambda effects, prepared, fit: warm if prepared == "warm" else None)
+    assert StepwiseSelection._with_warm_runs(selection, cold) is warm
+    assert cold in selection.superseded
+    monkeypatch.setattr(naming, "with_initial_temperatures", lambda fitted: fitted)
+    assert StepwiseSelection._with_warm_runs(selection, cold) is cold
 
 
 def test_a_correction_of_a_formula_does_not_hide_an_effect_found_without_a_filter():
