@@ -440,7 +440,7 @@ def test_the_textbook_controller_settles(kind, rule):
     assert name == rule
     assert isinstance(controller, CONTROLLERS[kind])
     found = evaluate(name, task, motor, controller, None)
-    assert found.stable
+    assert found.margins.stable
     assert 1.0 < found.metrics["SettlingTime"] / float(task.fastest_settling) < 2.5
 
 

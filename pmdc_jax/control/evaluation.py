@@ -17,7 +17,7 @@ from ..runtime.compiled import compiled
 from .controllers import AbstractController
 from .law import Law, SampledMotor
 from .loop import Response, closed_loop
-from .margins import margins
+from .margins import Margins, margins
 from .metrics import LoadMetrics, StepMetrics, load_metrics, step_metrics
 from .objective import SECOND_SETPOINT, Score, Task, exact_score
 
@@ -48,7 +48,8 @@ class EvaluatedController:
     second_step: Mapping[str, float | None]  # of the step from the set point to half of it
     small_step: Mapping[str, float | None]  # of a step to 5 % of the set point
     robust: Robustness | None
-    stable: bool
+    margins: Margins
+    response: Response = field(repr=False, converter=lambda r: Response(*map(np.asarray, r)))  # over the whole course
 
 
 def evaluate(
@@ -67,7 +68,8 @@ def evaluate(
         second_step=_finite_or_none(step_metrics(*second, SECOND_SETPOINT * task.setpoint, task.setpoint)),
         small_step=_finite_or_none(_small_step_metrics(task, motor, law)),
         robust=None if validation_motors is None else evaluate_robustness(task, motor, controller, validation_motors),
-        stable=margins(motor, law).stable,
+        margins=margins(motor, law),
+        response=response,
     )
 
 

@@ -19,10 +19,9 @@ from ..runtime.threads import one_blas_thread
 from .classical import textbook_controller
 from .controllers import AbstractController
 from .descent import STARTS, best_coordinates
-from .evaluation import Robustness, evaluate, evaluate_robustness, simulate_speeds, simulate_task
+from .evaluation import Robustness, evaluate, evaluate_robustness, simulate_speeds
 from .gains import GainSpace
 from .law import Law
-from .margins import margins
 from .objective import Task
 from .remarks import remarks
 from .specification import MAX_SENSITIVITY, LoopRequirements
@@ -189,12 +188,10 @@ def _evaluated(
         motor=motor,
         task=task,
         requirements=requirements,
-        margins=margins(motor, law),
         candidates=(
             evaluate("tuned", task, motor, controller, validation_motors),
             evaluate(rule, task, motor, rival, validation_motors),
         ),
-        response=simulate_task(task, motor, law),
         validation_speeds=None
         if validation_motors is None
         else np.asarray(simulate_speeds(task, validation_motors, law)),

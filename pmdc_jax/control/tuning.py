@@ -26,9 +26,7 @@ class Tuning:
     motor: Motor
     task: Task
     requirements: LoopRequirements
-    margins: Margins
     candidates: tuple[EvaluatedController, ...]  # the tuned one, and that of a textbook rule
-    response: Response = field(repr=False, converter=lambda r: Response(*map(np.asarray, r)))
     validation_speeds: np.ndarray | None = field(repr=False)  # (motors, samples) rad/s
     seed: int
     seconds: Mapping[str, float] = field(factory=dict)
@@ -38,6 +36,16 @@ class Tuning:
     def metrics(self) -> Mapping[str, float | None]:
         """Metrics of the step, on the nominal motor."""
         return self.candidates[0].metrics
+
+    @property
+    def margins(self) -> Margins:
+        """Margins of the loop."""
+        return self.candidates[0].margins
+
+    @property
+    def response(self) -> Response:
+        """The response over the whole course, on the nominal motor."""
+        return self.candidates[0].response
 
     @property
     def load(self) -> Mapping[str, float | None]:

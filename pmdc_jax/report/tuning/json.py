@@ -45,7 +45,7 @@ def _candidate_json(one: EvaluatedController) -> dict[str, Any]:
         "gains": gains_of(one.controller),
         "metrics": one.metrics,
         "robust": _robust_json(one.robust),
-        "stable": one.stable,
+        "stable": one.margins.stable,
     }
 
 
