@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from ...identify.corrections.electrical_equation import MIN_FLOW
 from ...identify.fit.generalised_least_squares import residuals_of, series_of
 from ...identify.noise.noise_model import Series
-from ...identify.noise.sensor_noise import noise_of_sensor, rms, white_noise
+from ...identify.noise.sensor_noise import noise_of_sensor, white_noise
 from ...motor import Motor
 from ...recordings.recording import OVER_LAST
 from ...simulate.exponential import scalar_phi
@@ -108,10 +108,11 @@ def electrical_misfit(model: Model) -> float:
     if model.is_exact:
         return 1.0
     series = residuals_of(model.prepared, model.fit)
+    size = float(model.prepared.problem.measured_rms[0])
     balances = [
         balance
         for run, residual in zip(model.training, series, strict=True)
-        if (balance := _balance(model, run, residual)) is not None
+        if (balance := _balance(model, run, residual, size)) is not None
     ]
     if not balances:
         return 1.0
@@ -143,8 +144,11 @@ def _covariance_beyond_chance(residuals: Float[np.ndarray, " samples"], even_clo
     return float(max(0.0, *np.subtract(means, chance)))
 
 
-def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
-    """The measured steps of a run; None if they are too few, a signal was not recorded, or the current is a mean."""
+def _balance(model: Model, run: int, residual: Series, size: float) -> _Balance | None:
+    """The measured steps of a run; None if they are too few, a signal was not recorded, or the current is a mean.
+
+    **Arguments**: `size`, the root mean square of the current in all runs, A.
+    """
     prepared, tape = model.prepared, model.prepared.problem.tape
     drive, known, residuals = tape.drive_of(run), residual.known, residual.values
     recorded = prepared.runs[run]
@@ -166,7 +170,7 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     is_mean = recorded.averaging == OVER_LAST
     voltage = _voltage_between_readings(model, run, len(known))[pairs]
 
-    shapes = brushes * _shapes(measured[:, 0])
+    shapes = brushes * _shapes(measured[:, 0], size)
     opposing = np.stack([shapes[:-1], shapes[1:]], 1)[pairs]
 
     def steps(signals: Float[np.ndarray, "samples 2"]) -> _SampleIntervals:
@@ -186,11 +190,11 @@ def _balance(model: Model, run: int, residual: Series) -> _Balance | None:
     return _Balance(steps(measured), reached, noise, even_clock)
 
 
-def _shapes(current: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "samples shapes"]:
-    """Shapes of which the drop of the brushes may be made up: constant, and less so below each of the `ONSETS`."""
-    onsets, size = np.array(ONSETS) * max(rms(current), 1e-300), np.abs(current)[:, None]
-    gradual = np.exp(-size / onsets)
-    return np.sign(current)[:, None] * np.hstack([np.ones_like(size), gradual])
+def _shapes(current: Float[np.ndarray, " samples"], size: float) -> Float[np.ndarray, "samples shapes"]:
+    """Shapes of which the drop of the brushes may be made up: constant, and less so below each of the `ONSETS`, in
+    units of `size`, A."""
+    gradual = np.exp(-np.abs(current)[:, None] / (np.array(ONSETS) * max(size, 1e-300)))
+    return np.sign(current)[:, None] * np.hstack([np.ones((len(current), 1)), gradual])
 
 
 def _voltage_between_readings(model: Model, run: int, length: int) -> Float[np.ndarray, "steps 2"]:
