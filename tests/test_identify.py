@@ -34,7 +34,7 @@ from pmdc_jax.identify.fit.refine import Optimum, refine
 from pmdc_jax.identify.fit.run_unknowns import fit_run_unknowns
 from pmdc_jax.identify.identification import CONVERGED_DISTANCE, Identification
 from pmdc_jax.identify.noise.noise_model import fit_whitener
-from pmdc_jax.identify.noise.sensor_noise import common_divisor, is_coarse, quantum, white_noise
+from pmdc_jax.identify.noise.sensor_noise import is_coarse, noise_of_sensor, white_noise
 from pmdc_jax.identify.noise.whitening import Whitening
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.prepare import prepare
@@ -49,6 +49,7 @@ from pmdc_jax.identify.uncertainty.covariance import information, long_run_varia
 from pmdc_jax.motor import PARAMETERS
 from pmdc_jax.motor_file import Uncertainty
 from pmdc_jax.recordings.recording import Recording
+from pmdc_jax.recordings.resolution import common_divisor, quantum
 from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, free_run, sensitivities
 
 PAPER = vb.paper_motor()
@@ -940,6 +941,15 @@ def test_an_interval_is_wider_if_few_moments_determine_the_parameter():
         covered.append(error < info.interval_factor[0] * spread)
         naive.append(error < 1.96 / np.sqrt((jacobian[..., 0] ** 2).sum()))
     assert np.mean(naive) < 0.3 and np.mean(covered) > 0.85, (np.mean(naive), np.mean(covered))
+
+
+def test_a_rotor_at_rest_does_not_hide_the_noise_of_its_speed():
+    """Measured and simulated speed are exactly zero for most of the run."""
+    rng = np.random.default_rng(4)
+    residual = np.append(0.2 * rng.standard_normal(1000), np.zeros(4000))
+    measured = np.append(50.0 + residual[:1000], np.zeros(4000))
+    assert noise_of_sensor(measured, residual) == pytest.approx(0.2, rel=0.1)
+    assert noise_of_sensor(0 * measured, 0 * residual) == 0
 
 
 def test_white_noise_does_not_widen_intervals():

@@ -124,3 +124,25 @@ def test_a_quantised_speed_that_dwells_at_its_maximum_is_not_clipped(seed):
     assert without_unmeasured([run])[0] is run
     clipped = attrs.evolve(run, speed=np.minimum(counts, 105.0))
     assert any("looks clipped" in note.what for note in without_unmeasured([clipped])[0].notes)
+
+
+@pytest.mark.parametrize("last_code", [-512, 511, 2047, 4095])
+def test_the_last_code_of_a_converter_is_missing_even_if_it_is_reached_once(last_code):
+    run = noisy_steps()
+    step = 1.01 * np.abs(run.current).max() / abs(last_code)
+    current = step * np.clip(np.round(run.current / step), -abs(last_code), abs(last_code))
+    assert without_unmeasured([attrs.evolve(run, current=current)])[0].current is current
+    current[1234] = step * last_code
+    (cleaned,) = without_unmeasured([attrs.evolve(run, current=np.round(current, 6))])
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(cleaned.current)), [1234])
+    current[1234] = step * (last_code - np.sign(last_code))  # one less
+    assert not np.isnan(without_unmeasured([attrs.evolve(run, current=current)])[0].current).any()
+
+
+def test_a_speed_by_the_time_between_edges_that_dwells_at_its_maximum_is_not_clipped():
+    """It is a whole number of ticks, so that its resolution is coarse only at high speed."""
+    run, rng = noisy_steps(), np.random.default_rng(7)
+    exact = 4.008 * lfilter([0.05], [1, -0.95], 5 * run.voltage) + 0.09 * rng.standard_normal(len(run))
+    ticks = 16e6 * 2 * np.pi / 360 / np.maximum(np.abs(exact), 1.0)
+    speed = np.sign(exact) * 16e6 * 2 * np.pi / 360 / np.round(ticks)
+    assert without_unmeasured([attrs.evolve(run, speed=speed)])[0].notes == ()

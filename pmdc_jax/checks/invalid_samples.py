@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..recordings.recording import MAX_MISSING, Finding, Recording, place_of_sample
+from ..recordings.resolution import quantum
 from ..recordings.white_noise import noise_by_differences
 
 RANGE = "If the values are real, sample faster and with a larger measuring range"
@@ -29,6 +30,10 @@ CHANCE_OF_STAY = 1e-9
 CHANCE_OF_REPEATS, MIN_LEAP = 1e-6, 5.0
 # Largest probability assumed for a value to repeat the one before, with a resolution far coarser than the noise
 MAX_CHANCE_TO_REPEAT = 0.9
+# Part of the range that is next to an extreme, and the least number of values there
+NEAR, MIN_NEAR = 0.1, 30
+# Bits of magnitude of the coarsest converter, and by how much its last code may differ from a whole number
+MIN_BITS, LAST_CODE_TOLERANCE = 9, 0.1
 # Least number of equal values from a failed sensor, and the least jump after them, over the noise; at zero, where a
 # sensor may truly rest, before and after them, over the range of the signal
 MIN_FROZEN, MIN_JUMP, MIN_JUMP_AT_ZERO = 20, 10.0, 0.05
@@ -117,19 +122,33 @@ def _drive_is_steady(run: Recording) -> Bool[np.ndarray, " samples"]:
 
 def clipped_extremes(values: Float[np.ndarray, " samples"]) -> Iterator[tuple[float, int, int]]:
     """Extremes at which a noisy signal stays longer than by chance, with start and length of the longest stay; or to
-    which it leaps too often, to stay for only a few samples each."""
+    which it leaps too often, to stay for only a few samples each; or that are the last code of its converter."""
     if not _is_noisy(values):
         return
     ends = np.array([np.nanmax(values), np.nanmin(values)])
+    of_converter = _are_last_codes(ends, quantum(np.diff(values)))
     noise = noise_by_differences(3, values)
     repeats = np.array([_repeats_between_leaps(values, extreme, noise) for extreme in ends])
     if np.isclose(*np.abs(ends), rtol=1e-6):  # the two ends of one measuring range
         repeats[:] = repeats.sum()
-    leaps = _chance_to_repeat(values, noise) ** repeats < CHANCE_OF_REPEATS
-    for extreme, leaps_there in zip(ends, leaps, strict=True):
+    chances = np.array([_chance_to_repeat(_values_near(values, extreme), noise) for extreme in ends])
+    leaps = chances**repeats < CHANCE_OF_REPEATS
+    for extreme, leaps_there, is_last_code in zip(ends, leaps, of_converter, strict=True):
         start, length, expected = _longest_stay_at(values, extreme)
-        if length > expected or (leaps_there and length > 1):
+        if is_last_code or length > expected or (leaps_there and length > 1):
             yield float(extreme), start, length
+
+
+def _are_last_codes(ends: Float[np.ndarray, "2"], step: float) -> Bool[np.ndarray, "2"]:
+    """Whether extremes are the last codes of a converter with this step, such as 2047 and -2048 of one with 12 bits:
+    what is beyond them has the same codes."""
+    if not step:
+        return np.zeros(2, bool)
+    codes = ends / step
+    counts = np.round(codes) + (ends > 0)
+    powers = np.log2(np.maximum(np.abs(counts), 1.0))
+    whole = np.abs(codes - np.round(codes)) < LAST_CODE_TOLERANCE
+    return whole & (powers >= MIN_BITS) & (powers == np.round(powers))
 
 
 def _repeats_between_leaps(values: Float[np.ndarray, " samples"], extreme: float, noise: float) -> int:
@@ -141,10 +160,19 @@ def _repeats_between_leaps(values: Float[np.ndarray, " samples"], extreme: float
     return int(np.sum((ends - starts)[leaps > MIN_LEAP * noise]))
 
 
+def _values_near(values: Float[np.ndarray, " samples"], extreme: float) -> Float[np.ndarray, " near"]:
+    """The values in the part of the range next to an extreme, without the ends of the range; all those without if they
+    are few. The resolution of a speed from the time between two edges of an encoder depends on the speed."""
+    values = values[np.isfinite(values)]
+    inner = values[(values > values.min()) & (values < values.max())]
+    near = inner[np.abs(inner - extreme) < NEAR * np.ptp(values)]
+    return near if len(near) >= MIN_NEAR else inner
+
+
 def _chance_to_repeat(values: Float[np.ndarray, " samples"], noise: float) -> float:
     """Probability that a value repeats the one before where the signal is steady: Gaussian noise in steps of the
     sensor's resolution."""
-    resolution = np.min(np.diff(np.unique(values[np.isfinite(values)])))
+    resolution = np.min(np.diff(np.unique(values)), initial=np.inf)
     steady = resolution / max(2 * np.sqrt(np.pi) * noise, resolution)
     return min(steady, MAX_CHANCE_TO_REPEAT)
 
@@ -172,7 +200,7 @@ def _longest_stay_at(values: np.ndarray, extreme: float) -> tuple[int, int, floa
     longest = int(np.argmax(ends - starts))
     ends_of_range = (np.nanmin(values), np.nanmax(values))
     inner = values[~np.isin(values, ends_of_range) & np.isfinite(values)]
-    repeats = (np.count_nonzero(np.diff(inner) == 0) + 1) / len(inner)
+    repeats = max((np.count_nonzero(np.diff(x) == 0) + 1) / len(x) for x in (inner, _values_near(values, extreme)))
     expected = 1 + np.log(CHANCE_OF_STAY / len(values)) / np.log(min(repeats, 0.999))
     # a speed in encoder counts stays at one value whenever the motor turns steadily
     elsewhere = 2.0 * _second_longest_stay(inner[inner != 0])

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from ...identify.noise.sensor_noise import quantum
+from ...recordings.resolution import quantum
 from ..model import RunSeries
 
 # Simulated readings, each with the converter's steps at another offset

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 
 from ...effects import EFFECTS, AbstractEffect
-from ...identify.noise.sensor_noise import common_divisor, is_coarse, quantum
+from ...identify.noise.sensor_noise import is_coarse
 from ...motor import Motor
 from ...recordings.recording import Recording
+from ...recordings.resolution import common_divisor, quantum
 from ...runtime.compiled import quickly_compiled
 from ...runtime.threads import run_ahead
 from ...simulate import Tape, free_run

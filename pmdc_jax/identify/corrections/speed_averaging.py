@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ...recordings.recording import AROUND, OVER_BOTH, OVER_LAST, Averaging
+from ...recordings.resolution import quantum
 from ...simulate import Tape
 from ..fit.fitted_runs import FittedRuns
 from ..fit.gauss_newton import TOLERANCE
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
 from ..fit.polish import Fit
-from ..noise.sensor_noise import quantum
 from ..prepare import Prepared
 
 # Most lines of an encoder
