@@ -41,9 +41,11 @@ class BackwardElimination:
         for effect in model.effects:
             for simple in self._simpler_forms(effect):
                 [simpler] = self.refits.with_replacements(model, white, [(effect, simple)])
+                if simpler is None or not simpler.is_possible:
+                    continue
                 if self.is_new(simpler) and self._is_as_good(simpler, model):
                     return self.reduced(simpler)
-                pair = simpler and self._simple_form_with_another(simpler, model, effect)
+                pair = self._simple_form_with_another(simpler, model, effect)
                 if pair and self._is_far_better(pair, model, white):
                     return self.reduced(pair)
         return model
