@@ -86,10 +86,14 @@ class Model:
         return float(max(np.ptp(angle[:, tape.blocks_of(run)]) for run in self.training))
 
     @property
+    def at_bound(self) -> set[str]:
+        """The parameters that are held at their bounds."""
+        return {self.prepared.problem.parameters.names[k] for k in self.fit.at_bound}
+
+    @property
     def effects_at_end(self) -> set[str]:
         """The effects with a parameter that is held at its bound or `undetermined`."""
-        names = self.prepared.problem.parameters.names
-        at_end = {names[k] for k in self.fit.at_bound} | self.undetermined
+        at_end = self.at_bound | self.undetermined
         return {name.partition(".")[0] for name in at_end} & set(self.effects)
 
     @property

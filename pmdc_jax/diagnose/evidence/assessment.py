@@ -102,9 +102,9 @@ class Assessment(NamedTuple):
         """Whether what is left may be model-form error of the model's effects.
 
         Not if it is a larger part of the unfiltered misfit than they explain: the whitening filter has then absorbed
-        what is missing as noise.
+        what is missing as noise. Nor if viscous friction had to be negative for them to explain it.
         """
-        if not model.effects or self._unexplained_unfiltered(model) > 1:
+        if not model.effects or self._unexplained_unfiltered(model) > 1 or self._calls_for_negative_friction(model):
             return False
         if self.unexplained < MODEL_FORM_SHARE:
             return True
@@ -112,6 +112,13 @@ class Assessment(NamedTuple):
         own_curve = isinstance(clearest, Curve) and has_axes_of(model, clearest)
         within = self.unexplained < OWN_MODEL_FORM_SHARE
         return self._belongs_to(model) or bool(own_curve and within)
+
+    def _calls_for_negative_friction(self, model: Model) -> bool:
+        """Whether a torque over speed is left and viscous friction is at its bound, zero: the model's effects then
+        depend on the speed in another way than what is missing."""
+        clearest = self.clearest.term
+        over_speed = isinstance(clearest, Curve) and (clearest.equation, clearest.variable) == ("mechanical", "speed")
+        return over_speed and "f" in model.at_bound
 
     def is_sensor_error(self) -> bool:
         """Whether the clearest signal is an error of a sensor that no effect of the library has."""
