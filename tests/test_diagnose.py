@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 from benchmarks import virtual_bench as vb
 from experiments.bench import recording
 from pmdc_jax import Recording
-from pmdc_jax.diagnose.evidence.assessment import Assessment
+from pmdc_jax.diagnose.evidence.assessment import FALSE_ALARM, Assessment
 from pmdc_jax.diagnose.evidence.periodic import common_line, spectrum
 from pmdc_jax.diagnose.evidence.quantisation import ROUNDING_DRAWS, rounding_errors
 from pmdc_jax.diagnose.evidence.regression import Block, gather_evidence
@@ -27,6 +27,7 @@ from pmdc_jax.diagnose.evidence.signals import Screen, Signal, gain_common_to_wa
 from pmdc_jax.diagnose.experiment import difference_between
 from pmdc_jax.diagnose.hypotheses.candidates import Scales
 from pmdc_jax.diagnose.hypotheses.change import Change
+from pmdc_jax.diagnose.hypotheses.curves import Curve
 from pmdc_jax.diagnose.hypotheses.effect_relations import FULLER, are_rivals, is_simpler_form
 from pmdc_jax.diagnose.hypotheses.library import Library
 from pmdc_jax.diagnose.hypotheses.trials import TRIALS
@@ -138,7 +139,7 @@ class UndecidedSelection(StepwiseSelection):
         return [self.other if current is self.one else self.one]
 
     _best = staticmethod(lambda tried, white: tried[0])
-    _with_warm_runs = staticmethod(lambda model: model)
+    _with_warm_runs = _without_needless = staticmethod(lambda model: model)
     elimination = Mock(reduced=lambda model: model)
     _is_genuine_improvement = staticmethod(lambda *models: True)
     _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))
@@ -160,6 +161,35 @@ def test_a_model_with_warm_runs_takes_the_place_of_one_in_which_all_begin_cold(m
     assert cold in selection.superseded
     monkeypatch.setattr(naming, "with_initial_temperatures", lambda fitted: fitted)
     assert StepwiseSelection._with_warm_runs(selection, cold) is cold
+
+
+@pytest.mark.parametrize("genuine", [True, False])
+@pytest.mark.parametrize("p_value", [0.0, 1.0])
+def test_an_effect_that_only_led_to_a_better_optimum_is_not_kept(genuine, p_value):
+    """Torque ripple beside friction that sticks and slips: the fit without it, from where that with it ended, leaves
+    no more."""
+    selection = UndecidedSelection()
+    both, one, none = (Mock(spec=Model, is_possible=True, effects=e) for e in (("a", "b"), ("a",), ()))
+    selection.refits = Mock(spec=Refits, without_each=lambda model, effects, white: [none, one])
+    selection.comparison.filter_of = lambda model: "white"
+    selection.assess.return_value.p_value = p_value
+    selection._is_genuine_improvement = lambda smaller, model: genuine
+    needless = p_value < FALSE_ALARM and not genuine
+    assert StepwiseSelection._without_needless(selection, both) is (one if needless else both)
+    assert (both in selection.superseded) == needless
+
+
+@pytest.mark.parametrize("variable", ["speed", "current"])
+@pytest.mark.parametrize("at_bound", [set(), {"f"}])
+def test_effects_that_would_need_a_negative_viscous_friction_are_not_those_missing(variable, at_bound):
+    """An eddy-current brake, taken for Coulomb friction: its torque falls at high speed."""
+    curve = Curve("mechanical", variable, "N m", np.linspace(-1.0, 1.0, 5))
+    rest = Signal(1.0, -50.0, curve, Mock(spec=Block))
+    screen = Mock(spec=Screen)
+    screen.unfiltered.regress.side_effect = lambda blocks=(): Mock(squares=1.0 - 0.1 * bool(blocks))
+    found = Assessment(screen, [], [rest], 0.0, explained=20.0, explained_unfiltered=20.0)
+    model = Mock(spec=Model, effects=("coulomb_friction",), at_bound=at_bound, fit=Mock(fitness=1.0))
+    assert found.may_be_model_form_error(model) == (variable == "current" or not at_bound)
 
 
 def test_a_correction_of_a_formula_does_not_hide_an_effect_found_without_a_filter():

@@ -85,7 +85,7 @@ class StepwiseSelection:
         current = self.base
         self.superseded.add(current)
         while better := self._step(current):
-            current = self._with_warm_runs(better)
+            current = self._with_warm_runs(self._without_needless(better))
             self.superseded.add(current)
         others = self.proposals.by_swap(current, self.equivalents)
         # even if little is left: what backlash leaves is small beside what a large effect explains
@@ -121,6 +121,17 @@ class StepwiseSelection:
             return model
         self.superseded.add(model)
         return self.refits.replace(model_of(model.effects, *warm))
+
+    def _without_needless(self, model: Model) -> Model:
+        """The model just accepted, without an effect that would not be accepted beside the others as they are fitted
+        now: where a rotor sticks and slips, it may only have led them to a better optimum."""
+        if self.assess(model).p_value >= FALSE_ALARM:
+            return model
+        for smaller in self.refits.without_each(model, model.effects, self.comparison.filter_of(model)):
+            if smaller.effects and self._is_new(smaller) and not self._is_genuine_improvement(smaller, model):
+                self.superseded.add(model)
+                return smaller
+        return model
 
     def _step(self, current: Model) -> Model | None:
         """The next model: of several kinds of proposals the first that is better and accepted; None if there is none.
