@@ -22,7 +22,7 @@ from pmdc_jax.effects import EFFECTS
 from pmdc_jax.effects.sine import cosine, sine
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.motor import Motor
-from pmdc_jax.recordings.recording import OVER_BOTH, OVER_LAST, Averaging, Recording
+from pmdc_jax.recordings.recording import AROUND, OVER_BOTH, OVER_LAST, Averaging, Recording
 from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, free_run, sensitivities, squared_errors
 
 STARTS = ((5.0, 60.0), (-3.0, -8.0), (0.0, 0.0))  # current A, speed rad/s of each run
@@ -413,10 +413,11 @@ def mean_reference(name: str, run: Recording) -> np.ndarray:
     finely = {c: np.repeat(getattr(run, c), FINE_STEPS) for c in ("voltage", "load", "current", "speed")}
     fine = Recording("fine", step * np.arange(FINE_STEPS * len(run)), **finely)
     outputs = reference(name, fine)
-    integral = cumulative_trapezoid(outputs, dx=step, axis=0, initial=0.0)[::FINE_STEPS]
-    last = np.pad(np.diff(integral, axis=0) / run.sample_time, ((1, 0), (0, 0)))
-    means = last if run.averaging == OVER_LAST else (last + np.roll(last, -1, axis=0)) / 2
-    means[[0, -1] if run.averaging == OVER_BOTH else 0] = np.nan
+    integral = cumulative_trapezoid(outputs, dx=step, axis=0, initial=0.0)
+    ends = integral[FINE_STEPS // 2 if run.averaging == AROUND else 0 :: FINE_STEPS]
+    last = np.pad(np.diff(ends, axis=0) / run.sample_time, ((1, 0), (0, 0)))
+    means = (last + np.roll(last, -1, axis=0)) / 2 if run.averaging == OVER_BOTH else last
+    means[0 if run.averaging == OVER_LAST else [0, -1]] = np.nan
     means[:, 0] = means[:, 0] if run.current_averaged else np.nan
     return means
 
@@ -429,8 +430,9 @@ def mean_reference(name: str, run: Recording) -> np.ndarray:
     ],
 )
 def test_means_agree_with_an_independent_integrator(x64, name):
-    """Means over the last sample or two, as from encoder counts; at 2 ms, within which the acceleration changes."""
-    runs = averaged(recordings(2e-3), OVER_LAST, OVER_BOTH, OVER_LAST)
+    """Means over the last sample, over two or around each instant, as from encoder counts; at 2 ms, within which the
+    acceleration changes."""
+    runs = averaged(recordings(2e-3), OVER_LAST, OVER_BOTH, AROUND)
     expected = np.concatenate([mean_reference(name, run) for run in runs])
     found, sampled = (np.concatenate(simulated(with_effect(name), of)) for of in (runs, recordings(2e-3)))
     size = np.nanmax(np.abs(expected), axis=0)
@@ -619,7 +621,7 @@ def test_sensitivities_match_central_differences(x64, name):
     truth = PAPER | {f"{name}.{n}": x for n, x in CASES[name].values.items()}
     scales = zip(parameters.names, parameters.logarithmic, strict=True)
     at = np.array([np.log(truth[n]) if log else truth[n] for n, log in scales])
-    tape = Tape.from_recordings(averaged(RUNS, OVER_LAST, None, OVER_BOTH))
+    tape = Tape.from_recordings(averaged(RUNS, AROUND, None, OVER_BOTH))
     own = np.column_stack([tape.initial, np.full((tape.runs, 4), [0.01, 0.2, 0.02, 0.1])])
     # away from zero, where a dry element has no derivative
     own[2:, :2] = 1.0, 5.0

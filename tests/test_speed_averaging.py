@@ -12,8 +12,8 @@ from benchmarks.naming.plant import Plant, simulate
 from benchmarks.virtual_bench import prbs, staircase
 from pmdc_jax import diagnose, identify
 from pmdc_jax.identify.corrections.speed_averaging import _in_counts, averaging_of_counts, averaging_of_differences
-from pmdc_jax.identify.noise.sensor_noise import quantum
-from pmdc_jax.recordings.recording import OVER_BOTH, OVER_LAST, Recording
+from pmdc_jax.recordings.recording import AROUND, OVER_BOTH, OVER_LAST, Averaging, Recording
+from pmdc_jax.recordings.resolution import quantum
 
 # a motor that speeds up within a few samples
 FAST_MOTOR = {"R": 0.5, "L": 0.001, "Kb": 0.05, "Kt": 0.05, "J": 5e-5, "f": 1e-4}
@@ -80,6 +80,29 @@ def test_counts_around_the_instant_are_recognised_beside_a_hidden_effect():
     assert found.verdict == "named"
     assert [effect.name for effect in found.effects] == ["shaft_compliance"]
     assert [m for m in found.final.messages if "around each instant" in m]
+
+
+@pytest.mark.slow
+def test_coarse_counts_around_the_instant_are_no_missing_effect():
+    """They fit better as instantaneous speeds than as means over the last sample; taken for instantaneous, what is left
+    was a delay of the sensor."""
+    found = diagnose(recorded("counts around the instant", lines=1000, J=1.5e-4))
+    assert found.verdict == "none_detected"
+    assert [m for m in found.final.messages if "around each instant" in m]
+
+
+@pytest.mark.parametrize("averaging", [OVER_LAST, OVER_BOTH, AROUND, Averaging(0.25, 0.5), Averaging(1.0, 0.0, 0.3)])
+def test_the_mean_of_a_signal_that_is_linear_between_samples(averaging):
+    signal = np.random.default_rng(6).standard_normal(50)
+    fine = np.arange(49 * 1000) / 1000
+    total = np.append(0, np.cumsum(np.interp(fine + 5e-4, np.arange(50), signal))) / 1000
+    integral = CubicSpline(np.append(fine, 49.0), total)
+    at = np.arange(2, 47) + averaging.later
+    last, coming = integral(at) - integral(at - 1), integral(at + 1) - integral(at)
+    instant = np.interp(at, np.arange(50), signal)
+    expected = averaging.last * last + averaging.next * coming + (1 - averaging.last - averaging.next) * instant
+    np.testing.assert_allclose(averaging.applied_to(signal)[2:47], expected, atol=1e-6)
+    assert np.isnan(averaging.with_ends_missing(signal)[-1]) == (averaging != OVER_LAST)
 
 
 def runs_of_a_toy_motor() -> list[Recording]:

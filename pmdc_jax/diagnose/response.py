@@ -20,7 +20,7 @@ from ..effects.base import Scalars
 from ..motor import Motor
 from ..runtime.compiled import compiled
 from ..simulate import Tape
-from ..simulate.propagator import Propagator, grid_propagators, pick_grid, steps_in_sample
+from ..simulate.propagator import Instant, Propagator, grid_propagators, pick_grid, steps_in_sample
 from ..simulate.sensing import outputs, reported
 from ..simulate.solver import Input, held_step, held_step_and_mean
 
@@ -178,15 +178,14 @@ def _reported_response(
 
     **Arguments**: `increments`, each of which builds up evenly over its sample; `varies`, zero where an output is held.
     """
-    response = at_start
-    if propagator.reading is not None:
-        part, share = propagator.reading
-        response = (
-            jnp.einsum("ijsb,sjbc->sibc", part.transition, at_start) + jnp.asarray(share)[:, None, :, None] * increments
-        )
-        response = response * varies
-    if propagator.mean is None:
-        return response
+    reading, speed_seen = propagator.reading, propagator.speed_seen
+
+    def share_of(instant: Instant) -> Float[Array, "samples 1 blocks 1"]:
+        return jnp.asarray(instant.share)[:, None, :, None]
+
+    def at(instant: Instant) -> Float[Array, "samples 2 blocks columns"]:
+        by_start = jnp.einsum("ijsb,sjbc->sibc", instant.propagator.transition, at_start)
+        return (by_start + share_of(instant) * increments) * varies
 
     def mean(within: Propagator, share: Scalars | float) -> Float[Array, "samples 2 blocks columns"]:
         """Over a share of each sample."""
@@ -194,11 +193,16 @@ def _reported_response(
         by_start = jnp.einsum("ijsb,sjbc->sibc", within.mean.transition, at_start)
         return (by_start + share / 2 * increments) * varies
 
-    simulated = [response, mean(propagator, 1.0)]
-    if propagator.reading is not None:
-        part, share = propagator.reading
-        share = jnp.asarray(share)[:, None, :, None]
-        simulated.append((share * mean(part, share))[:, 1:])
+    simulated = [at_start if reading is None else at(reading)]  # in the order of `outputs`
+    if speed_seen is not None:
+        simulated.append(at(speed_seen)[:, 1:])
+    if propagator.mean is not None:
+        simulated.append(mean(propagator, 1.0))
+        if instant := speed_seen or reading:
+            share = share_of(instant)
+            simulated.append((share * mean(instant.propagator, share))[:, 1:])
+    if len(simulated) == 1:
+        return simulated[0]
     simulated = jnp.concatenate(simulated, 1)
     report = partial(_reported_samples_first, motor, tape)
     return jax.vmap(report, in_axes=-1, out_axes=-1)(simulated)

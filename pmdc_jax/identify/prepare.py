@@ -16,7 +16,7 @@ from ..checks.check import check
 from ..checks.invalid_samples import without_unmeasured
 from ..effects import AbstractEffect
 from ..errors import InputError
-from ..motor import PARAMETERS
+from ..motor import PARAMETERS, Drive
 from ..recordings.clock import evenly_stamped
 from ..recordings.recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
 from ..recordings.recording_file import Runs, named_apart, recordings_of, refuse_copies
@@ -53,7 +53,7 @@ class Prepared(NamedTuple):
         """The same runs with some fields of the problem replaced."""
         return self._replace(problem=replace(self.problem, **fields))
 
-    def with_tape(self, **fields: Array | None) -> Prepared:
+    def with_tape(self, **fields: Array | Drive | None) -> Prepared:
         """The same runs with some fields of the tape replaced."""
         return self.with_problem(tape=replace(self.problem.tape, **fields))
 

@@ -49,29 +49,35 @@ class Averaging(NamedTuple):
     """A recorded signal that is a mean over the neighbouring sample intervals, as a difference of angles is.
 
     **Fields**: `last` and `next`, the weights of the means over the previous and over the following interval; the rest
-    of the weight is that of the instantaneous signal.
+    of the weight is that of the instantaneous signal. `later`, by which share of a sample all this is later than the
+    instant of the sample.
     """
 
     last: float
     next: float
+    later: float = 0.0
 
     def with_ends_missing(self, signal: np.ndarray) -> np.ndarray:
         """`signal`, NaN at the ends whose averaging interval lies outside the record."""
         known = signal.copy()
         known[: 1 if self.last else 0] = np.nan
-        known[len(known) - 1 if self.next else len(known) :] = np.nan
+        known[len(known) - 1 if self.next or self.later else len(known) :] = np.nan
         return known
 
     def applied_to(self, signal: np.ndarray) -> np.ndarray:
         """What is recorded of a signal, (samples, ...), that is linear between samples."""
-        means = (signal[:-1] + signal[1:]) / 2
-        last, coming = np.concatenate([signal[:1], means]), np.concatenate([means, signal[-1:]])
-        return (1 - self.last - self.next) * signal + self.last * last + self.next * coming
+        change = np.diff(signal, axis=0, append=signal[-1:])
+        then = signal + self.later * change
+        until_then = self.later * (signal + then) / 2  # the integrals over the parts of each interval
+        from_then = signal + change / 2 - until_then
+        last = until_then + np.concatenate([(1 - self.later) * signal[:1], from_then[:-1]])
+        coming = np.concatenate([last[1:], signal[-1:]])
+        return (1 - self.last - self.next) * then + self.last * last + self.next * coming
 
 
 OVER_LAST, OVER_BOTH = Averaging(1.0, 0.0), Averaging(0.5, 0.5)
-# a mean from half a sample before each instant to half a sample after it hardly differs from the signal there
-AROUND = Averaging(0.0, 0.0)
+# from half a sample before each instant to half a sample after it
+AROUND = Averaging(1.0, 0.0, 0.5)
 
 
 def _samples(values: ArrayLike) -> np.ndarray:

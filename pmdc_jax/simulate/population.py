@@ -77,11 +77,13 @@ def _means_at_sample_start(tape: Tape) -> tuple[Samples, Samples, Bool[Array, "b
     """Measurements and weights, with means over the last sample moved to where that sample begins; and which currents
     and speeds of the blocks are such means, None if nothing of the tape is a mean.
 
-    A mean over the last sample and the next is centred already, and stays.
+    A mean around a sample is centred already, and stays.
     """
     if tape.averaging is None:
         return tape.measured, tape.weight, None
     over_last = (jnp.asarray(tape.averaging)[:, (2, 0)] == 1)[tape.run]
+    if tape.later is not None:
+        over_last &= jnp.stack([jnp.ones(tape.run.shape, bool), jnp.asarray(tape.later)[tape.grid] == 0], -1)
     # the mean from the last sample of a run on was not recorded
     last_of_run = jnp.append(jnp.asarray(tape.begins)[1:], True)
 

@@ -87,7 +87,8 @@ class Propagator(NamedTuple):
     # h (phi_2 - phi_1 / 2)(A h): effect of a drive's rise within a step, beyond that of its mean
     ramp: Matrix | None = None
     reading: Instant | None = None  # when the outputs are read, if not at the start of a sample
-    speed_seen: Instant | None = None  # when a delayed sensor sees the speed
+    # when a delayed sensor sees the speed, or the speed's mean ends, if not at a sample
+    speed_seen: Instant | None = None
     mean: MeanPropagator | None = None  # for a speed that is reported as a mean
 
 
@@ -190,7 +191,7 @@ def grid_propagators(motor: Motor, tape: Tape) -> Propagator:
     """The propagators of one step on every grid of the tape, stacked along the first axis."""
     steps, delay, reading = steps_in_sample(motor, tape), motor.speed_delay(), tape.reading
 
-    def of_grid(sample: Float[Array, ""], drive: Drive) -> Propagator:
+    def of_grid(sample: Float[Array, ""], drive: Drive, later: Float[Array, ""] | None) -> Propagator:
         options = (tape.rise is not None, tape.averaging is not None)
 
         def instant(share: Scalars) -> Instant:
@@ -200,12 +201,25 @@ def grid_propagators(motor: Motor, tape: Tape) -> Propagator:
         propagator = make_propagator(motor, sample / steps, drive, *options)
         if reading is not None:
             propagator = propagator._replace(reading=instant(reading))
-        if delay is not None:
-            behind = jnp.asarray(delay / sample - (0.0 if reading is None else reading))
+        if delay is not None or later is not None:
+            behind = samples_behind(delay, sample, reading, later)
             propagator = propagator._replace(speed_seen=instant(1 - (behind - jnp.floor(behind))))
         return propagator
 
-    return jax.vmap(of_grid)(*jax.tree.map(jnp.asarray, (tape.sample_time, tape.drive)))
+    return jax.vmap(of_grid)(*jax.tree.map(jnp.asarray, (tape.sample_time, tape.drive, tape.later)))
+
+
+def samples_behind(
+    delay: Scalars | None, sample_time: Scalars, reading: Scalars | None, later: Scalars | None
+) -> Scalars:
+    """How many samples before each one its speed was seen, or the mean of its speed ended; negative for after it.
+
+    **Arguments**: `delay` of the sensor, s; `sample_time`, s; `reading` and `later`, as of a `Tape`.
+    """
+    behind = 0.0 if delay is None else delay / sample_time
+    for ahead in (reading, later):
+        behind = behind if ahead is None else behind - ahead
+    return jnp.asarray(behind)
 
 
 def pick_grid(grids: Propagator, tape: Tape, grid: Int[Array | np.ndarray, "..."]) -> tuple[Propagator, Drive]:

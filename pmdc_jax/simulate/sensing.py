@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from ..effects.base import Scalars, State
 from ..motor import Motor
-from .propagator import Instant, Propagator
+from .propagator import Instant, Propagator, samples_behind
 from .solver import Input, held_step_and_mean
 from .tape import BLOCK, Tape
 
@@ -32,9 +32,9 @@ def outputs(
     """Current and speed when a sample is read, and the other values from which `reported` makes delayed or averaged
     ones.
 
-    With a delayed sensor: the speed at the instant it sees, between this sample and the next. With averaging: the mean
-    current and speed from this sample to the next, those of the `mean` state. With averaging and a speed that is seen
-    within a sample: also the part of its mean that comes from before that instant.
+    With a delayed sensor, or a mean that ends later: the speed at the instant it sees, between this sample and the
+    next. With averaging: the mean current and speed from this sample to the next, those of the `mean` state. With
+    averaging and a speed that is seen within a sample: also the part of its mean that comes from before that instant.
     """
     reading, speed_seen, part_mean = propagator.reading, propagator.speed_seen, None
     if reading is None:
@@ -78,13 +78,14 @@ def reported(
         return jnp.where(k < first, before, values[jnp.clip(k, 0, len(speed) - 1)])
 
     last, share = before, None
-    if delay is not None or reading is not None:
+    delayed = delay is not None or tape.later is not None
+    if delayed or reading is not None:
         sample_time = jnp.repeat(jnp.asarray(tape.sample_time)[tape.grid], BLOCK)
-        behind = (0.0 if delay is None else delay) / sample_time
-        behind -= 0.0 if reading is None else reading
+        later = None if tape.later is None else jnp.repeat(jnp.asarray(tape.later)[tape.grid], BLOCK)
+        behind = samples_behind(delay, sample_time, reading, later)
         last = before - jnp.floor(behind).astype(int)
         share = 1 - (behind - jnp.floor(behind))
-    if delay is not None:
+    if delayed:
         within, *others = others
         speed = sample(within, last, begun)
     if tape.averaging is not None:

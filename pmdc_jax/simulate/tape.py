@@ -62,6 +62,8 @@ class Tape(eqx.Module):
     # shares in the reported speed of its means over the last sample and over the next, and in the reported current of
     # its mean over the last sample, which is not combined with a `reading`; None if nothing is a mean
     averaging: Float[Samples, "runs 3"] | None = None
+    # by which share of a sample the speeds that are means are later than their samples; None if none is
+    later: Float[Samples, " grids"] | None = None
     # share of each sample, between 0 and 1, after which its outputs are read; None if they are read at its start
     reading: Float[Samples, ""] | None = None
 
@@ -85,7 +87,7 @@ class Tape(eqx.Module):
         rises = timing.first_order_hold or any(recording.resampled_from is not None for recording in recordings)
         averaged = any(r.averaging is not None or r.current_averaged for r in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
-        sample_times, drives, free = (np.array(each) for each in zip(*grids, strict=True))
+        sample_times, drives, free, later = (np.array(each) for each in zip(*grids, strict=True))
         empty_runs = _power_of_two(len(runs)) - len(runs)
 
         def of_runs(values: Iterable[float | Sequence[float]]) -> np.ndarray:
@@ -100,6 +102,7 @@ class Tape(eqx.Module):
             ),
             initial=of_runs(run.initial for run in runs),
             averaging=of_runs(map(_averaging_shares, recordings)) if averaged else None,
+            later=later if np.any(later) else None,
             load_unknown=of_runs(r.load is None and not unloaded and not r.held for r in recordings),
             angle=of_runs(_first(r.angle) for r in recordings),
             angle_known=of_runs(r.angle is not None for r in recordings),
@@ -167,8 +170,8 @@ class Tape(eqx.Module):
         return float(self.sample_time[self.grid_of(run)])
 
 
-# Sample time in s, what drives the motor, and whether the rotor is free
-Grid = tuple[float, str, bool]
+# Sample time in s, what drives the motor, whether the rotor is free, and `Averaging.later` of its speed
+Grid = tuple[float, str, bool, float]
 
 
 class _Run:
@@ -192,7 +195,8 @@ class _Run:
                 self.current = OVER_LAST.with_ends_missing(self.current)
         self.value, self.rise = mean_and_rise(recording, timing)
         # rounded: two runs of one clock must share a grid even if their time stamps differ in the last bits
-        self.grid: Grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held)
+        later = self.averaging.later if self.averaging else 0.0
+        self.grid: Grid = (float(f"{recording.sample_time:.9g}"), drive, not recording.held, later)
         self.initial = (_first(self.current), _first(self.speed))
 
     def turn(self) -> np.ndarray:
@@ -253,7 +257,7 @@ def _laid_in_blocks(
 
 
 def _averaging_shares(recording: Recording) -> tuple[float, float, float]:
-    last, coming = recording.averaging or (0.0, 0.0)
+    last, coming, _ = recording.averaging or (0.0, 0.0, 0.0)
     return last, coming, float(recording.current_averaged)
 
 

@@ -13,12 +13,13 @@ from ...identify.corrections.input_timing import negative_log_likelihood_within,
 from ...identify.corrections.speed_averaging import with_averaging
 from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN
+from ...identify.noise.noise_model import Whitener
 from ...identify.prepare import Prepared
-from ...identify.solve import Solved, polish_with_angle, solve
+from ...identify.solve import Solved, solve
 from ...progress import ReportProgress
-from ...recordings.recording import AROUND, OVER_LAST
+from ...recordings.recording import AROUND
 from ...simulate import ZERO_ORDER_HOLD, Timing
-from ..model import Model, model_of
+from ..model import Model, model_of, refit_from
 from .naming import Naming, StepwiseSelection
 
 # Difference of two leads, in samples, below which they are the same
@@ -39,8 +40,8 @@ def likeliest_attempt(prepared: Prepared, search: str, seed: int, report: Report
     runs that begin with a warm winding."""
     attempt = _of_likeliest_timing(prepared, search, seed, report)
     chosen = attempt.naming.chosen
-    over_last = chosen.effects and chosen.prepared.averaging == OVER_LAST
-    if over_last and with_averaging(chosen.fitted).prepared.averaging == AROUND:
+    averaging = chosen.prepared.averaging
+    if chosen.effects and averaging != AROUND and with_averaging(chosen.fitted).prepared.averaging == AROUND:
         around = prepared._replace(averaging=AROUND)
         attempt = _likelier(attempt, _of_likeliest_timing(around, search, seed, report))
         chosen = attempt.naming.chosen
@@ -73,7 +74,7 @@ def _of_likeliest_timing(prepared: Prepared, search: str, seed: int, report: Rep
         if only_current_is_late(chosen.fitted):
             return attempt(ZERO_ORDER_HOLD)
         solved, _ = identified(ZERO_ORDER_HOLD)
-        zero_order = _with_effects_of(chosen, solved.fitted.prepared)
+        zero_order = _with_effects_of(chosen, solved.fitted.prepared, first.selection.comparison.filter_of(chosen))
         gain = negative_log_likelihood_within(zero_order.fitted) - negative_log_likelihood_within(chosen.fitted)
         if not gain > MIN_LOG_LIKELIHOOD_GAIN:
             return attempt(ZERO_ORDER_HOLD)
@@ -90,10 +91,10 @@ def _named(solved: Solved, identifying: float, report: ReportProgress) -> Attemp
     return Attempt(solved, selection, selection.name(), identifying)
 
 
-def _with_effects_of(model: Model, prepared: Prepared) -> Model:
-    """The effects of a model fitted to runs with another timing."""
+def _with_effects_of(model: Model, prepared: Prepared, white: Whitener) -> Model:
+    """The effects of a model fitted to runs with another timing, as the model was: to whitened residuals."""
     prepared = prepared.with_effects([EFFECTS[effect] for effect in model.effects])
-    return model_of(model.effects, *polish_with_angle(prepared, model.fit.optimum))
+    return refit_from(model.effects, prepared, model.fit.optimum, white)
 
 
 def _likelier(*attempts: Attempt) -> Attempt:

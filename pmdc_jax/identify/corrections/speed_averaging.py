@@ -78,10 +78,12 @@ def with_averaging(fitted: FittedRuns) -> FittedRuns:
     if mean is None:
         return fitted
     inner = without_ends(prepared, SPEED)
+    instantaneous = FittedRuns(inner, fit)
     averaged = refitted(_with_speeds_averaged(inner, mean), fit)
     unlikeliness = negative_log_likelihood(averaged)
-    if not negative_log_likelihood(FittedRuns(inner, fit)) - unlikeliness > min_gain:
-        return fitted
+    if not negative_log_likelihood(instantaneous) - unlikeliness > min_gain:
+        around = _or_around(instantaneous) if counted and mean == OVER_LAST else instantaneous
+        return fitted if around is instantaneous else around
     if not counted:
         # a mean over the last and the next sample has no lag: a speed that fits better a sample earlier, or as a mean
         # over the last sample, is merely late
@@ -92,12 +94,12 @@ def with_averaging(fitted: FittedRuns) -> FittedRuns:
     return averaged
 
 
-def _or_around(over_last: FittedRuns) -> FittedRuns:
-    """The runs with their speeds treated as means around each instant, if these are clearly likelier than means over
-    the last sample and leave nothing but noise, and the fit to them; otherwise both unchanged."""
-    around = refitted(without_averaging(over_last.prepared)._replace(averaging=AROUND), over_last.fit)
-    gain = negative_log_likelihood(over_last) - negative_log_likelihood(around)
-    return around if gain > MIN_LOG_LIKELIHOOD_GAIN and leaves_only_noise(around) else over_last
+def _or_around(other: FittedRuns) -> FittedRuns:
+    """The runs with their speeds treated as means around each instant, if these are clearly likelier than as they are
+    treated now and leave nothing but noise, and the fit to them; otherwise both unchanged."""
+    around = refitted(_with_speeds_averaged(other.prepared, AROUND), other.fit)
+    gain = negative_log_likelihood(other) - negative_log_likelihood(around)
+    return around if gain > MIN_LOG_LIKELIHOOD_GAIN and leaves_only_noise(around) else other
 
 
 def without_averaging(prepared: Prepared) -> Prepared:
@@ -125,7 +127,8 @@ def _with_speeds_averaged(prepared: Prepared, averaging: Averaging | None) -> Pr
         for run, is_differentiated in zip(prepared.runs, prepared.differentiated, strict=True)
     ]
     laid = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, follow=True))
-    averaged = prepared.with_tape(averaging=laid.averaging, turn=laid.turn)
+    names = ("averaging", "later", "turn", "sample_time", "drive", "grid")  # the grids are those of each averaging
+    averaged = prepared.with_tape(**{name: getattr(laid, name) for name in names})
     return averaged._replace(runs=runs, averaging=averaging)
 
 
