@@ -87,7 +87,7 @@ def test_a_hidden_shaft_causes_no_electrical_misfit():
 @pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_brushes_whose_drop_sets_in_gradually_cause_no_electrical_misfit():
-    """With a drop of constant size it would be more than 3, and with an onset in proportion to each run's current."""
+    """With an onset in proportion to each run's current it would be 4.5."""
     small = {"R": 1.2, "L": 1.5e-3, "Kb": 0.022, "Kt": 0.022, "J": 8.4e-6, "f": 6e-6}
     plant, rng, runs = (Plant(**small, brush_V=0.85, brush_onset_A=0.12), np.random.default_rng(3), [])
     for name, volts in {"large": 10.0, "small": 2.5}.items():
