@@ -10,7 +10,7 @@ from typing import NamedTuple
 from ...effects import EFFECTS
 from ...identify.corrections.initial_temperature import with_initial_temperatures
 from ...identify.corrections.input_timing import negative_log_likelihood_within, only_current_is_late, other_timings
-from ...identify.corrections.speed_averaging import with_averaging
+from ...identify.corrections.speed_averaging import with_averaging, with_means
 from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN
 from ...identify.noise.noise_model import Whitener
@@ -42,7 +42,7 @@ def likeliest_attempt(prepared: Prepared, search: str, seed: int, report: Report
     chosen = attempt.naming.chosen
     averaging = chosen.prepared.averaging
     if chosen.effects and averaging != AROUND and with_averaging(chosen.fitted).prepared.averaging == AROUND:
-        around = prepared._replace(averaging=AROUND)
+        around = with_means(prepared, AROUND)
         attempt = _likelier(attempt, _of_likeliest_timing(around, search, seed, report))
         chosen = attempt.naming.chosen
     warm = with_initial_temperatures(chosen.fitted)

@@ -58,8 +58,14 @@ def with_evident_averaging(prepared: Prepared) -> Prepared:
     if prepared.averaging:
         return prepared
     mean, min_gain, _ = _averaging_by_noise(prepared)
-    sure = mean is not None and np.isneginf(min_gain)
-    return _with_speeds_averaged(without_ends(prepared, SPEED), mean) if sure else prepared
+    if mean is None or not np.isneginf(min_gain):
+        return prepared
+    return with_means(prepared, mean)
+
+
+def with_means(prepared: Prepared, averaging: Averaging) -> Prepared:
+    """The runs with their recorded speeds treated as such means, without those at their ends."""
+    return _with_speeds_averaged(without_ends(prepared, SPEED), averaging)
 
 
 def with_averaging(fitted: FittedRuns) -> FittedRuns:
