@@ -163,10 +163,15 @@ def _repeats_between_leaps(values: Float[np.ndarray, " samples"], extreme: float
 def _values_near(values: Float[np.ndarray, " samples"], extreme: float) -> Float[np.ndarray, " near"]:
     """The values in the part of the range next to an extreme, without the ends of the range; all those without if they
     are few. The resolution of a speed from the time between two edges of an encoder depends on the speed."""
-    values = values[np.isfinite(values)]
-    inner = values[(values > values.min()) & (values < values.max())]
-    near = inner[np.abs(inner - extreme) < NEAR * np.ptp(values)]
+    inner = _inside_range(values)
+    near = inner[np.abs(inner - extreme) < NEAR * np.ptp(values[np.isfinite(values)])]
     return near if len(near) >= MIN_NEAR else inner
+
+
+def _inside_range(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " inner"]:
+    """The values that are finite and not at an end of their range."""
+    values = values[np.isfinite(values)]
+    return values[(values > values.min()) & (values < values.max())]
 
 
 def _chance_to_repeat(values: Float[np.ndarray, " samples"], noise: float) -> float:
@@ -179,9 +184,8 @@ def _chance_to_repeat(values: Float[np.ndarray, " samples"], noise: float) -> fl
 
 def _is_noisy(values: np.ndarray) -> bool:
     """Whether the channel carries noise, unlike a simulation, whether in full precision or rounded to a few digits."""
-    values = values[np.isfinite(values)]
-    inner = values[(values > values.min()) & (values < values.max())]
-    if len(inner) < 100 or noise_by_differences(3, inner) < 1e-5 * np.ptp(values):
+    inner = _inside_range(values)
+    if len(inner) < 100 or noise_by_differences(3, inner) < 1e-5 * np.ptp(values[np.isfinite(values)]):
         return False
     third = np.diff(inner, 3)
     return bool(np.mean(third[1:] * third[:-1] < 0) > 0.5)  # 0.77 for white noise, 0 for motion
@@ -198,8 +202,7 @@ def _longest_stay_at(values: np.ndarray, extreme: float) -> tuple[int, int, floa
         return 0, 0, np.inf
     starts, ends = starts[later], ends[later]
     longest = int(np.argmax(ends - starts))
-    ends_of_range = (np.nanmin(values), np.nanmax(values))
-    inner = values[~np.isin(values, ends_of_range) & np.isfinite(values)]
+    inner = _inside_range(values)
     repeats = max((np.count_nonzero(np.diff(x) == 0) + 1) / len(x) for x in (inner, _values_near(values, extreme)))
     expected = 1 + np.log(CHANCE_OF_STAY / len(values)) / np.log(min(repeats, 0.999))
     # a speed in encoder counts stays at one value whenever the motor turns steadily
