@@ -146,3 +146,10 @@ def test_a_speed_by_the_time_between_edges_that_dwells_at_its_maximum_is_not_cli
     ticks = 16e6 * 2 * np.pi / 360 / np.maximum(np.abs(exact), 1.0)
     speed = np.sign(exact) * 16e6 * 2 * np.pi / 360 / np.round(ticks)
     assert without_unmeasured([attrs.evolve(run, speed=speed)])[0].notes == ()
+
+
+def test_a_signal_of_few_levels_is_judged_without_undefined_numbers():
+    """Next to its maximum there is only one other level, so that the resolution there is the distance between both."""
+    run = noisy_steps()
+    speed = 15.0 * np.round((run.speed + 9 * np.random.default_rng(8).standard_normal(len(run))) / 15)
+    assert without_unmeasured([attrs.evolve(run, speed=speed)])[0].notes == ()

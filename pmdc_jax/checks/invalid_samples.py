@@ -131,7 +131,7 @@ def clipped_extremes(values: Float[np.ndarray, " samples"]) -> Iterator[tuple[fl
     repeats = np.array([_repeats_between_leaps(values, extreme, noise) for extreme in ends])
     if np.isclose(*np.abs(ends), rtol=1e-6):  # the two ends of one measuring range
         repeats[:] = repeats.sum()
-    chances = np.array([_chance_to_repeat(_values_near(values, extreme), noise) for extreme in ends])
+    chances = np.array([_chance_to_repeat(np.append(_values_near(values, end), end), noise) for end in ends])
     leaps = chances**repeats < CHANCE_OF_REPEATS
     for extreme, leaps_there, is_last_code in zip(ends, leaps, of_converter, strict=True):
         start, length, expected = _longest_stay_at(values, extreme)
@@ -177,7 +177,7 @@ def _inside_range(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " 
 def _chance_to_repeat(values: Float[np.ndarray, " samples"], noise: float) -> float:
     """Probability that a value repeats the one before where the signal is steady: Gaussian noise in steps of the
     sensor's resolution."""
-    resolution = np.min(np.diff(np.unique(values)), initial=np.inf)
+    resolution = np.min(np.diff(np.unique(values)))
     steady = resolution / max(2 * np.sqrt(np.pi) * noise, resolution)
     return min(steady, MAX_CHANCE_TO_REPEAT)
 
