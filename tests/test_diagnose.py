@@ -19,7 +19,6 @@ from benchmarks import virtual_bench as vb
 from experiments.bench import recording
 from pmdc_jax import Recording
 from pmdc_jax.diagnose.evidence.assessment import FALSE_ALARM, Assessment
-from pmdc_jax.diagnose.evidence.periodic import common_line, spectrum
 from pmdc_jax.diagnose.evidence.quantisation import ROUNDING_DRAWS, rounding_errors
 from pmdc_jax.diagnose.evidence.regression import Block, gather_evidence
 from pmdc_jax.diagnose.evidence.rows import _batches
@@ -47,6 +46,7 @@ from pmdc_jax.identify.fit.polish import fit_at
 from pmdc_jax.identify.fit.refine import Optimum
 from pmdc_jax.identify.identification import Estimate, Identification
 from pmdc_jax.identify.noise.noise_model import Series, fit_whitener
+from pmdc_jax.identify.noise.spectral_lines import common_line, spectrum
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Unknowns
 from pmdc_jax.motor import PARAMETERS, Motor
@@ -254,6 +254,26 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
     assert better is (tried if leaves_little else None)
     [call] = refits.with_signals.call_args_list
     assert [signal.effect for signal in call.args[1]] == list(gains)[:2]
+
+
+@pytest.mark.parametrize(
+    ("of_others", "misfit", "searches"), [("coulomb_friction", 90.0, 1), ("quadratic_drag", 90.0, 0)]
+)
+def test_friction_is_searched_if_any_leading_effect_makes_the_rotor_stick(of_others, misfit, searches):
+    """Far from the motor with friction, saturation may fit better than friction does from there."""
+
+    def model(effects: tuple[str, ...], fitness: float) -> Mock:
+        problem = Mock(outputs=2)
+        fit = Mock(fitness=fitness)
+        return Mock(spec=Model, effects=effects, fit=fit, prepared=Mock(problem=problem), is_possible=True)
+
+    current, nearest = model((), 1000.0), model(("torque_constant_saturation",), 80.0)
+    nearest.effects_at_end = set()
+    searched = model(("coulomb_friction",), 3.0)
+    refits = Mock(spec=Refits, with_global_search=Mock(return_value=searched))
+    tried = [nearest, model((of_others,), misfit)]
+    found = Proposals(refits, Mock(), set())._searched_with_friction(current, tried)
+    assert found == [searched] * searches
 
 
 @pytest.mark.parametrize(("count", "p_value", "exchanges"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])

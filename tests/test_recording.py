@@ -167,7 +167,7 @@ def test_units_of_temperature_have_an_offset():
 @given(
     st.sampled_from(["{} [{}]", "{} ({})", "{}_{}", "{} / {}", "{} in {}"]),
     st.sampled_from(["speed", "Motor Speed", "OMEGA", "angular_velocity"]),
-    st.sampled_from([("rpm", RPM), ("deg/s", DEGREE), ("rad/s", 1.0), ("krpm", 1e3 * RPM)]),
+    st.sampled_from([("rpm", RPM), ("deg/s", DEGREE), ("rad/s", 1.0), ("krpm", 1e3 * RPM), ("kr/min", 1e3 * RPM)]),
 )
 @settings(max_examples=60, deadline=None)
 def test_units_are_understood_in_every_notation(pattern, name, unit):

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..recordings.angle import unwrapped
 from ..recordings.clock import GAP, is_evenly_sampled
+from ..recordings.readings import reading_interval
 from ..recordings.recording import Finding, Recording, place_of_sample
 from ..recordings.white_noise import noise_by_differences
 from .alignment import shifted_channels, slow_sampling
@@ -87,10 +88,14 @@ def _clock(run: Recording) -> tuple[float, float]:
 
 
 def missing_samples(run: Recording) -> Iterator[Finding]:
-    """Samples without a value."""
+    """Samples without a value, and sensors that are read more slowly than the log."""
     for quantity, values in run.columns().items():
         absent = np.isnan(values)
-        if absent.any():
+        every = reading_interval(~absent)
+        if every > 1:
+            what = f"its sensor is read only every {every} samples: what the log repeats in between is not used"
+            yield Finding(run.name, quantity, "note", what, "", "")
+        elif absent.any():
             yield Finding(
                 run.name,
                 quantity,

@@ -18,7 +18,7 @@ from scipy.signal import cont2discrete, lfilter, ss2tf
 from ..motor import Motor
 from ..recordings.recording import OVER_LAST
 from ..simulate import UNKNOWNS_PER_RUN, Tape
-from .fit.generalised_least_squares import residuals_of, series_of, training_indices
+from .fit.generalised_least_squares import residuals_of, series_of, series_of_samples, training_indices
 from .fit.polish import Fit
 from .identification import Identification
 from .noise.noise_model import Series, Whitener, fit_whitener, scaling_whitener
@@ -95,15 +95,15 @@ def _regression_columns(prepared: Prepared, fit: Fit) -> list[Series]:
     rows = []
     for run, residual in zip(training_indices(prepared), residuals_of(prepared, fit), strict=True):
         speed = np.asarray(fit.evaluation.simulated)[tape.blocks_of(run), 1].ravel()
-        _, outputs = residual.kind
         friction = _load_response(filters[tape.grid_of(run)], np.sign(speed))
         if (averaging := prepared.runs[run].averaging) is not None:
-            friction[:, 1] = averaging.applied_to(friction[:, 1])
+            span = 1 if tape.span is None else int(tape.span[run])
+            friction[:, 1] = averaging.applied_to(friction[:, 1], span)
         if prepared.runs[run].current_averaged:
             friction[:, 0] = OVER_LAST.applied_to(friction[:, 0])
-        friction = friction[:, list(outputs)]
         derivatives = series_of(tape, run, J).values
-        columns = (derivatives[..., :count], friction, derivatives[..., count:], residual.values)
+        of_friction = series_of_samples(tape, run, friction).values
+        columns = (derivatives[..., :count], of_friction, derivatives[..., count:], residual.values)
         sized = [c if c.ndim == 3 else c[..., None] for c in columns]
         rows.append(residual._replace(values=np.concatenate(sized, -1)))
     return rows

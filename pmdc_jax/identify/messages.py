@@ -21,6 +21,7 @@ MAX_LOAD_SPREAD = 0.2
 MIN_INITIAL_RISE = 0.02
 # Units of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
+HUM_UNITS = {"current": "A", "speed": "rad/s"}
 # Spans over which a speed may be averaged
 AVERAGING_SPANS = {
     OVER_LAST: "the last sample interval",
@@ -49,16 +50,20 @@ def _corrections(prepared: Prepared) -> list[str]:
         for run in prepared.runs
         if run.name in prepared.input_noise
     ]
+    messages += [
+        f"the sensor of the {output} picks up mains hum of {amplitude:.3g} {HUM_UNITS[output]}: it was removed"
+        for output, amplitude in prepared.mains_hum.items()
+    ]
     acts = "steps between samples" if prepared.stepped else prepared.timing.what
     if acts:
         messages.append(f"the voltage {acts}: this is modelled")
     if prepared.timing.current_mean:
         messages.append("the current is a mean over the last sample interval: this is modelled")
     if prepared.averaging:
-        messages.append(
-            f"the speed is a mean over {AVERAGING_SPANS[prepared.averaging]}, as differences of an angle are:"
-            " this is modelled"
-        )
+        span = AVERAGING_SPANS[prepared.averaging]
+        if prepared.problem.tape.span is not None:
+            span = "the interval from the last reading of its sensor"
+        messages.append(f"the speed is a mean over {span}, as differences of an angle are: this is modelled")
     return messages
 
 

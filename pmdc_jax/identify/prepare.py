@@ -14,6 +14,7 @@ from jaxtyping import Array
 
 from ..checks.check import check
 from ..checks.invalid_samples import without_unmeasured
+from ..checks.slow_sensors import readings_only
 from ..effects import AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS, Drive
@@ -43,6 +44,8 @@ class Prepared(NamedTuple):
     # results of the corrections (see `corrections`):
     # standard deviation of the noise removed from the drive, by name of the run
     input_noise: Mapping[str, float] = MappingProxyType({})
+    # largest amplitude of the mains hum removed from an output, by name of the output
+    mains_hum: Mapping[str, float] = MappingProxyType({})
     # how the recorded speeds are averaged, None if they are instantaneous
     averaging: Averaging | None = None
     timing: Timing = ZERO_ORDER_HOLD
@@ -88,7 +91,7 @@ def prepare(
     recordings, holdout = recordings_of(recordings), recordings_of(holdout)
     named = named_apart([*recordings, *holdout])
     refuse_copies(named)
-    cleaned = without_unmeasured(named)
+    cleaned = [readings_only(run) for run in without_unmeasured(named)]
     roles: list[Role] = [*("train" for _ in recordings), *("holdout" for _ in holdout)]
     known = dict(known or {})
     _check_columns(cleaned, roles)

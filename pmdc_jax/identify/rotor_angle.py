@@ -30,7 +30,7 @@ def rotor_outputs(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"
     unknowns = fit.unknowns
     motor = problem.parameters(unknowns.coordinates)
     bare = motor.with_effects(effect for effect in motor.effects if effect.equation != "sensor")
-    return free_run(bare, replace(tape, averaging=None, later=None, reading=None), unknowns.runs)
+    return free_run(bare, replace(tape, averaging=None, span=None, later=None, reading=None), unknowns.runs)
 
 
 def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:

@@ -13,11 +13,12 @@ from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from .columns import QUANTITIES
+from .readings import reading_interval
 
 Samples = Float[np.ndarray, " samples"]
 
 MIN_SAMPLES = 10
-MAX_MISSING = 0.2  # share of an output's samples that may be missing
+MAX_MISSING = 0.2  # share of an output's samples, or of the readings of a slower sensor, that may be missing
 # Most sample intervals that a run may last, per sample: an even clock ticks through the gaps, too, and its ticks must
 # fit into memory
 MAX_INTERVALS_PER_SAMPLE = 20
@@ -50,7 +51,7 @@ class Averaging(NamedTuple):
 
     **Fields**: `last` and `next`, the weights of the means over the previous and over the following interval; the rest
     of the weight is that of the instantaneous signal. `later`, by which share of a sample all this is later than the
-    instant of the sample.
+    instant of the sample. Of a sensor slower than the log the interval is that from one reading to the next.
     """
 
     last: float
@@ -59,19 +60,22 @@ class Averaging(NamedTuple):
 
     def with_ends_missing(self, signal: np.ndarray) -> np.ndarray:
         """`signal`, NaN at the ends whose averaging interval lies outside the record."""
-        known = signal.copy()
-        known[: 1 if self.last else 0] = np.nan
-        known[len(known) - 1 if self.next or self.later else len(known) :] = np.nan
+        known, interval = signal.copy(), reading_interval(~np.isnan(signal))
+        known[: interval if self.last else 0] = np.nan
+        known[len(known) - (interval if self.next or self.later else 0) :] = np.nan
         return known
 
-    def applied_to(self, signal: np.ndarray) -> np.ndarray:
-        """What is recorded of a signal, (samples, ...), that is linear between samples."""
+    def applied_to(self, signal: np.ndarray, interval: int = 1) -> np.ndarray:
+        """What is recorded of a signal, (samples, ...), that is linear between samples, at an interval of so many of
+        them from one reading to the next."""
         change = np.diff(signal, axis=0, append=signal[-1:])
         then = signal + self.later * change
         until_then = self.later * (signal + then) / 2  # the integrals over the parts of each interval
         from_then = signal + change / 2 - until_then
         last = until_then + np.concatenate([(1 - self.later) * signal[:1], from_then[:-1]])
-        coming = np.concatenate([last[1:], signal[-1:]])
+        if interval > 1:
+            last = _means_over_last(last, interval)
+        coming = np.concatenate([last[interval:], np.repeat(signal[-1:], interval, axis=0)])
         return (1 - self.last - self.next) * then + self.last * last + self.next * coming
 
 
@@ -230,9 +234,9 @@ def _faults_of_values(quantity: str, values: np.ndarray, columns: Mapping[str, n
     if not output and quantity != "temperature":
         what = f"{count} of {len(values)} values are missing (empty or NaN), the first here"
         yield Fault(quantity, first, what, "Inputs must be complete: fill the gaps, or cut the run")
-    elif output and count > MAX_MISSING * len(values):
+    elif output and (len(values) - count) * reading_interval(~bad) < (1 - MAX_MISSING) * len(values):
         what = f"{count} of {len(values)} values are missing (empty or NaN), the first here"
-        mend = f"Up to {MAX_MISSING:.0%} may be missing: cut the run, or remove the column"
+        mend = f"Up to {MAX_MISSING:.0%} of those that come regularly may be missing: cut the run, or remove the column"
         yield Fault(quantity, first, what, mend)
 
 
@@ -263,6 +267,12 @@ def _long_gaps(steps: np.ndarray) -> Iterator[Fault]:
         )
         mend = "Correct the time stamp, or split the run at its gaps"
         yield Fault("time", longest + 1, what, mend)
+
+
+def _means_over_last(signal: np.ndarray, count: int) -> np.ndarray:
+    """The mean of each sample and those before it, `count` in all; before the first one they are like that."""
+    total = np.cumsum(np.concatenate([np.repeat(signal[:1], count, axis=0), signal]), axis=0)
+    return (total[count:] - total[:-count]) / count
 
 
 def jumps_of(signal: Float[np.ndarray, " samples"], ratio: float, share: float) -> Int[np.ndarray, " jumps"]:

@@ -45,7 +45,7 @@ rps = turn / second
 """
 # Further spellings of rpm, most of which omit the turn, and of turns per second; 1/s and Hz may mean rad/s, too
 RPM = ("1/min", "min^-1", "min-1", "min⁻¹", "/min", "u/min", "upm", "r/min", "r.p.m.", "r.p.m")
-TURNS: dict[str, str] = {**dict.fromkeys(RPM, "rpm"), "r/s": "rps", "u/s": "rps"}
+TURNS: dict[str, str] = {**dict.fromkeys(RPM, "rpm"), "kr/min": "krpm", "r/s": "rps", "u/s": "rps"}
 # Torques as weights by lengths, such as oz-in and kgf.cm, and the other way round, as in ft-lb
 WEIGHT, LENGTH = r"(?P<weight>oz|lb|kg|g)f?s?", r"(?P<length>in|ft|cm)"
 WEIGHT_BY_LENGTH = tuple(

@@ -82,6 +82,8 @@ def _means_at_sample_start(tape: Tape) -> tuple[Samples, Samples, Bool[Array, "b
     if tape.averaging is None:
         return tape.measured, tape.weight, None
     over_last = (jnp.asarray(tape.averaging)[:, (2, 0)] == 1)[tape.run]
+    if tape.span is not None:  # near enough for a search
+        over_last &= jnp.stack([jnp.ones(tape.run.shape, bool), jnp.asarray(tape.span)[tape.run] == 1], -1)
     if tape.later is not None:
         over_last &= jnp.stack([jnp.ones(tape.run.shape, bool), jnp.asarray(tape.later)[tape.grid] == 0], -1)
     # the mean from the last sample of a run on was not recorded

@@ -104,5 +104,21 @@ def reported(
         shift = sample(mean_current, before, current[first]) - current
         current = current + current_over_last * shift
         sampled = (1 - over_last - over_next) * speed
-        speed = sampled + over_last * ending_within(last) + over_next * ending_within(last + 1)
+        mean_over_last, mean_over_next = ending_within(last), ending_within(last + 1)
+        if tape.span is not None:
+            span = jnp.repeat(jnp.asarray(tape.span)[tape.run], BLOCK)
+            mean_over_last = _over_span(mean_over_last, span, first, begun)
+            mean_over_next = sample(mean_over_last, before + 1 + span, begun)
+        speed = sampled + over_last * mean_over_last + over_next * mean_over_next
     return jnp.stack([x.reshape(simulated[:, 0].shape) for x in (current, speed)], 1)
+
+
+def _over_span(
+    means: Float[Array, " all"], span: Int[Array, " all"], first: Int[Array, " all"], begun: Float[Array, " all"]
+) -> Float[Array, " all"]:
+    """The means over as many samples as `span` says from those over one sample; before the `first` sample of a run
+    they are as it had `begun`."""
+    total = jnp.append(0.0, jnp.cumsum(means))
+    now = jnp.arange(len(means)) + 1
+    then = jnp.maximum(now - span, first)
+    return (total[now] - total[then] + (span - (now - then)) * begun) / span

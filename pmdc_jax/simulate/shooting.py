@@ -179,9 +179,9 @@ def _initial_states(motor: Motor, own: RunUnknowns, tape: Tape) -> Starts:
 
 
 def _guessed_starts(motor: Motor, own: RunUnknowns, tape: Tape, initial: Starts) -> Starts:
-    """Guessed starts of the blocks: current and speed as measured there, or else as the run begins, and the angle from
-    the measured speed."""
-    known = (tape.weight[:, :, 0] > 0).T
+    """Guessed starts of the blocks: current and speed as last measured before, or else as the run begins, and the angle
+    from the measured speed."""
+    known = (tape.weight > 0).any(-1).T
     current, speed = jnp.where(known, tape.measured[:, :, 0].T, initial[:, :2].T)
     length = jnp.asarray(tape.sample_time)[tape.grid]
     by_speed = tape.measured[:, 1] * tape.weight[:, 1] * length[:, None]

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..motor import Drive
+from ..recordings.readings import reading_interval
 from ..recordings.recording import OVER_LAST
 from .between_samples import mean_and_rise, value_on_line
 from .timing import ZERO_ORDER_HOLD, Timing
@@ -26,6 +27,8 @@ Samples = Array | np.ndarray
 # Samples in a block. A population is simulated block after block, one motor in all blocks in parallel: long enough that
 # the influence of a block's start has mostly decayed at its end, short enough that padding the last one costs little.
 BLOCK = 128
+# Samples without a reading of the speed are a gap if there are more than so many intervals between two readings
+MAX_GAP = 1.5
 
 
 class Tape(eqx.Module):
@@ -41,7 +44,7 @@ class Tape(eqx.Module):
 
     value: Float[Samples, "blocks samples"]  # mean of the drive over each sample: V, A or N m
     load: Float[Samples, "blocks samples"]  # N m, zero where unknown
-    measured: Float[Samples, "blocks 2 samples"]  # current A, speed rad/s; zero where missing
+    measured: Float[Samples, "blocks 2 samples"]  # current A, speed rad/s; where missing, the last known
     weight: Float[Samples, "blocks 2 samples"]  # 1 where measured, else 0
     run: Int[Samples, " blocks"]
     begins: Bool[Samples, " blocks"]
@@ -62,6 +65,8 @@ class Tape(eqx.Module):
     # shares in the reported speed of its means over the last sample and over the next, and in the reported current of
     # its mean over the last sample, which is not combined with a `reading`; None if nothing is a mean
     averaging: Float[Samples, "runs 3"] | None = None
+    # samples from one reading of the speed to the next, over which its means extend; None if it is read at each sample
+    span: Int[Samples, " runs"] | None = None
     # by which share of a sample the speeds that are means are later than their samples; None if none is
     later: Float[Samples, " grids"] | None = None
     # share of each sample, between 0 and 1, after which its outputs are read; None if they are read at its start
@@ -102,6 +107,9 @@ class Tape(eqx.Module):
             ),
             initial=of_runs(run.initial for run in runs),
             averaging=of_runs(map(_averaging_shares, recordings)) if averaged else None,
+            span=np.maximum(of_runs(run.span for run in runs), 1)
+            if averaged and max(r.span for r in runs) > 1
+            else None,
             later=later if np.any(later) else None,
             load_unknown=of_runs(r.load is None and not unloaded and not r.held for r in recordings),
             angle=of_runs(_first(r.angle) for r in recordings),
@@ -186,6 +194,7 @@ class _Run:
         self.averaging = recording.averaging
         if recording.speed is not None:
             self.speed = recording.speed
+        self.span = reading_interval(~np.isnan(self.speed))
         if self.averaging is not None:
             self.speed = self.averaging.with_ends_missing(self.speed)
         drive = recording.drive
@@ -201,11 +210,20 @@ class _Run:
 
     def turn(self) -> np.ndarray:
         """Angle over each sample in rad, NaN where the speed is not known."""
+        read = np.flatnonzero(~np.isnan(self.speed))
+        if not len(read):
+            return self.speed
+        last, coming, later = self.averaging or (0.0, 0.0, 0.0)
+        # the samples to which the readings belong: means to the middle of their interval
+        at = read + self.span * (later + (coming - last) / 2)
+        middle = np.arange(self.length) + 0.5
+        # the end of the run has no reading after it, and is no gap
+        around = np.concatenate([[at[0] - self.span], at, [at[-1] + self.span]])
+        after = np.clip(np.searchsorted(around, middle), 1, len(around) - 1)
+        gap = np.diff(around)[after - 1] > MAX_GAP * self.span
+        gap |= (middle < around[0]) | (middle > around[-1])
         sample_time, *_ = self.grid
-        ahead = np.append(self.speed[1:], self.speed[-1])
-        if self.averaging == OVER_LAST:
-            return sample_time * ahead
-        return sample_time * (self.speed + ahead) / 2
+        return np.where(gap, np.nan, sample_time * np.interp(middle, at, self.speed[read]))
 
     def to_blocks(self, samples: np.ndarray, hold: bool = False) -> np.ndarray:
         padding = self.blocks * BLOCK - self.length
@@ -231,7 +249,7 @@ def _laid_in_blocks(
         load[part] = run.to_blocks(run.load, hold=True)
         for channel, samples in enumerate((run.current, run.speed)):
             missing = np.isnan(samples)
-            measured[part, channel] = run.to_blocks(np.where(missing, 0.0, samples))
+            measured[part, channel] = run.to_blocks(_last_known(samples))
             weight[part, channel] = run.to_blocks(np.where(missing, 0.0, 1.0))
         if rise is not None:
             rise[part] = run.to_blocks(run.rise)
@@ -264,6 +282,12 @@ def _averaging_shares(recording: Recording) -> tuple[float, float, float]:
 def _first(samples: np.ndarray | None) -> float:
     known = samples[~np.isnan(samples)] if samples is not None else np.empty(0)
     return float(known[0]) if len(known) else 0.0
+
+
+def _last_known(samples: np.ndarray) -> np.ndarray:
+    """The samples, where they are missing those before; zero before the first one."""
+    row = np.maximum.accumulate(np.where(np.isnan(samples), -1, np.arange(len(samples))))
+    return np.where(row < 0, 0.0, samples[row])
 
 
 def _round_up(blocks: int) -> int:

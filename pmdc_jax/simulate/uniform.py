@@ -7,6 +7,7 @@ import numpy as np
 
 from ..recordings.angle import unwrapped
 from ..recordings.clock import GAP, is_even
+from ..recordings.readings import reading_interval
 from ..recordings.recording import OVER_LAST, Recording
 
 # An even clock is good enough if this share of the samples has ticks of their own, relative to the best clock
@@ -28,7 +29,9 @@ def uniform(recording: Recording) -> Recording:
     if recording.speed is None and recording.angle is not None:
         angle, _ = unwrapped(recording.angle)
         if even:
-            speed = np.diff(angle, prepend=np.nan) / recording.sample_time
+            interval = reading_interval(~np.isnan(angle))
+            speed = np.full_like(angle, np.nan)
+            speed[interval:] = (angle[interval:] - angle[:-interval]) / (interval * recording.sample_time)
             recording = attrs.evolve(recording, speed=speed, averaging=OVER_LAST)
         else:
             recording = attrs.evolve(recording, speed=_spline_derivative(angle, time))

@@ -7,6 +7,7 @@ from that of the speed, up to the white noise of the sensors.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from ...identify.noise.noise_model import Series
 from ...identify.noise.sensor_noise import noise_of_sensor, white_noise
 from ...motor import Motor
 from ...recordings.recording import OVER_LAST
+from ...recordings.white_noise import MEDIAN
 from ...simulate.exponential import scalar_phi
 from ..model import Model
 
@@ -101,7 +103,7 @@ def electrical_misfit(model: Model) -> float:
     model has beside it, such as the drop of its brushes. R, Kb, L and a further drop of the brushes are fitted to the
     measured steps of all runs, because torques that the model lacks bias the fit of a free run. Only what steps some
     samples apart (`LAGS`) have in common is added to the noise: a rough voltage, whose errors differ from step to step,
-    is no missing effect.
+    is no missing effect; nor is the colour of a sensor's noise, which is the same in all runs.
 
     **Returns**: at least 1; 1 if no run has voltage, current and speed, or if the model is exact.
     """
@@ -126,7 +128,9 @@ def electrical_misfit(model: Model) -> float:
         x_scale="jac",
     )
     motor = start.changed(best.x)
-    beyond = [_covariance_beyond_chance(b.residuals(motor), b.even_clock) for b in balances]
+    residuals = [b.residuals(motor) for b in balances]
+    colour = _common_colour(balances, residuals)
+    beyond = [_covariance_beyond_chance(r, b, colour) for b, r in zip(balances, residuals, strict=True)]
     return float(np.sqrt(1 + max(beyond)))
 
 
@@ -134,14 +138,37 @@ def _electrical_part(motor: Motor) -> _Electrical:
     return _Electrical(float(motor.R), float(motor.Kb), float(motor.L))
 
 
-def _covariance_beyond_chance(residuals: Float[np.ndarray, " samples"], even_clock: bool) -> float:
+def _common_colour(balances: list[_Balance], residuals: list[Float[np.ndarray, " _"]]) -> dict[int, float]:
+    """By lag, the covariance in A^2 that the residuals of all runs have in common at any time: the colour of the
+    sensor's noise. What the equation lacks differs between runs, or shows at some times more than at others.
+
+    **Returns**: zeros for a single run, and for runs of different clocks.
+    """
+    lags = [1, *LAGS]
+    if len(balances) < 2 or len({b.measured.seconds for b in balances}) > 1:
+        return dict.fromkeys(lags, 0.0)
+    scaled = [r * b.noise for b, r in zip(balances, residuals, strict=True)]
+    return {lag: max(min(_typical_covariance(r, lag) for r in scaled), 0.0) for lag in lags}
+
+
+def _typical_covariance(residuals: Float[np.ndarray, " samples"], lag: int) -> float:
+    """The covariance at a lag, of normal residuals, that rare large ones leave as it is: from the signs of pairs and
+    the median size (quadrant correlation)."""
+    agreement = np.mean(np.sign(residuals[lag:]) * np.sign(residuals[:-lag]))
+    return float(np.sin(np.pi / 2 * agreement) * (np.median(np.abs(residuals)) / MEDIAN) ** 2)
+
+
+def _covariance_beyond_chance(
+    residuals: Float[np.ndarray, " samples"], balance: _Balance, colour: Mapping[int, float]
+) -> float:
     """The largest mean product, in magnitude, of two residuals at one of the `LAGS`, or the positive one of neighbours,
-    less what may be chance."""
-    lags = [*LAGS, 1] if even_clock else LAGS
+    less what may be chance or the `colour` of the noise, in A^2."""
+    lags = [*LAGS, 1] if balance.even_clock else LAGS
     products = [residuals[lag:] * residuals[:-lag] for lag in lags]
-    means = [p.mean() if lag == 1 else abs(p.mean()) for lag, p in zip(lags, products, strict=True)]
+    excess = [p.mean() - colour[lag] / balance.noise**2 for lag, p in zip(lags, products, strict=True)]
+    sizes = [x if lag == 1 else abs(x) for lag, x in zip(lags, excess, strict=True)]
     chance = [CHANCE_ERRORS * p.std() / np.sqrt(len(p)) for p in products]
-    return float(max(0.0, *np.subtract(means, chance)))
+    return float(max(0.0, *np.subtract(sizes, chance)))
 
 
 def _balance(model: Model, run: int, residual: Series, size: float) -> _Balance | None:
@@ -152,7 +179,9 @@ def _balance(model: Model, run: int, residual: Series, size: float) -> _Balance 
     prepared, tape = model.prepared, model.prepared.problem.tape
     drive, known, residuals = tape.drive_of(run), residual.known, residual.values
     recorded = prepared.runs[run]
-    both = residual.kind[1] == (0, 1) and not recorded.current_averaged
+    seconds, outputs = residual.kind
+    # a sensor slower than the log has no reading at the next sample
+    both = outputs == (0, 1) and seconds == tape.sample_time_of(run) and not recorded.current_averaged
     if not both or not drive.voltage or known.sum() < MIN_SAMPLES:
         return None
     measured = series_of(tape, run, np.asarray(tape.measured)).values
@@ -165,7 +194,7 @@ def _balance(model: Model, run: int, residual: Series, size: float) -> _Balance 
     pairs = known[1:] & known[:-1]
     if pairs.sum() < MIN_SAMPLES:
         return None
-    motor, seconds = _electrical_part(model.motor), tape.sample_time_of(run)
+    motor = _electrical_part(model.motor)
     # a speed that is the mean over just this step
     is_mean = recorded.averaging == OVER_LAST
     voltage = _voltage_between_readings(model, run, len(known))[pairs]

@@ -7,9 +7,12 @@ import time
 from functools import cache
 from typing import NamedTuple
 
+import jax.numpy as jnp
+
 from ...effects import EFFECTS
 from ...identify.corrections.initial_temperature import with_initial_temperatures
 from ...identify.corrections.input_timing import negative_log_likelihood_within, only_current_is_late, other_timings
+from ...identify.corrections.mains_hum import without_mains_hum
 from ...identify.corrections.speed_averaging import with_averaging, with_means
 from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN
@@ -36,8 +39,8 @@ class Attempt(NamedTuple):
 
 
 def likeliest_attempt(prepared: Prepared, search: str, seed: int, report: ReportProgress) -> Attempt:
-    """The effects named, and then once more if these reveal another timing of the voltages or of counted speeds, or
-    runs that begin with a warm winding."""
+    """The effects named, and then once more if these reveal another timing of the voltages or of counted speeds, a
+    sensor that hums, or runs that begin with a warm winding."""
     attempt = _of_likeliest_timing(prepared, search, seed, report)
     chosen = attempt.naming.chosen
     averaging = chosen.prepared.averaging
@@ -45,6 +48,9 @@ def likeliest_attempt(prepared: Prepared, search: str, seed: int, report: Report
         around = with_means(prepared, AROUND)
         attempt = _likelier(attempt, _of_likeliest_timing(around, search, seed, report))
         chosen = attempt.naming.chosen
+    quiet = without_mains_hum(chosen.fitted)
+    if quiet.prepared is not chosen.prepared:
+        return _named(_without_hum_of(quiet.prepared, attempt.solved), attempt.identifying, report)
     warm = with_initial_temperatures(chosen.fitted)
     if warm.prepared is chosen.prepared:
         return attempt
@@ -95,6 +101,14 @@ def _with_effects_of(model: Model, prepared: Prepared, white: Whitener) -> Model
     """The effects of a model fitted to runs with another timing, as the model was: to whitened residuals."""
     prepared = prepared.with_effects([EFFECTS[effect] for effect in model.effects])
     return refit_from(model.effects, prepared, model.fit.optimum, white)
+
+
+def _without_hum_of(quiet: Prepared, solved: Solved) -> Solved:
+    """The motor without effects, fitted to runs whose sensors hum no more."""
+    prepared, fit = solved.fitted
+    prepared = prepared._replace(runs=quiet.runs, mains_hum=quiet.mains_hum)
+    measured = jnp.asarray(quiet.problem.tape.measured)
+    return solved._replace(fitted=FittedRuns.polished(prepared.with_tape(measured=measured), fit.optimum))
 
 
 def _likelier(*attempts: Attempt) -> Attempt:

@@ -15,12 +15,13 @@ from ...effects import EFFECTS
 from ...identify.corrections.initial_temperature import with_initial_temperatures
 from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.noise.noise_model import Whitener
+from ...identify.noise.spectral_lines import Line
 from ...identify.solve import Solved
 from ...progress import ReportProgress
 from ..diagnosis import VaryingParameter
 from ..evidence.assessment import FALSE_ALARM, REFIT_ONLY, Assessment, familywise_p_value, has_axes_of
 from ..evidence.constancy import varying_parameter
-from ..evidence.periodic import Line, line_of
+from ..evidence.periodic import line_of
 from ..evidence.screen import screen, share_beyond
 from ..evidence.signals import Screen, signals
 from ..hypotheses.effect_relations import are_rivals

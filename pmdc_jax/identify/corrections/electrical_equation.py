@@ -173,7 +173,8 @@ def _reading(share: float, remains: float) -> float:
 
 
 def electrical_equation(prepared: Prepared, fit: Fit) -> ElectricalEquation | None:
-    """The equation of all training runs together; None if they differ in sample time or none has what it takes.
+    """The equation of all training runs together; None if they differ in sample time, none has what it takes, or
+    no three samples in a row are known.
 
     **Arguments**: `fit`, to these runs, with voltages that are held from their samples on.
     """
@@ -201,6 +202,8 @@ def electrical_equation(prepared: Prepared, fit: Fit) -> ElectricalEquation | No
         for rows, x in ((columns, measured), (instruments, simulated)):
             row = [x[2:-1, 0], x[2:-1, 1], x[3:, 1], *shared]
             rows.append(np.stack(row, 1)[used])
+    if not any(map(len, currents)):  # a sensor slower than the log has no three readings one after the other
+        return None
     rows = map(np.concatenate, (currents, columns, instruments))
     return ElectricalEquation(*rows, sample_time=tape.sample_time_of(runs[0][0]))
 

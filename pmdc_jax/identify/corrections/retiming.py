@@ -23,7 +23,7 @@ def with_timing(prepared: Prepared, timing: Timing) -> Prepared:
         for k, run in enumerate(prepared.runs)
     ]
     driven = Tape.from_recordings(runs, timing=timing)
-    names = ("value", "load", "rise", "reading", "averaging")
+    names = ("value", "load", "rise", "reading", "averaging", "span")
     retimed = jax.tree.map(jnp.asarray, {name: getattr(driven, name) for name in names})
     acting = prepared.with_tape(**retimed)._replace(runs=runs, timing=timing)
     # what acts during the first sample was not recorded: without outputs there, the initial state makes up for it

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ...recordings.readings import reading_interval
 from ...recordings.recording import AROUND, OVER_BOTH, OVER_LAST, Averaging
 from ...recordings.resolution import quantum
 from ...simulate import Tape
@@ -76,7 +77,7 @@ def with_averaging(fitted: FittedRuns) -> FittedRuns:
     **Returns**: both unchanged if no other mean was found.
     """
     prepared, fit = fitted
-    if prepared.averaging == OVER_LAST:
+    if prepared.averaging == OVER_LAST and not _is_slow(prepared):
         return _or_around(fitted)
     if prepared.averaging:
         return fitted
@@ -120,7 +121,8 @@ def without_ends(prepared: Prepared, outputs: slice = BOTH) -> Prepared:
     weight = np.array(tape.weight)
     for k, run in enumerate(prepared.runs):
         first = int(np.argmax(tape.blocks_of(k)))
-        for sample in (0, len(run) - 1):
+        interval = 1 if run.speed is None else _interval(run.speed)
+        for sample in (*range(interval), *range(len(run) - interval, len(run))):
             block, at = divmod(sample, weight.shape[2])
             weight[first + block, outputs, at] = 0.0
     return prepared.with_tape(weight=jnp.asarray(weight))
@@ -133,19 +135,24 @@ def _with_speeds_averaged(prepared: Prepared, averaging: Averaging | None) -> Pr
         for run, is_differentiated in zip(prepared.runs, prepared.differentiated, strict=True)
     ]
     laid = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, follow=True))
-    names = ("averaging", "later", "turn", "sample_time", "drive", "grid")  # the grids are those of each averaging
+    # the grids are those of each averaging
+    names = ("averaging", "span", "later", "turn", "sample_time", "drive", "grid")
     averaged = prepared.with_tape(**{name: getattr(laid, name) for name in names})
     return averaged._replace(runs=runs, averaging=averaging)
 
 
 def _shifted_earlier(prepared: Prepared) -> Prepared:
-    """The runs with their speeds shifted to one sample earlier."""
-    runs = [
-        run if run.speed is None else attrs.evolve(run, speed=np.append(run.speed[1:], np.nan)) for run in prepared.runs
-    ]
+    """The runs with their speeds shifted to one sample earlier, those of slow sensors by half their interval."""
+
+    def shifted(speed: np.ndarray) -> np.ndarray:
+        shift = max(_interval(speed) // 2, 1)
+        return np.append(speed[shift:], np.full(shift, np.nan))
+
+    runs = [run if run.speed is None else attrs.evolve(run, speed=shifted(run.speed)) for run in prepared.runs]
     laid = Tape.from_recordings(runs)
-    weight = jnp.asarray(prepared.problem.tape.weight * laid.weight)
-    return prepared.with_tape(measured=jnp.asarray(laid.measured), weight=weight)
+    weight = np.stack([prepared.problem.tape.weight[:, 0], laid.weight[:, 1]], 1)
+    moved = prepared.with_tape(measured=jnp.asarray(laid.measured), weight=jnp.asarray(weight))
+    return without_ends(moved, SPEED)
 
 
 def refitted(prepared: Prepared, fit: Fit, inductance: float | None = None, tolerance: float = TOLERANCE) -> FittedRuns:
@@ -179,6 +186,9 @@ def _averaging_by_noise(prepared: Prepared) -> tuple[Averaging | None, float, bo
     """
     speeds = _speeds(prepared)
     counts = _in_counts(speeds)
+    if _is_slow(prepared):
+        # of a slow sensor, with or without counts, only the fit tells
+        return OVER_LAST, MIN_LOG_LIKELIHOOD_GAIN, False
     mean, min_gain = averaging_of_counts(counts) if counts else averaging_of_differences([s for s, _ in speeds])
     if mean is None and speeds and not counts and prepared.timing.current_mean:
         mean = OVER_LAST
@@ -228,15 +238,26 @@ def _band_powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
     return np.mean(powers, axis=0)
 
 
+def _is_slow(prepared: Prepared) -> bool:
+    """Whether the sensor of the speed is slower than the log."""
+    return any(run.speed is not None and _interval(run.speed) > 1 for run in prepared.training)
+
+
+def _interval(speed: np.ndarray) -> int:
+    """The samples from one reading of a speed to the next."""
+    return reading_interval(~np.isnan(speed))
+
+
 def _speeds(prepared: Prepared) -> list[tuple[np.ndarray, float]]:
-    """The recorded speeds, rad/s, of all training runs long enough to show their noise, and their sample times, s."""
+    """The readings of the speeds, rad/s, of all training runs long enough to show their noise, and the time from one to
+    the next, s."""
     recorded = [
-        (run.speed, np.diff(run.time))
+        (run.speed, run.time)
         for run, is_differentiated in zip(prepared.training, prepared.differentiated, strict=False)
         if run.speed is not None and not is_differentiated
     ]
-    known = [(speed[~np.isnan(speed)], float(np.median(steps))) for speed, steps in recorded]
-    return [(speed, step) for speed, step in known if len(speed) >= MIN_SAMPLES]
+    known = [(speed[~np.isnan(speed)], time[~np.isnan(speed)]) for speed, time in recorded]
+    return [(speed, float(np.median(np.diff(time)))) for speed, time in known if len(speed) >= MIN_SAMPLES]
 
 
 def _in_counts(speeds: Sequence[tuple[np.ndarray, float]]) -> list[np.ndarray]:

@@ -10,11 +10,13 @@ of plain least squares.
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Bool, Float
 
+from ...recordings.readings import reading_interval
 from ...simulate import Tape
 from ..noise.noise_model import Series, Whitener
 from ..noise.sensor_noise import MIN_RELATIVE_NOISE
-from ..noise.whitening import Whitening
+from ..noise.whitening import CHUNK, Whitening
 from ..prepare import Prepared
 from .fitted_runs import FittedRuns
 from .gauss_newton import TOLERANCE
@@ -30,9 +32,10 @@ def last_fit(plain: FittedRuns, start: Fit, white: Whitener) -> FittedRuns:
     """The fit with whitened residuals, from a `start` near it; the plain fit if its residuals are white already.
 
     The plain fit is also kept where the other one reproduces the runs clearly worse, because the motor has an effect
-    that the model lacks or a formula is only approximate: the filter then takes what is missing for noise.
+    that the model lacks or a formula is only approximate: the filter then takes what is missing for noise. So it is
+    with a sensor slower than the log: the other one would use nothing but its readings.
     """
-    if white.is_white or _is_exact(plain):
+    if white.is_white or _is_exact(plain) or _is_sparse(plain.prepared):
         return plain
     whitened = fit_whitened(plain.prepared, start, white)
     fitness = fit_at(plain.problem, whitened.fit.optimum).fitness  # without whitening
@@ -44,6 +47,12 @@ def _is_exact(fitted: FittedRuns) -> bool:
     measured = fitted.problem.samples > 0
     least = MIN_RELATIVE_NOISE * fitted.problem.measured_rms
     return bool(np.all(fitted.fit.noise[measured] < 2 * least[measured]))
+
+
+def _is_sparse(prepared: Prepared) -> bool:
+    """Whether a training run has a sensor slower than the log."""
+    tape = prepared.problem.tape
+    return any(reading_interval(_known(tape, run)) > 1 for run in training_indices(prepared))
 
 
 def fit_whitened(
@@ -72,9 +81,11 @@ def with_whitening(prepared: Prepared, white: Whitener) -> Prepared:
     scales = [np.diag(1 / noise)] * tape.runs
     for run, A, S in zip(training_indices(prepared), white.filters, white.scales, strict=True):
         both = np.ix_(*2 * [_measured_outputs(tape, run)])
-        filters[run], scales[run] = np.zeros((len(A), 2, 2)), np.zeros((2, 2))
-        filters[run][:, *both], scales[run][both] = A, S
-    whitening = Whitening.of(filters, scales, tape.weight, tape.run)
+        # from one reading to the next of a sensor slower than the log
+        interval = reading_interval(_known(tape, run))
+        filters[run], scales[run] = np.zeros((len(A) * interval, 2, 2)), np.zeros((2, 2))
+        filters[run][interval - 1 :: interval, *both], scales[run][both] = A, S
+    whitening = Whitening.of([A[:CHUNK] for A in filters], scales, tape.weight, tape.run)
     return prepared.with_problem(whitening=whitening)
 
 
@@ -90,14 +101,25 @@ def residuals_of(prepared: Prepared, fit: Fit) -> list[Series]:
 
 
 def series_of(tape: Tape, run: int, signal: np.ndarray) -> Series:
-    """The part of a signal (blocks, 2, samples, ...) of one run, in the order of time, for its measured outputs."""
-    mine = tape.blocks_of(run)
-    part = np.moveaxis(signal[mine], 1, 2)
-    values = part.reshape(-1, *part.shape[2:])
-    weight = np.moveaxis(np.asarray(tape.weight)[mine], 1, 2).reshape(-1, 2) > 0
-    outputs = tuple(int(c) for c in _measured_outputs(tape, run))
-    kind = (tape.sample_time_of(run), outputs)
-    return Series(values[:, list(outputs)], np.asarray(weight[:, list(outputs)].all(1)), kind)
+    """The part of a signal (blocks, 2, samples, ...) of one run, in the order of time, for its measured outputs; with a
+    sensor slower than the log only at its readings."""
+    part = np.moveaxis(signal[tape.blocks_of(run)], 1, 2)
+    return series_of_samples(tape, run, part.reshape(-1, *part.shape[2:]))
+
+
+def series_of_samples(tape: Tape, run: int, values: Float[np.ndarray, "samples 2 ..."]) -> Series:
+    """The same from the values of one run, in the order of time."""
+    outputs, known = _measured_outputs(tape, run), _known(tape, run)
+    values, interval = values[:, outputs], reading_interval(known)
+    if interval > 1:
+        values, known = values[known], known[known]
+    return Series(values, known, (interval * tape.sample_time_of(run), tuple(int(c) for c in outputs)))
+
+
+def _known(tape: Tape, run: int) -> Bool[np.ndarray, " samples"]:
+    """Which samples of a run have all outputs that it has measured."""
+    weight = np.moveaxis(np.asarray(tape.weight)[tape.blocks_of(run)], 1, 2).reshape(-1, 2) > 0
+    return np.asarray(weight[:, _measured_outputs(tape, run)].all(1))
 
 
 def _measured_outputs(tape: Tape, run: int) -> np.ndarray:

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ...recordings.readings import reading_interval
+
 # Samples that are filtered by one matrix product, and the longest order of a filter
 CHUNK = 32
 
@@ -41,7 +43,7 @@ class Whitening(eqx.Module):
         run: Int[Array | np.ndarray, " blocks"],
     ) -> Whitening:
         """From the coefficients A and the scale S of each run; `weight` is zero where nothing was measured, `run` is
-        the run of each block."""
+        the run of each block. Of a sensor slower than the log only the readings count."""
         longest = [np.append(A, np.zeros((CHUNK - len(A), 2, 2)), axis=0) for A in filters]
         bands = np.stack([band_matrix(A, S) for A, S in zip(longest, scales, strict=True)])
         known = np.moveaxis(np.asarray(weight) > 0, 1, 2)
@@ -49,9 +51,11 @@ class Whitening(eqx.Module):
         for index, A in enumerate(filters):
             mine, counts = np.asarray(run) == index, np.any(scales[index], axis=0)
             measured = known[mine].reshape(-1, 2)[:, counts]
-            begun = np.logical_or.accumulate(measured.all(1))
-            before = np.append(np.ones(len(A), bool), measured.all(1) | ~begun)
-            whole = with_history(before, len(A))[len(A) :] & measured.any(1)
+            whole = np.asarray(measured.all(1))
+            if reading_interval(whole) == 1:
+                begun = np.logical_or.accumulate(whole)
+                before = np.append(np.ones(len(A), bool), whole | ~begun)
+                whole = with_history(before, len(A))[len(A) :] & measured.any(1)
             usable[mine] = (whole[:, None] * counts).reshape(-1, *known.shape[1:])
         return cls(jnp.asarray(bands), jnp.asarray(np.moveaxis(usable, 2, 1)))
 
