@@ -113,6 +113,10 @@ class Motor(eqx.Module):
         """The effect with teeth, if there is one."""
         return next((effect for effect in self.effects if effect.contact_state), None)
 
+    def effect_named(self, name: str) -> AbstractEffect:
+        """The effect of this name, which the motor must have."""
+        return next(effect for effect in self.effects if effect.name == name)
+
     def with_effects(self, effects: Iterable[AbstractEffect]) -> Motor:
         """The same motor with these effects in place of its own."""
         return eqx.tree_at(lambda motor: motor.effects, self, tuple(effects))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from attrs import frozen
 
-from .effects import EFFECTS, AbstractEffect
+from .effects import EFFECTS, OTHER_FORMS, AbstractEffect
 from .errors import InputError
 from .files import write_text
 from .json_file import finite_number, read_object
@@ -143,7 +143,8 @@ def load_speed_noise(path: str | Path) -> float | None:
 
 def _is_covariance(names: Sequence[str], matrix: np.ndarray) -> bool:
     """Whether names are unique and known, and the matrix is finite and symmetric with no negative variance."""
-    known = {*PARAMETERS, *(f"{e}.{f}" for e, kind in EFFECTS.items() for f in kind.ranges)}
+    forms = (*EFFECTS.values(), *OTHER_FORMS.values())
+    known = {*PARAMETERS, *(f"{kind.name}.{field}" for kind in forms for field in kind.ranges)}
     once = known.issuperset(names) and len(set(names)) == len(names)
     alike = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=1e-6)
     return bool(once and alike and np.all(np.diag(matrix) >= 0))
@@ -164,8 +165,11 @@ def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:
             raise InputError(where, f"unknown effect {name!r}", f"Choose from {', '.join(EFFECTS)}")
         if name in effects:
             raise InputError(where, f"effect {name} is listed twice", "Keep one of the two")
-        fields = _numbers(where, entry.get("parameters", {}), EFFECTS[name].ranges, name)
-        effects[name] = EFFECTS[name](**fields)
+        given = entry.get("parameters", {})
+        kind = EFFECTS[name]
+        if name in OTHER_FORMS and isinstance(given, dict) and set(given) - set(kind.ranges):
+            kind = OTHER_FORMS[name]
+        effects[name] = kind(**_numbers(where, given, kind.ranges, name))
     return tuple(effects.values())
 
 

@@ -139,7 +139,7 @@ class UndecidedSelection(StepwiseSelection):
         return [self.other if current is self.one else self.one]
 
     _best = staticmethod(lambda tried, white: tried[0])
-    _with_warm_runs = _without_needless = staticmethod(lambda model: model)
+    _with_refined_runs = _without_needless = staticmethod(lambda model: model)
     elimination = Mock(reduced=lambda model: model)
     _is_genuine_improvement = staticmethod(lambda *models: True)
     _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))
@@ -151,16 +151,16 @@ def test_the_selection_does_not_return_to_a_superseded_model():
     assert selection.trials == 3
 
 
-def test_a_model_with_warm_runs_takes_the_place_of_one_in_which_all_begin_cold(monkeypatch):
+def test_a_model_with_refined_runs_takes_the_place_of_one_in_which_all_begin_cold(monkeypatch):
     selection, warm = UndecidedSelection(), Mock(spec=Model, effects=("resistance_heating",))
     cold = Mock(spec=Model, effects=("resistance_heating",), fitted=Mock(prepared="cold"), prepared="cold")
     selection.refits = Mock(spec=Refits, replace=lambda model: model)
     monkeypatch.setattr(naming, "with_initial_temperatures", lambda fitted: FittedRuns("warm", "fit"))
     monkeypatch.setattr(naming, "model_of", lambda effects, prepared, fit: warm if prepared == "warm" else None)
-    assert StepwiseSelection._with_warm_runs(selection, cold) is warm
+    assert StepwiseSelection._with_refined_runs(selection, cold) is warm
     assert cold in selection.superseded
     monkeypatch.setattr(naming, "with_initial_temperatures", lambda fitted: fitted)
-    assert StepwiseSelection._with_warm_runs(selection, cold) is cold
+    assert StepwiseSelection._with_refined_runs(selection, cold) is cold
 
 
 @pytest.mark.parametrize("genuine", [True, False])

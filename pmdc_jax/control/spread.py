@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..effects import EFFECTS
 from ..errors import InputError
 from ..motor import PARAMETERS, Motor
 from ..motor_file import Uncertainty
@@ -55,7 +54,7 @@ def _moved(motor: Motor, names: Sequence[str], deviations: Float[np.ndarray, "mo
     effects = []
     for effect in stacked.effects:
         fields = {}
-        for name, allowed in EFFECTS[effect.name].ranges.items():
+        for name, allowed in effect.ranges.items():
             value, by = getattr(effect, name), deviation.get(f"{effect.name}.{name}", 0.0)
             fields[name] = value * np.exp(by) if allowed.scale == "log" else value + by
         effects.append(type(effect)(**fields))

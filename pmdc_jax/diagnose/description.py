@@ -25,7 +25,7 @@ def effects_found(naming: Naming, final: Identification) -> tuple[EffectFound, .
         EffectFound(
             name,
             EFFECTS[name].equation,
-            {f: final.parameters[f"{name}.{f}"] for f in EFFECTS[name].ranges},
+            {f: final.parameters[f"{name}.{f}"] for f in naming.chosen.motor.effect_named(name).ranges},
             naming.p_without[name],
         )
         for name in naming.chosen.effects

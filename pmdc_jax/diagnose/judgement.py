@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..effects import EFFECTS, ShaftCompliance
+from ..effects import ShaftCompliance, range_of
 from ..identify.identification import Identification
 from ..motor import Motor
 from .diagnosis import Verdict, breaks_electrical_equation, holdouts_show_more, is_disturbed
@@ -55,7 +55,7 @@ def unneeded_effect(naming: Naming, base: Identification, final: Identification,
             return True
         if effect in amplitude and may_be_absent(final, effect, amplitude[effect]):
             return True
-        intervals = [final.parameters[f"{effect}.{f}"].ci95 for f in EFFECTS[effect].ranges]
+        intervals = [final.parameters[f"{effect}.{f}"].ci95 for f in final.motor.effect_named(effect).ranges]
         return p_value >= certain and all(interval is None for interval in intervals)
 
     unneeded = {e: p for e, p in naming.p_without.items() if is_unneeded(e, p)}
@@ -65,7 +65,7 @@ def unneeded_effect(naming: Naming, base: Identification, final: Identification,
 def may_be_absent(final: Identification, effect: str, amplitude: str) -> bool:
     """Whether the 95 % interval of an effect's amplitude includes zero, or, if it is strictly positive, the larger of
     its lower bound and the share `ABSENT_SHARE` of the estimate."""
-    estimate, about = final.parameters[f"{effect}.{amplitude}"], EFFECTS[effect].ranges[amplitude]
+    estimate, about = final.parameters[f"{effect}.{amplitude}"], range_of(effect, amplitude)
     if estimate.value is None or estimate.ci95 is None:
         return False
     least = about.lower * (1 + 1e-6)  # the bound after its logarithm and back

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import attrs
 import numpy as np
 
-from ..effects import EFFECTS, AsymmetricFriction, CoulombFriction, InputDeadZone
+from ..effects import AsymmetricFriction, CoulombFriction, InputDeadZone
 from ..identify.fit.fitted_runs import FittedRuns
 from ..identify.fit.gauss_newton import TRIAL_TOLERANCE
 from ..identify.fit.generalised_least_squares import last_fit, residuals_of, series_of, training_indices, with_whitening
@@ -132,7 +132,7 @@ class Model:
     @property
     def path(self) -> Path:
         """The free run of the fitted motor: the states of the rotor itself, before any sensor."""
-        held = {EFFECTS[name].holds for name in self.effects}
+        held = {effect.holds for effect in self.motor.effects}
         problem = self.prepared.problem
         start_angle = self.fit.unknowns.runs.angle
         return path_of(

@@ -2,7 +2,7 @@
 
 from .angle_torque import CoggingTorque, TorqueRipple
 from .base import AbstractEffect, Grip, ParameterRange, State
-from .brush_voltage_drop import BrushVoltageDrop
+from .brush_voltage_drop import BrushVoltageDrop, GradualBrushDrop
 from .constant_load import ConstantLoad
 from .coulomb_friction import AsymmetricFriction, CoulombFriction
 from .input_dead_zone import InputDeadZone
@@ -36,8 +36,19 @@ EFFECTS: dict[str, type[AbstractEffect]] = {
     )
 }
 
+# Other forms of effects, with more parameters, in which they are fitted where the runs call for it
+OTHER_FORMS: dict[str, type[AbstractEffect]] = {GradualBrushDrop.name: GradualBrushDrop}
+
+
+def range_of(effect: str, field: str) -> ParameterRange:
+    """Unit and bounds of a parameter of an effect, in either of its forms."""
+    ranges = EFFECTS[effect].ranges
+    return ranges[field] if field in ranges else OTHER_FORMS[effect].ranges[field]
+
+
 __all__ = [
     "EFFECTS",
+    "OTHER_FORMS",
     "AbstractEffect",
     "AsymmetricFriction",
     "BrushVoltageDrop",
@@ -46,6 +57,7 @@ __all__ = [
     "CoulombFriction",
     "CurrentSensorOffset",
     "GearBacklash",
+    "GradualBrushDrop",
     "Grip",
     "InductanceSaturation",
     "InputDeadZone",
@@ -59,4 +71,5 @@ __all__ = [
     "StribeckFriction",
     "TorqueConstantSaturation",
     "TorqueRipple",
+    "range_of",
 ]

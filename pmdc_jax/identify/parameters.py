@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..effects import EFFECTS, AbstractEffect
+from ..effects import EFFECTS, AbstractEffect, range_of
 from ..errors import InputError
 from ..motor import PARAMETERS, Motor
 
@@ -116,7 +116,7 @@ def unit_of(name: str) -> str:
     if name in PARAMETERS:
         return PARAMETERS[name]
     effect, field = name.split(".")
-    return EFFECTS[effect].ranges[field].unit
+    return range_of(effect, field).unit
 
 
 def effects_named(names: Sequence[str]) -> tuple[type[AbstractEffect], ...]:

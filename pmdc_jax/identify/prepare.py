@@ -15,7 +15,7 @@ from jaxtyping import Array
 from ..checks.check import check
 from ..checks.invalid_samples import without_unmeasured
 from ..checks.slow_sensors import readings_only
-from ..effects import AbstractEffect
+from ..effects import EFFECTS, AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS, Drive
 from ..recordings.clock import evenly_stamped
@@ -71,6 +71,11 @@ class Prepared(NamedTuple):
         """The parameters of a motor with these effects; `bounds` overrides those of the search and of the effects."""
         bounds = {**search_bounds(self.training), **(bounds or {})}
         return Parameters.of(bounds, effects, {**self.irrelevant, **self.known}, self.ties)
+
+    def forms_of(self, effects: Sequence[str]) -> list[type[AbstractEffect]]:
+        """The classes of some effects, by name: in the form in which they are fitted to these runs, if they are."""
+        fitted = {effect.name: effect for effect in self.problem.parameters.effects}
+        return [fitted.get(name, EFFECTS[name]) for name in effects]
 
     def with_effects(self, effects: Sequence[type[AbstractEffect]]) -> Prepared:
         """The same runs for a motor with other effects."""

@@ -76,7 +76,8 @@ class Problem(eqx.Module):
     @property
     def measured_rms(self) -> Float[np.ndarray, "2"]:
         """Root mean square of each output as measured in the training runs; zero where it was not measured."""
-        squares = np.square(np.asarray(self.tape.measured)[self.fitted_blocks]).sum((0, 2))
+        known = np.asarray(self.tape.measured) * np.asarray(self.tape.weight)
+        squares = np.square(known[self.fitted_blocks]).sum((0, 2))
         return np.sqrt(squares / np.maximum(self.samples, 1.0))
 
     @property

@@ -13,6 +13,7 @@ import numpy as np
 from ..progress import ReportProgress, silent
 from ..runtime.threads import map_in_threads_until, submit
 from ..simulate import RunUnknowns, Tape, Timing
+from .corrections.gradual_brushes import with_gradual_brushes
 from .corrections.initial_temperature import with_initial_temperatures
 from .corrections.input_noise import without_input_noise
 from .corrections.input_timing import negative_log_likelihood_within, other_timings
@@ -88,6 +89,7 @@ CORRECTIONS: tuple[Callable[[FittedRuns], FittedRuns], ...] = (
     without_input_noise,
     with_averaging,
     with_initial_temperatures,
+    with_gradual_brushes,
 )
 
 

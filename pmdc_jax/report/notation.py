@@ -7,7 +7,7 @@ from math import floor, isfinite, log10
 
 from attrs import evolve, frozen
 
-from ..effects import EFFECTS
+from ..effects import EFFECTS, range_of
 from ..identify.identification import Estimate, Role, Status
 
 UNKNOWN = "–"
@@ -156,7 +156,7 @@ def effect_words(effect: str) -> str:
 
 def field_words(effect: str, field: str) -> str:
     """A parameter of an effect without the unit in its name: "time constant" for time_constant_s."""
-    unit = EFFECTS[effect].ranges[field].unit
+    unit = range_of(effect, field).unit
     suffix = unit.removeprefix("1/").replace(" ", "").replace("^", "").replace("/", "_")
     if field == f"per_{suffix}":
         return "coefficient"

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
+from ...effects import BrushVoltageDrop, GradualBrushDrop
 from ...identify.corrections.electrical_equation import MIN_FLOW
 from ...identify.fit.generalised_least_squares import residuals_of, series_of
 from ...identify.noise.noise_model import Series
@@ -187,7 +188,7 @@ def _balance(model: Model, run: int, residual: Series, size: float) -> _Balance 
     measured = series_of(tape, run, np.asarray(tape.measured)).values
     simulated = measured - residuals
     current_noise, speed_noise = (_sensor_noise(measured[known, c], residuals[known, c]) for c in range(2))
-    brushes = any(effect.holds == "current" for effect in model.motor.effects)
+    brushes = any(isinstance(effect, BrushVoltageDrop | GradualBrushDrop) for effect in model.motor.effects)
     if brushes:
         threshold = MIN_FLOW * current_noise
         known = known & _flows(measured[:, 0], simulated[:, 0], threshold)

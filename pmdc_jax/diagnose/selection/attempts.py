@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from ...effects import EFFECTS
 from ...identify.corrections.initial_temperature import with_initial_temperatures
 from ...identify.corrections.input_timing import negative_log_likelihood_within, only_current_is_late, other_timings
 from ...identify.corrections.mains_hum import without_mains_hum
@@ -99,7 +98,7 @@ def _named(solved: Solved, identifying: float, report: ReportProgress) -> Attemp
 
 def _with_effects_of(model: Model, prepared: Prepared, white: Whitener) -> Model:
     """The effects of a model fitted to runs with another timing, as the model was: to whitened residuals."""
-    prepared = prepared.with_effects([EFFECTS[effect] for effect in model.effects])
+    prepared = prepared.with_effects(model.prepared.forms_of(model.effects))
     return refit_from(model.effects, prepared, model.fit.optimum, white)
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeGuard
 import numpy as np
 
 from ...effects import EFFECTS
+from ...identify.corrections.gradual_brushes import with_gradual_brushes
 from ...identify.corrections.initial_temperature import with_initial_temperatures
 from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.noise.noise_model import Whitener
@@ -86,7 +87,7 @@ class StepwiseSelection:
         current = self.base
         self.superseded.add(current)
         while better := self._step(current):
-            current = self._with_warm_runs(self._without_needless(better))
+            current = self._with_refined_runs(self._without_needless(better))
             self.superseded.add(current)
         others = self.proposals.by_swap(current, self.equivalents)
         # even if little is left: what backlash leaves is small beside what a large effect explains
@@ -114,14 +115,15 @@ class StepwiseSelection:
         explained_unfiltered = self.base.fit.fitness - model.fit.fitness
         return Assessment(evidence, candidate_signals, curve_signals, p_value, explained, explained_unfiltered)
 
-    def _with_warm_runs(self, model: Model) -> Model:
-        """The model with runs that begin with a warm winding, if that is clearly likelier: other effects would seem to
-        be missing from a model in which all begin cold."""
-        warm = with_initial_temperatures(model.fitted)
-        if warm.prepared is model.prepared:
-            return model
-        self.superseded.add(model)
-        return self.refits.replace(model_of(model.effects, *warm))
+    def _with_refined_runs(self, model: Model) -> Model:
+        """The model with runs that begin with a warm winding, or with a brush drop that sets in gradually, if that is
+        clearly likelier: other effects would seem to be missing without."""
+        for refine in (with_initial_temperatures, with_gradual_brushes):
+            refined = refine(model.fitted)
+            if refined.prepared is not model.prepared:
+                self.superseded.add(model)
+                model = self.refits.replace(model_of(model.effects, *refined))
+        return model
 
     def _without_needless(self, model: Model) -> Model:
         """The model just accepted, without an effect that would not be accepted beside the others as they are fitted

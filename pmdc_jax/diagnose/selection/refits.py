@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from ...effects import EFFECTS
 from ...identify.fit.gauss_newton import TRIAL_TOLERANCE
 from ...identify.fit.generalised_least_squares import residuals_of, with_whitening
 from ...identify.fit.polish import fit_at, polish
@@ -127,7 +126,7 @@ class Refits:
         self.report(f"searching with {_joined(effects)}", _misfit(current))
 
         def search() -> Model:
-            prepared = current.prepared.with_effects([EFFECTS[e] for e in effects])
+            prepared = current.prepared.with_effects(current.prepared.forms_of(effects))
             method, seed = self.solved.search.method, self.solved.seed
             return model_of(effects, *search_and_refine(prepared, method, seed, searches=1).fitted)
 

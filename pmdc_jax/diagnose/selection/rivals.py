@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from scipy import stats
 
-from ...effects import EFFECTS
 from ...identify.noise.noise_model import Whitener
 from ..evidence.assessment import FALSE_ALARM, Assessment
 from ..hypotheses.effect_relations import FULLER, are_rivals
@@ -44,5 +43,5 @@ def p_values_without(chosen: Model, white: Whitener, refits: Refits, comparison:
     for effect, smaller in zip(chosen.effects, smaller_models, strict=True):
         squares = {f.model.effects: f.squares for f in comparison.ranked([chosen, smaller], white)}
         gain = squares[smaller.effects] - squares[chosen.effects]
-        p_values[effect] = float(stats.chi2.sf(max(gain, 0.0), len(EFFECTS[effect].ranges)))
+        p_values[effect] = float(stats.chi2.sf(max(gain, 0.0), len(chosen.motor.effect_named(effect).ranges)))
     return p_values

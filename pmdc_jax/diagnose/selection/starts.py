@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...effects import EFFECTS
 from ...identify.fit.refine import Optimum
 from ...identify.parameters import Parameters
 from ...identify.prepare import Prepared
@@ -90,7 +89,7 @@ class Starts:
         **Arguments**: `values` of new effects; `changes` of the current search coordinates, to first order; `angles`,
         in rad, added to the rotor's initial angles.
         """
-        prepared = current.prepared.with_effects([EFFECTS[e] for e in effects])
+        prepared = current.prepared.with_effects(current.prepared.forms_of(effects))
         for effect, new in values.items():
             self.first_values.setdefault(effect, new)
         parameters, runs = prepared.problem.parameters, current.fit.unknowns.runs

@@ -1,0 +1,58 @@
+"""A brush drop that sets in gradually with the current, where the runs show that it does.
+
+Taken for constant, a drop whose onset is a considerable part of the currents biases R, and with it the rest.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from ...effects import BrushVoltageDrop, GradualBrushDrop
+from ..fit.fitted_runs import FittedRuns
+from ..fit.gauss_newton import TRIAL_TOLERANCE
+from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
+from ..prepare import Prepared
+
+# Currents of the onset that are tried, over the root mean square of those measured
+ONSETS = (0.02, 0.06, 0.2)
+# Fastest rate of a gradual drop, times the shortest sample time: a steeper one is hardly different from a constant one,
+# and would need too many steps in a sample
+MAX_RATE = 10.0
+ONSET = f"{GradualBrushDrop.name}.onset_A"
+
+
+def with_gradual_brushes(fitted: FittedRuns) -> FittedRuns:
+    """The runs with a brush drop that sets in gradually, and the fit to them; both unchanged unless that is clearly
+    likelier than a drop that is constant from zero current on, or where that leaves nothing but noise."""
+    prepared, problem = fitted.prepared, fitted.problem
+    if BrushVoltageDrop not in problem.parameters.effects or not problem.samples[0] > 0 or leaves_only_noise(fitted):
+        return fitted
+    onsets = [share * float(problem.measured_rms[0]) for share in ONSETS]
+    kinds = [GradualBrushDrop if kind is BrushVoltageDrop else kind for kind in problem.parameters.effects]
+    gradual = prepared.with_effects(kinds)
+    ends = [_polished(gradual, fitted, onset) for onset in onsets if onset > _least_onset(fitted)]
+    if not ends:
+        return fitted
+    best = min(ends, key=lambda end: end.fit.cost)
+    best = FittedRuns.polished(gradual, best.fit.optimum)
+    gain = negative_log_likelihood(fitted) - negative_log_likelihood(best)
+    return best if gain > MIN_LOG_LIKELIHOOD_GAIN else fitted
+
+
+def _least_onset(fitted: FittedRuns) -> float:
+    """The smallest current, A, that is simulated as an onset."""
+    motor, tape = fitted.problem.parameters(fitted.fit.coordinates), fitted.problem.tape
+    drop = motor.effect_named(BrushVoltageDrop.name)
+    assert isinstance(drop, BrushVoltageDrop)
+    return float(drop.voltage_V / motor.L * np.min(np.asarray(tape.sample_time)) / MAX_RATE)
+
+
+def _polished(gradual: Prepared, fitted: FittedRuns, onset: float) -> FittedRuns:
+    """The fit to the runs with a gradual drop, from the fit with a constant one and an onset in A."""
+    names = fitted.problem.parameters.names
+    values = dict(zip(names, np.asarray(fitted.fit.coordinates), strict=True)) | {ONSET: np.log(onset)}
+    coordinates = jnp.asarray([values[name] for name in gradual.problem.parameters.names])
+    start = fitted.fit.optimum
+    start = start._replace(unknowns=start.unknowns._replace(coordinates=coordinates), at_bound=())
+    return FittedRuns.polished(gradual, start, TRIAL_TOLERANCE)
