@@ -151,12 +151,15 @@ def test_the_selection_does_not_return_to_a_superseded_model():
     assert selection.trials == 3
 
 
-def test_a_model_with_refined_runs_takes_the_place_of_one_in_which_all_begin_cold(monkeypatch):
-    selection, warm = UndecidedSelection(), Mock(spec=Model, effects=("resistance_heating",))
-    cold = Mock(spec=Model, effects=("resistance_heating",), fitted=Mock(prepared="cold"), prepared="cold")
+def test_a_model_with_warm_runs_takes_the_place_of_one_in_which_all_begin_cold(monkeypatch):
+    selection, effects = UndecidedSelection(), ("resistance_heating",)
+    cold, warm = (
+        Mock(spec=Model, effects=effects, fitted=Mock(prepared=runs), prepared=runs) for runs in ("cold", "warm")
+    )
     selection.refits = Mock(spec=Refits, replace=lambda model: model)
     monkeypatch.setattr(naming, "with_initial_temperatures", lambda fitted: FittedRuns("warm", "fit"))
     monkeypatch.setattr(naming, "model_of", lambda effects, prepared, fit: warm if prepared == "warm" else None)
+    monkeypatch.setattr(naming, "with_gradual_brushes", lambda fitted: fitted)
     assert StepwiseSelection._with_refined_runs(selection, cold) is warm
     assert cold in selection.superseded
     monkeypatch.setattr(naming, "with_initial_temperatures", lambda fitted: fitted)

@@ -71,6 +71,8 @@ def test_coarse_counts_are_no_slow_sensor(step):
     time = np.arange(4000) * 1e-3
     speed = 40 * np.sin(2 * np.pi * 0.5 * time)
     assert not repeated_readings(step * np.round(speed / step)).any()
+    ramp = 30 * np.arange(4000) * 1e-3
+    assert not repeated_readings(step * np.round(ramp / step)).any()
 
 
 def test_a_log_faster_than_all_its_sensors_is_thinned():

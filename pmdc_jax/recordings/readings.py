@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 MIN_CHANGES = 50
 # and by readings, other than zero, of which at least this share differ from the one before
 MIN_CHANGED = 0.25
+# Largest share of changes that are all of one size: steps of a resolution, which a slow motion crosses now and then
+MAX_OF_ONE_SIZE = 0.95
 # Shortest interval, in samples, of readings that come now a sample earlier and now later, as from another clock
 MIN_UNEVEN_INTERVAL = 4
 
@@ -16,11 +18,13 @@ MIN_UNEVEN_INTERVAL = 4
 def repeated_readings(signal: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
     """Where a signal repeats the last reading of a sensor slower than the log; nowhere if it is read at every sample.
 
-    Such a signal changes only every so many samples. One of few counts changes seldom, too, but at any sample.
+    Such a signal changes only every so many samples. One of few counts changes seldom, too, but at any sample, or
+    always by one count.
     """
     nowhere = np.zeros(len(signal), bool)
-    changes = np.flatnonzero(np.abs(np.diff(signal)) > 0) + 1
-    if len(changes) < MIN_CHANGES:
+    sizes = np.abs(np.diff(signal))
+    changes = np.flatnonzero(sizes > 0) + 1
+    if len(changes) < MIN_CHANGES or _are_alike(sizes[changes - 1]):
         return nowhere
     steps = np.diff(changes)
     interval = int(np.gcd.reduce(steps))
@@ -32,6 +36,11 @@ def repeated_readings(signal: Float[np.ndarray, " samples"]) -> Bool[np.ndarray,
     if interval < MIN_UNEVEN_INTERVAL or np.min(steps) < interval - 1:
         return nowhere
     return ~np.isin(np.arange(len(signal)), np.append(0, changes))
+
+
+def _are_alike(sizes: Float[np.ndarray, " changes"]) -> bool:
+    """Whether nearly all changes are of one size."""
+    return bool(np.mean(np.isclose(sizes, np.median(sizes), rtol=1e-3)) > MAX_OF_ONE_SIZE)
 
 
 def reading_interval(known: Bool[np.ndarray, " samples"]) -> int:
