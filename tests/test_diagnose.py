@@ -259,6 +259,19 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
     assert [signal.effect for signal in call.args[1]] == list(gains)[:2]
 
 
+@pytest.mark.parametrize(("least_gain", "is_evidence"), [(0.0, True), (50.0, False)])
+def test_what_an_uneven_clock_may_leave_is_no_evidence(monkeypatch, least_gain, is_evidence):
+    """Its samples are simulated only approximately."""
+    clear = Mock(spec=Signal, gain=40.0, log_p=-20.0)
+    found = Mock(spec=Screen, candidates=[1], curves=[], least_gain=least_gain)
+    monkeypatch.setattr(naming, "screen", lambda model, library: found)
+    monkeypatch.setattr(naming, "signals", lambda screen: ([clear], []))
+    selection = StepwiseSelection.__new__(StepwiseSelection)
+    selection.base = Mock(spec=Model, effects=(), is_exact=False, fit=Mock(fitness=1.0))
+    selection.library = Mock(spec=Library)
+    assert (selection._assess(selection.base).p_value < FALSE_ALARM) == is_evidence
+
+
 @pytest.mark.parametrize(
     ("of_others", "misfit", "searches"), [("coulomb_friction", 90.0, 1), ("quadratic_drag", 90.0, 0)]
 )

@@ -114,7 +114,7 @@ def learned_curves(naming: Naming) -> tuple[LearnedCurve, ...]:
 def detectable_effects(screen: Screen) -> tuple[Detectable, ...]:
     """The smallest amplitude of each effect that would be detected with a probability of 90 %, if it is physical."""
     count = len(screen.candidates) + len(screen.curves)
-    needed = stats.norm.isf(FALSE_ALARM / count / 2) + stats.norm.isf(0.1)
+    needed = max(stats.norm.isf(FALSE_ALARM / count / 2) + stats.norm.isf(0.1), np.sqrt(screen.least_gain))
     smallest: dict[str, Detectable] = {}
     for candidate, block in zip(screen.candidates, screen.candidate_blocks, strict=True):
         field = candidate.amplitude

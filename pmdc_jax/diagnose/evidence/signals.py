@@ -42,6 +42,7 @@ class Screen(NamedTuple):
     coulomb_torque: float  # Coulomb friction in the model, N m
     # by unit: the amplitude that imperfect sensors alone may produce
     sensor_floors: Mapping[str, float]
+    least_gain: float = 0.0  # that counts as evidence, in whitened squares
 
     def is_possible(self, candidate: Candidate, coefficients: np.ndarray) -> bool:
         """Whether physics allows these coefficients, and the amplitude is not one that sensors may produce."""

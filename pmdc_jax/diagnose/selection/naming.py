@@ -107,7 +107,9 @@ class StepwiseSelection:
         candidate_signals, curve_signals = signals(evidence)
         count = len(evidence.candidates) + len(evidence.curves)
         count *= MAX_EFFECTS if model.effects else 1
-        p_value = 1.0 if model.is_exact else familywise_p_value(candidate_signals, curve_signals, count)
+        p_value = familywise_p_value(candidate_signals, curve_signals, count)
+        if model.is_exact or max(s.gain for s in (*candidate_signals, *curve_signals)) < evidence.least_gain:
+            p_value = 1.0
         explained = 0.0
         if model.effects:
             base, fitted = (self.comparison.fitted(m, evidence.white) for m in (self.base, model))
