@@ -272,26 +272,6 @@ def test_what_an_uneven_clock_may_leave_is_no_evidence(monkeypatch, least_gain, 
     assert (selection._assess(selection.base).p_value < FALSE_ALARM) == is_evidence
 
 
-@pytest.mark.parametrize(
-    ("of_others", "misfit", "searches"), [("coulomb_friction", 90.0, 1), ("quadratic_drag", 90.0, 0)]
-)
-def test_friction_is_searched_if_any_leading_effect_makes_the_rotor_stick(of_others, misfit, searches):
-    """Far from the motor with friction, saturation may fit better than friction does from there."""
-
-    def model(effects: tuple[str, ...], fitness: float) -> Mock:
-        problem = Mock(outputs=2)
-        fit = Mock(fitness=fitness)
-        return Mock(spec=Model, effects=effects, fit=fit, prepared=Mock(problem=problem), is_possible=True)
-
-    current, nearest = model((), 1000.0), model(("torque_constant_saturation",), 80.0)
-    nearest.effects_at_end = set()
-    searched = model(("coulomb_friction",), 3.0)
-    refits = Mock(spec=Refits, with_global_search=Mock(return_value=searched))
-    tried = [nearest, model((of_others,), misfit)]
-    found = Proposals(refits, Mock(), set())._searched_with_friction(current, tried)
-    assert found == [searched] * searches
-
-
 @pytest.mark.parametrize(("count", "p_value", "exchanges"), [(3, 0.0, 1), (2, 0.0, 0), (3, 1.0, 0)])
 def test_a_full_set_exchanges_the_effect_in_the_same_equation(monkeypatch, count, p_value, exchanges):
     """Of dry friction, a delay and an offset the first, if Stribeck friction has the largest expected gain."""

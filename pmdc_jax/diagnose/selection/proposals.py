@@ -167,19 +167,17 @@ class Proposals:
         """The motor with Coulomb friction from a new global search, if stiction may explain a large misfit.
 
         A rotor that sticks for long is too far from one that creeps for first-order evidence. So this is tried if no
-        possible model was `tried`, or the best of them is far from the noise, and one of the leading effects makes a
-        rotor stick.
+        possible model was `tried`, or the best of them is far from the noise, and a leading effect makes a rotor stick.
         The result must cut the misfit by a factor of `DECISIVE_RATIO`. With a load, too, where asymmetric friction
         ended at a bound: a load larger than friction drives the rotor in one direction.
         """
         possible = [model for model in tried if model is not None and model.is_possible]
         if possible:
             nearest = min(possible, key=lambda m: m.fit.fitness)
-            suspects = {effect for model in possible for effect in model.effects}
-            noise = POOR_MISFIT * current.prepared.problem.outputs
+            suspects, noise = nearest.effects, POOR_MISFIT * current.prepared.problem.outputs
         else:
             by_gain = sorted(self.assess(current).candidate_signals, key=lambda s: -s.gain)
-            suspects = set(list(dict.fromkeys(s.effect for s in by_gain))[:SHORTLIST])
+            suspects = tuple(dict.fromkeys(s.effect for s in by_gain))[:SHORTLIST]
             nearest, noise = current, current.prepared.problem.outputs
         sticks = any(EFFECTS[effect].holds == "speed" for effect in suspects)
         decisive = nearest.fit.fitness / DECISIVE_RATIO
