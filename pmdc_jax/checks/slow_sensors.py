@@ -14,14 +14,14 @@ def readings_only(run: Recording) -> Recording:
 
     If nothing else changes in between either, only the samples remain at which all these sensors are read.
     """
-    outputs = {name for name in OUTPUTS if getattr(run, name) is not None and name != run.drive}
+    outputs = [name for name in OUTPUTS if getattr(run, name) is not None and name != run.drive]
     repeated = {name: repeated_readings(getattr(run, name)) for name in outputs}
-    slow = {name: mask for name, mask in repeated.items() if mask.any()}
+    slow = [name for name in outputs if repeated[name].any()]
     if not slow:
         return run
-    any_mask = next(iter(slow.values()))
-    if slow.keys() == outputs and all(np.array_equal(mask, any_mask) for mask in slow.values()):
-        inputs = [x for x in (run.voltage, run.torque, run.load) if x is not None]
-        if not any(np.diff(x)[any_mask[1:]].any() for x in inputs):
-            return attrs.evolve(run, **{name: x[~any_mask] for name, x in run.columns().items()})
-    return attrs.evolve(run, **{name: np.where(mask, np.nan, getattr(run, name)) for name, mask in slow.items()})
+    between = repeated[slow[0]]
+    inputs = [x for x in (run.voltage, run.torque, run.load) if x is not None]
+    all_slow = all(np.array_equal(repeated[name], between) for name in outputs)
+    if all_slow and not any(np.diff(x)[between[1:]].any() for x in inputs):
+        return attrs.evolve(run, **{name: x[~between] for name, x in run.columns().items()})
+    return attrs.evolve(run, **{name: np.where(repeated[name], np.nan, getattr(run, name)) for name in slow})

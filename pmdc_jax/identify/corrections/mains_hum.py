@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ...motor import Motor
+from ...recordings.readings import reading_interval
 from ...recordings.recording import Recording
 from ...simulate import Tape
 from ..fit.fitted_runs import FittedRuns
@@ -54,7 +55,7 @@ def without_mains_hum(fitted: FittedRuns) -> FittedRuns:
 def _hums(fitted: FittedRuns) -> Iterator[tuple[int, float]]:
     """The outputs that hum, 0 for the current and 1 for the speed, with the frequency in Hz."""
     prepared = fitted.prepared
-    both = [k for k in training_indices(prepared) if _has_both_outputs(prepared.runs[k])]
+    both = [k for k in training_indices(prepared) if _shows_hum(prepared.runs[k])]
     if not both:
         return
     runs, residuals = [prepared.runs[k] for k in both], _residuals(fitted, both)
@@ -82,8 +83,11 @@ def _residuals(fitted: FittedRuns, runs: range | list[int]) -> list[Float[np.nda
     return [tape.samples_of(k, signal, len(fitted.prepared.runs[k])) for k in runs]
 
 
-def _has_both_outputs(run: Recording) -> bool:
-    return run.voltage is not None and run.current is not None and run.speed is not None
+def _shows_hum(run: Recording) -> bool:
+    """Whether a run has voltage, current and speed, without a sensor slower than the log: the rate of its readings may
+    be that of the mains."""
+    outputs = [x for x in (run.current, run.speed) if x is not None and reading_interval(~np.isnan(x)) == 1]
+    return run.voltage is not None and len(outputs) == 2
 
 
 def _refined(frequency: float, runs: list[Recording], residuals: list[Float[np.ndarray, " samples"]]) -> float:
