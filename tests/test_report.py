@@ -258,6 +258,14 @@ def test_long_runs_are_thinned_and_the_page_stays_small(tmp_path):
     assert "plot reduced to" in Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
 
 
+def test_the_readings_of_a_slow_sensor_are_joined():
+    time, values = np.arange(100.0), np.full(100, np.nan)
+    values[3::10] = np.arange(10.0)
+    drawn_time, drawn = envelope(time, values, 400)
+    np.testing.assert_array_equal(drawn_time, time[3::10])
+    np.testing.assert_array_equal(drawn, values[3::10])
+
+
 def test_envelope_keeps_peaks_order_and_gaps():
     rng = np.random.default_rng(1)
     time = np.arange(10_001) * 1e-3

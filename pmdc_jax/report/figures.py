@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import plotly.graph_objects as go
 
+from ..recordings.readings import reading_interval
+
 # colours
 MEASURED = "#a3b0c0"
 SIMULATED = "#0b5fcc"
@@ -37,8 +39,12 @@ def mark_noise(figure: go.Figure, row: int, noise: float | None) -> None:
 def envelope(time: np.ndarray, values: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
     """Thin a trace to at most `points` samples (even): the lowest and highest of each group of neighbours, in order.
 
-    Unlike decimation this keeps every peak, but shows noise at its full width.
+    Unlike decimation this keeps every peak, but shows noise at its full width. Of a sensor slower than the log only the
+    readings are drawn, joined by lines.
     """
+    known = ~np.isnan(values)
+    if reading_interval(known) > 1:
+        time, values = time[known], values[known]
     if len(values) > points:
         group = group_size(len(values), points)
         padding = (0, -len(values) % group)
