@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from attrs import frozen
 
-from .effects import EFFECTS, OTHER_FORMS, AbstractEffect
+from .effects import EFFECTS, OTHER_FORMS, AbstractEffect, form_with
 from .errors import InputError
 from .files import write_text
 from .json_file import finite_number, read_object
@@ -166,9 +166,7 @@ def _effects(where: str, entries: object) -> tuple[AbstractEffect, ...]:
         if name in effects:
             raise InputError(where, f"effect {name} is listed twice", "Keep one of the two")
         given = entry.get("parameters", {})
-        kind = EFFECTS[name]
-        if name in OTHER_FORMS and isinstance(given, dict) and set(given) - set(kind.ranges):
-            kind = OTHER_FORMS[name]
+        kind = form_with(name, given if isinstance(given, dict) else ())
         effects[name] = kind(**_numbers(where, given, kind.ranges, name))
     return tuple(effects.values())
 

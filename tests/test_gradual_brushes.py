@@ -62,6 +62,15 @@ def test_a_gradual_drop_is_named_with_its_onset():
     assert found.final.parameters["R"].value == pytest.approx(PAPER["R"], rel=2e-3)
 
 
+def test_a_field_that_no_form_has_does_not_select_one(tmp_path):
+    save_motor(tmp_path / "motor.json", Motor(**PAPER, effects=(BrushVoltageDrop(np.asarray(0.8)),)))
+    text = (tmp_path / "motor.json").read_text().replace('"voltage_V"', '"measured_on": 3, "voltage_V"')
+    (tmp_path / "motor.json").write_text(text)
+    assert text.count("measured_on") == 1
+    (read,) = load_motor(tmp_path / "motor.json").effects
+    assert type(read) is BrushVoltageDrop
+
+
 def test_both_forms_are_saved_and_read(tmp_path):
     for effect in (BrushVoltageDrop(np.asarray(0.8)), GradualBrushDrop(np.asarray(0.8), np.asarray(2.0))):
         save_motor(tmp_path / "motor.json", Motor(**PAPER, effects=(effect,)))

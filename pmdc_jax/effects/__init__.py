@@ -1,5 +1,7 @@
 """Physical effects beyond the linear motor, one class each; `EFFECTS` is the table of them by name."""
 
+from collections.abc import Iterable
+
 from .angle_torque import CoggingTorque, TorqueRipple
 from .base import AbstractEffect, Grip, ParameterRange, State
 from .brush_voltage_drop import BrushVoltageDrop, GradualBrushDrop
@@ -40,10 +42,16 @@ EFFECTS: dict[str, type[AbstractEffect]] = {
 OTHER_FORMS: dict[str, type[AbstractEffect]] = {GradualBrushDrop.name: GradualBrushDrop}
 
 
+def form_with(effect: str, fields: Iterable[str]) -> type[AbstractEffect]:
+    """The form of an effect that has these parameters: the other one if any of them belongs to that alone."""
+    usual = EFFECTS[effect]
+    other = OTHER_FORMS.get(effect, usual)
+    return other if (other.ranges.keys() - usual.ranges.keys()) & set(fields) else usual
+
+
 def range_of(effect: str, field: str) -> ParameterRange:
     """Unit and bounds of a parameter of an effect, in either of its forms."""
-    ranges = EFFECTS[effect].ranges
-    return ranges[field] if field in ranges else OTHER_FORMS[effect].ranges[field]
+    return form_with(effect, [field]).ranges[field]
 
 
 __all__ = [
@@ -71,5 +79,6 @@ __all__ = [
     "StribeckFriction",
     "TorqueConstantSaturation",
     "TorqueRipple",
+    "form_with",
     "range_of",
 ]

@@ -97,8 +97,7 @@ def _regression_columns(prepared: Prepared, fit: Fit) -> list[Series]:
         speed = np.asarray(fit.evaluation.simulated)[tape.blocks_of(run), 1].ravel()
         friction = _load_response(filters[tape.grid_of(run)], np.sign(speed))
         if (averaging := prepared.runs[run].averaging) is not None:
-            span = 1 if tape.span is None else int(tape.span[run])
-            friction[:, 1] = averaging.applied_to(friction[:, 1], span)
+            friction[:, 1] = averaging.applied_to(friction[:, 1], tape.span_of(run))
         if prepared.runs[run].current_averaged:
             friction[:, 0] = OVER_LAST.applied_to(friction[:, 0])
         derivatives = series_of(tape, run, J).values

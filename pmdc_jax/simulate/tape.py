@@ -169,6 +169,10 @@ class Tape(eqx.Module):
         """The grid of one run."""
         return int(np.asarray(self.grid)[self.blocks_of(run)][0])
 
+    def span_of(self, run: int) -> int:
+        """Samples from one reading of the speed of one run to the next, where that is a mean."""
+        return 1 if self.span is None else int(self.span[run])
+
     def drive_of(self, run: int) -> Drive:
         """The drive of one run."""
         return Drive(*(float(np.asarray(share)[self.grid_of(run)]) for share in self.drive))

@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 
 from ...effects import BrushVoltageDrop, GradualBrushDrop
 from ...identify.corrections.electrical_equation import MIN_FLOW
+from ...identify.corrections.gradual_brushes import ONSETS
 from ...identify.fit.generalised_least_squares import residuals_of, series_of
 from ...identify.noise.noise_model import Series
 from ...identify.noise.sensor_noise import noise_of_sensor, white_noise
@@ -34,9 +35,6 @@ MIN_SAMPLES = 50
 LAGS = range(2, 9)
 # Standard errors of a correlation that chance may bring
 CHANCE_ERRORS = 3.0
-# The drop of the brushes may set in gradually: currents, over their root mean square, at which it is within 1/e of its
-# final value
-ONSETS = (0.02, 0.06, 0.2)
 # Bounds of the natural logarithms of R, Kb and L over those of the model
 MAX_LOGARITHM = 7.0
 # Least first guess of L over R times the sample time: a smaller one is not felt, and no gradient leads back

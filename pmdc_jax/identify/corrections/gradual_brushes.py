@@ -28,10 +28,10 @@ def with_gradual_brushes(fitted: FittedRuns) -> FittedRuns:
     prepared, problem = fitted.prepared, fitted.problem
     if BrushVoltageDrop not in problem.parameters.effects or not problem.samples[0] > 0 or leaves_only_noise(fitted):
         return fitted
-    onsets = [share * float(problem.measured_rms[0]) for share in ONSETS]
+    onsets, least = float(problem.measured_rms[0]) * np.array(ONSETS), _least_onset(fitted)
     kinds = [GradualBrushDrop if kind is BrushVoltageDrop else kind for kind in problem.parameters.effects]
     gradual = prepared.with_effects(kinds)
-    ends = [_polished(gradual, fitted, onset) for onset in onsets if onset > _least_onset(fitted)]
+    ends = [_polished(gradual, fitted, onset) for onset in onsets[onsets > least]]
     if not ends:
         return fitted
     best = min(ends, key=lambda end: end.fit.cost)

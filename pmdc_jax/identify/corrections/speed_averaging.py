@@ -184,11 +184,11 @@ def _averaging_by_noise(prepared: Prepared) -> tuple[Averaging | None, float, bo
     A mean over the last sample can be told from a delay only if the speed is counted, or where the current is such a
     mean, and from an inductance only if the current was measured.
     """
+    if _is_slow(prepared):
+        # with or without counts, only the fit tells
+        return OVER_LAST, MIN_LOG_LIKELIHOOD_GAIN, False
     speeds = _speeds(prepared)
     counts = _in_counts(speeds)
-    if _is_slow(prepared):
-        # of a slow sensor, with or without counts, only the fit tells
-        return OVER_LAST, MIN_LOG_LIKELIHOOD_GAIN, False
     mean, min_gain = averaging_of_counts(counts) if counts else averaging_of_differences([s for s, _ in speeds])
     if mean is None and speeds and not counts and prepared.timing.current_mean:
         mean = OVER_LAST

@@ -211,8 +211,7 @@ def _responses(
         last, coming, of_current = np.asarray(tape.averaging)[run]
         responses[:, 0] = Averaging(of_current, 0.0).applied_to(responses[:, 0])
         later = 0.0 if tape.later is None else float(tape.later[tape.grid_of(run)])
-        span = 1 if tape.span is None else int(tape.span[run])
-        responses[:, 1] = Averaging(last, coming, later).applied_to(responses[:, 1], span)
+        responses[:, 1] = Averaging(last, coming, later).applied_to(responses[:, 1], tape.span_of(run))
     return np.moveaxis(responses.reshape(length // BLOCK, BLOCK, 2, len(steps.at)), 1, 2)
 
 
