@@ -136,6 +136,14 @@ def test_an_error_of_the_speed_over_the_angle_is_attributed_to_the_sensor(period
     assert sensor_ripple_of(found) == pytest.approx((0.02, periods), rel=0.05)
 
 
+def test_a_ripple_of_the_speed_sensor_far_below_its_noise_is_told_but_is_no_missing_effect():
+    runs = recorded(vb.BenchMotor(**PAPER), 6, NOISE)
+    found = diagnose([with_ripple(run, 0.001, 14) for run in runs])
+    assert found.verdict == "none_detected"
+    assert sensor_ripple_of(found) == pytest.approx((0.001, 14), rel=0.1)
+    assert any("tachometer ripple" in sentence for sentence in verdict_sentences(found))
+
+
 @pytest.mark.slow
 def test_a_ripple_of_the_speed_sensor_hides_no_friction():
     runs = recorded(vb.BenchMotor(**PAPER, coulomb_Nm=0.08), 6, NOISE)

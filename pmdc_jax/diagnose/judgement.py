@@ -102,14 +102,18 @@ def _by_evidence(naming: Naming) -> Verdict:
         return "not_in_library"
     if naming.p_nothing >= FALSE_ALARM:
         return "not_in_library" if naming.varies else "none_detected"
-    if _more_is_missing(naming) or not naming.chosen.effects:
+    if _more_is_missing(naming):
         return "not_in_library"
+    if not naming.chosen.effects:
+        return "none_detected" if naming.leaves_small_ripple else "not_in_library"
     return "ambiguous" if naming.rivals else "named"
 
 
 def _more_is_missing(naming: Naming) -> bool:
-    """Whether the chosen effects leave what no other form of them could explain."""
-    return naming.p_nothing_more < FALSE_ALARM and not naming.may_be_model_form_error
+    """Whether the chosen effects leave what neither another form of them could explain, nor is a small ripple of the
+    speed sensor."""
+    tolerated = naming.may_be_model_form_error or naming.leaves_small_ripple
+    return naming.p_nothing_more < FALSE_ALARM and not tolerated
 
 
 def _closed_fraction(naming: Naming, base: Identification, final: Identification) -> float:

@@ -33,6 +33,8 @@ CURVE_SHARE = 0.5
 EFFECT_SHARE = 0.7
 # By simple effect, its fuller form if that has no regression column: only a refit can test it, such as backlash
 REFIT_ONLY = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}
+# Share of the unfiltered squares up to which a ripple of the speed sensor hardly adds to its noise
+SMALL_RIPPLE_SHARE = 0.05
 # Largest difference of a number of periods from a multiple of another, over that one, of a harmonic
 MAX_DETUNING = 0.05
 # The clearest gain left, over what the effects explain, below which nothing more is worth a trial
@@ -125,6 +127,12 @@ class Assessment(NamedTuple):
         clearest = self.clearest.term
         return isinstance(clearest, Curve) and clearest.is_sensor_error
 
+    def is_small_ripple(self) -> bool:
+        """Whether the clearest signal is a ripple of the speed sensor that is far below its noise."""
+        clearest = self.clearest.term
+        is_ripple = isinstance(clearest, Curve) and clearest.is_sensor_ripple
+        return is_ripple and self._unfiltered_share() < SMALL_RIPPLE_SHARE
+
     def unfiltered_signals(self) -> list[Signal]:
         """The candidates' signals with their gains on the unfiltered residuals."""
         unfiltered = self.screen.unfiltered
@@ -135,10 +143,12 @@ class Assessment(NamedTuple):
         """`unexplained` for the unfiltered misfit: what the clearest signal would explain, over what the model does."""
         if not self.explained_unfiltered > 0:
             return np.inf
+        return self._unfiltered_share() * model.fit.fitness / self.explained_unfiltered
+
+    def _unfiltered_share(self) -> float:
+        """The share of the unfiltered squares that the clearest signal explains."""
         unfiltered = self.screen.unfiltered
-        after = unfiltered.regress([self.clearest.block]).squares
-        share = 1 - after / unfiltered.regress().squares
-        return float(share * model.fit.fitness / self.explained_unfiltered)
+        return float(1 - unfiltered.regress([self.clearest.block]).squares / unfiltered.regress().squares)
 
     def _belongs_to(self, model: Model) -> bool:
         """Whether the clearest signal belongs to an effect that the model has."""

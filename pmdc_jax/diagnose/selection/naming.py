@@ -57,6 +57,7 @@ class Naming(NamedTuple):
     p_nothing_more: float  # p-value of what is left if nothing more were missing
     may_be_model_form_error: bool  # what is left, of the chosen effects
     leaves_sensor_error: bool  # whether what is left is most like that
+    leaves_small_ripple: bool  # whether it is a ripple of the speed sensor that is far below its noise
     # root mean square of the chosen one's residuals beyond all curves over that of all; 1 if nothing more is missing
     noise_share: float
     p_without: dict[str, float]  # by effect of the chosen model: p-value of the data without it
@@ -239,6 +240,7 @@ class StepwiseSelection:
             p_nothing_more=assessment.p_value,
             may_be_model_form_error=assessment.may_be_model_form_error(current),
             leaves_sensor_error=more_missing and assessment.is_sensor_error(),
+            leaves_small_ripple=more_missing and assessment.is_small_ripple(),
             noise_share=np.sqrt(share_beyond(assessment.screen, curves)) if more_missing else 1.0,
             p_without=p_values_without(current, assessment.screen.white, self.refits, self.comparison),
             final_fit=final_fit(current, self.comparison.filter_of(current)),

@@ -24,7 +24,7 @@ def rest_sentence(diagnosis: Diagnosis) -> str:
     """What is left beside noise; empty if nothing is."""
     if diagnosis.varies:
         rest = varying_sentence(diagnosis, diagnosis.varies)
-    elif diagnosis.leaves_noise or not diagnosis.effects:
+    elif diagnosis.leaves_noise:
         return ""
     elif diagnosis.curves:
         rest = curve_sentence(diagnosis.curves[0])

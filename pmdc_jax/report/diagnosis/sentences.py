@@ -56,11 +56,13 @@ def verdict_sentences(diagnosis: Diagnosis) -> list[str]:
 
 
 def _none_detected(diagnosis: Diagnosis) -> list[str]:
-    return [
-        "No missing effect was detected: simulation and measurement differ by no more than the noise"
-        f" explains ({p_value_words(diagnosis.p_nothing)}).",
-        _detectable_sentence("", diagnosis),
-    ]
+    found = "No missing effect of the motor was detected."
+    if diagnosis.leaves_noise:
+        found = (
+            "No missing effect was detected: simulation and measurement differ by no more than the noise"
+            f" explains ({p_value_words(diagnosis.p_nothing)})."
+        )
+    return [found, _detectable_sentence("", diagnosis)]
 
 
 def _named(diagnosis: Diagnosis) -> list[str]:
