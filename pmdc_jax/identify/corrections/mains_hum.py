@@ -38,7 +38,7 @@ def without_mains_hum(fitted: FittedRuns) -> FittedRuns:
     if not hums:
         return fitted
     prepared, fit = fitted
-    residuals = _residuals(fitted, range(len(prepared.runs)))
+    residuals = [fitted.residuals(k) for k in range(len(prepared.runs))]
     runs, removed = list(prepared.runs), dict(prepared.mains_hum)
     for output, frequency in hums.items():
         name = ("current", "speed")[output]
@@ -58,7 +58,7 @@ def _hums(fitted: FittedRuns) -> Iterator[tuple[int, float]]:
     both = [k for k in training_indices(prepared) if _shows_hum(prepared.runs[k])]
     if not both:
         return
-    runs, residuals = [prepared.runs[k] for k in both], _residuals(fitted, both)
+    runs, residuals = [prepared.runs[k] for k in both], [np.nan_to_num(fitted.residuals(k)) for k in both]
     motor = prepared.problem.parameters(fitted.fit.coordinates)
     for output in (0, 1):
         spectra = [
@@ -74,13 +74,6 @@ def _hums(fitted: FittedRuns) -> Iterator[tuple[int, float]]:
         )
         if _is_of_sensor(motor, waves, output, frequency):
             yield output, frequency
-
-
-def _residuals(fitted: FittedRuns, runs: range | list[int]) -> list[Float[np.ndarray, "samples 2"]]:
-    """Measured less simulated current and speed of some runs, A and rad/s; zero where nothing was measured."""
-    tape, simulated = fitted.problem.tape, np.asarray(fitted.fit.evaluation.simulated)
-    signal = np.where(np.asarray(tape.weight) > 0, np.asarray(tape.measured) - simulated, 0.0)
-    return [tape.samples_of(k, signal, len(fitted.prepared.runs[k])) for k in runs]
 
 
 def _shows_hum(run: Recording) -> bool:
@@ -129,7 +122,7 @@ def _without(
         angles = 2 * np.pi * frequency * time[:, None] * np.array(orders)
         return np.concatenate([np.cos(angles), np.sin(angles)], 1)
 
-    known = residual != 0
+    known = ~np.isnan(residual)
     coefficients = np.linalg.lstsq(waves(run.time)[known], residual[known])[0]
     record = run.recorded
     quiet = {name: getattr(run, name) - waves(run.time) @ coefficients}

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
 from ..prepare import Prepared
 from ..problem import Problem
 from .gauss_newton import TOLERANCE
@@ -26,3 +29,9 @@ class FittedRuns(NamedTuple):
     def problem(self) -> Problem:
         """The least-squares problem of the runs."""
         return self.prepared.problem
+
+    def residuals(self, run: int) -> Float[np.ndarray, "samples 2"]:
+        """Measured less simulated current and speed of a run, A and rad/s; NaN where nothing was measured."""
+        tape, length = self.problem.tape, len(self.prepared.runs[run])
+        residual = np.asarray(tape.measured) - np.asarray(self.fit.evaluation.simulated)
+        return tape.samples_of(run, np.where(np.asarray(tape.weight) > 0, residual, np.nan), length)

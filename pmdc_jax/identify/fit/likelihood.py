@@ -45,16 +45,10 @@ def negative_log_likelihood_of(prepared: Prepared, evaluation: Evaluation) -> fl
 
 def leaves_only_noise(fitted: FittedRuns) -> bool:
     """Whether a fit leaves nothing of the training runs but the white noise of the sensors."""
-    prepared, fit = fitted
-    tape, training = prepared.problem.tape, training_indices(prepared)
-    residual = np.where(tape.weight > 0, tape.measured - fit.evaluation.simulated, np.nan)
-
-    def of_output(c: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        lengths = [(k, len(prepared.runs[k])) for k in training]
-        measured, residuals = (
-            [tape.samples_of(k, signal[:, c], length) for k, length in lengths]
-            for signal in (np.asarray(tape.measured), residual)
-        )
-        return list(zip(measured, residuals, strict=True))
-
-    return all(ratio_to_noise(of_output(c)) <= MAX_NOISE_RATIO for c in range(2))
+    prepared, training = fitted.prepared, training_indices(fitted.prepared)
+    tape = prepared.problem.tape
+    measured = [tape.samples_of(k, np.asarray(tape.measured), len(prepared.runs[k])) for k in training]
+    pairs = list(zip(measured, map(fitted.residuals, training), strict=True))
+    return all(
+        ratio_to_noise((signal[:, c], left[:, c]) for signal, left in pairs) <= MAX_NOISE_RATIO for c in range(2)
+    )
