@@ -30,7 +30,7 @@ from pmdc_jax.diagnose.hypotheses.curves import Curve
 from pmdc_jax.diagnose.hypotheses.effect_relations import FULLER, are_rivals, is_simpler_form
 from pmdc_jax.diagnose.hypotheses.library import Library
 from pmdc_jax.diagnose.hypotheses.trials import TRIALS
-from pmdc_jax.diagnose.judgement import implausible_effect, may_be_absent
+from pmdc_jax.diagnose.judgement import _by_evidence, implausible_effect, may_be_absent
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
 from pmdc_jax.diagnose.response import path_of, respond, sensor_changes, state_increments
 from pmdc_jax.diagnose.selection import naming, proposals
@@ -257,6 +257,14 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
     assert better is (tried if leaves_little else None)
     [call] = refits.with_signals.call_args_list
     assert [signal.effect for signal in call.args[1]] == list(gains)[:2]
+
+
+@pytest.mark.parametrize(("missed", "verdict"), [({}, "none_detected"), ({"current": 8.1}, "not_in_library")])
+def test_a_small_ripple_of_the_speed_sensor_is_accepted_only_beside_white_noise(missed, verdict):
+    """The inertia of a crank leaves such a ripple, too, but also residuals of the current far above its noise."""
+    ripple = {"may_be_model_form_error": False, "leaves_small_ripple": True}
+    found = Mock(spec=Naming, line=None, p_nothing=0.0, p_nothing_more=0.0, chosen=Mock(effects=()), **ripple)
+    assert _by_evidence(found, Mock(spec=Identification, missed=missed)) == verdict
 
 
 @pytest.mark.parametrize(("least_gain", "is_evidence"), [(0.0, True), (50.0, False)])

@@ -145,6 +145,32 @@ def test_a_ripple_of_the_speed_sensor_far_below_its_noise_is_told_but_is_no_miss
 
 
 @pytest.mark.slow
+def test_an_inertia_that_varies_with_the_angle_is_no_sensor_ripple():
+    """A crank: J(angle) dw/dt = Kt i - f w - J'(angle) w**2 / 2, in steps of a twentieth of a sample."""
+    rng, runs = np.random.default_rng(12), []
+    for name, sine in (("steps", False), ("triangle", True)):
+        time = 4e-3 * np.arange(1000)
+        triangle = 20 * signal.sawtooth(2 * np.pi * time / 2, 0.5)
+        voltage = triangle if sine else np.repeat(rng.uniform(-24, 24, 10), 100)
+        i, w, angle, current, speed = 0.0, 0.0, 0.0, [], []
+        for v in voltage:
+            current.append(i)
+            speed.append(w)
+            for _ in range(20):
+                step, wave = 2e-4, 2 * angle + 0.7
+                J, dJ = 9e-4 * (1 + 0.22 * np.cos(wave)), -9e-4 * 0.44 * np.sin(wave)
+                dw = (0.12 * i - 2e-4 * w - dJ * w**2 / 2) / J
+                i += step * (v - 0.7 * i - 0.12 * w) / 1.2e-3
+                w += step * dw
+                angle += step * w
+        noise = rng.standard_normal((2, 1000))
+        runs.append(Recording(name, time, voltage, current + 0.05 * noise[0], speed + 0.3 * noise[1]))
+    found = diagnose(runs, unloaded=True)
+    assert found.verdict == "not_in_library"
+    assert not any("tachometer ripple" in sentence for sentence in verdict_sentences(found))
+
+
+@pytest.mark.slow
 def test_a_ripple_of_the_speed_sensor_hides_no_friction():
     runs = recorded(vb.BenchMotor(**PAPER, coulomb_Nm=0.08), 6, NOISE)
     found = diagnose([with_ripple(run, 0.01, 14) for run in runs])

@@ -134,6 +134,16 @@ def test_a_wrong_formula_is_considered_if_residuals_exceed_the_noise():
     assert not any("another formula" in s for s in sentences)
 
 
+def test_an_oscillation_of_the_speed_is_no_sensor_error_if_the_current_has_it_too():
+    angle = np.linspace(0, np.pi, 9)
+    curve = LearnedCurve("sensor", "angle", "", angle, 0.01 * np.sin(2 * angle), np.full(9, 1e-3), 1e-9, False)
+    alone = not_in_library()
+    alone = evolve(alone, curves=(curve,), final=evolve(alone.final, missed={"speed": 4.0}))
+    assert "tachometer ripple" in words(alone)
+    both = evolve(alone, final=evolve(alone.final, missed={"current": 8.11, "speed": 4.0}))
+    assert "8.11 times its white noise. Something on the shaft varies with its angle" in words(both)
+
+
 def test_sentences_for_a_named_effect():
     text = words(named())
     location = "disagree in the mechanical equation, below 20.0 rad/s, in both directions."

@@ -80,7 +80,7 @@ def judge(
 
     **Arguments**: `base` and `final`, the motor without and with the effects, and the `electrical_misfits` of both.
     """
-    verdict = _by_evidence(naming)
+    verdict = _by_evidence(naming, final)
     if breaks_electrical_equation(*electrical_misfits):
         verdict = "not_in_library"
     fits, share = final.fit, naming.noise_share if verdict == "not_in_library" else 1.0
@@ -96,7 +96,7 @@ def judge(
     return verdict, noise
 
 
-def _by_evidence(naming: Naming) -> Verdict:
+def _by_evidence(naming: Naming, final: Identification) -> Verdict:
     """The verdict by the evidence against the motor without effects and against the chosen one."""
     if naming.line is not None:
         return "not_in_library"
@@ -105,7 +105,8 @@ def _by_evidence(naming: Naming) -> Verdict:
     if _more_is_missing(naming):
         return "not_in_library"
     if not naming.chosen.effects:
-        return "none_detected" if naming.leaves_small_ripple else "not_in_library"
+        is_small = naming.leaves_small_ripple and not final.missed
+        return "none_detected" if is_small else "not_in_library"
     return "ambiguous" if naming.rivals else "named"
 
 

@@ -27,7 +27,7 @@ def rest_sentence(diagnosis: Diagnosis) -> str:
     elif diagnosis.leaves_noise:
         return ""
     elif diagnosis.curves:
-        rest = curve_sentence(diagnosis.curves[0])
+        rest = curve_sentence(diagnosis)
     else:
         return (
             "The remaining error is small compared with the effect, but exceeds the noise: as much as another formula"
@@ -36,12 +36,13 @@ def rest_sentence(diagnosis: Diagnosis) -> str:
     return f"Not only noise is left. {rest}"
 
 
-def curve_sentence(curve: LearnedCurve) -> str:
+def curve_sentence(diagnosis: Diagnosis) -> str:
     """What the clearest unknown term looks like."""
+    curve = diagnosis.curves[0]
     if curve.variable == "current_rate":
         looks = _late_current(curve)
     elif curve.equation == "sensor":
-        looks = _oscillating_speed(curve)
+        looks = _oscillating_speed(curve, diagnosis.final.missed.get("current"))
     else:
         looks = _missing_term(curve)
     return f"Estimated from the data, it looks most like a {looks}"
@@ -56,11 +57,18 @@ def _late_current(curve: LearnedCurve) -> str:
     )
 
 
-def _oscillating_speed(curve: LearnedCurve) -> str:
+def _oscillating_speed(curve: LearnedCurve, current_residual: float | None) -> str:
+    """**Arguments**: `current_residual`, that of the current over its white noise, if that is large."""
     times, share = 2 * np.pi / curve.x[-1], 100 * float(np.max(np.abs(curve.value)))
+    causes = "tachometer ripple, or an eccentric encoder"
+    if current_residual:
+        causes = (
+            f"but no sensor of the speed disturbs the current, whose residual is {significant(current_residual)} times"
+            " its white noise. Something on the shaft varies with its angle, such as the inertia of a crank"
+        )
     return (
         f"speed reading that oscillates {significant(times)} times per turn, by {percent(share)} of the speed"
-        f" ({p_value_words(curve.p_value)}): tachometer ripple, or an eccentric encoder."
+        f" ({p_value_words(curve.p_value)}): {causes}."
     )
 
 

@@ -97,7 +97,7 @@ def _not_in_library(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.varies:
         sentences.append(varying_sentence(diagnosis, diagnosis.varies))
     elif diagnosis.curves:
-        sentences.append(curve_sentence(diagnosis.curves[0]))
+        sentences.append(curve_sentence(diagnosis))
     # a misread current or speed leaves the electrical equation unbalanced, too
     misread = any(curve.equation == "sensor" for curve in diagnosis.curves[:1])
     if diagnosis.breaks_electrical_equation and not (misread or diagnosis.varies):
