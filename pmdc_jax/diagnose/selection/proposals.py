@@ -32,6 +32,9 @@ MIN_UNFILTERED_SHARE = 0.05
 # Misfit (noise variances per output) from which a first-order start may lead a refit to a wrong optimum
 POOR_MISFIT = 10.0
 
+# What a refit-only form may leave of what its simple form left unexplained, to be all that is missing
+MAX_REST = 0.5
+
 # None where physics forbids the coefficients found
 Proposed = list[Model | None]
 
@@ -55,7 +58,7 @@ class Proposals:
         refit_only = []
         if not assessment.is_clearly_effect():
             refit_only = self.in_refit_only_forms(current, present)
-        if any(self._is_sufficient(model) for model in refit_only):
+        if any(self._is_sufficient(model, assessment) for model in refit_only):
             return refit_only
         tried = []
         if assessment.calls_for_effect():
@@ -152,16 +155,18 @@ class Proposals:
         ]
         return self.refits.with_replacements(current, white, swaps)
 
-    def _is_sufficient(self, model: Model | None) -> bool:
-        """Whether a model leaves nothing that is worth another trial.
+    def _is_sufficient(self, model: Model | None, before: Assessment) -> bool:
+        """Whether a refit-only form leaves nothing that is worth another trial, and most of what was left `before`
+        is gone.
 
-        If a refit-only form is sufficient, no other effect is tried: what a simple form leaves of gear teeth may look
-        like many.
+        If it is, no other effect is tried: what a simple form leaves of gear teeth may look like many.
         """
         if model is None or not model.is_possible:
             return False
         assessment = self.assess(model)
-        return assessment.p_value >= FALSE_ALARM or assessment.is_negligible(model)
+        if assessment.p_value >= FALSE_ALARM:
+            return True
+        return assessment.is_negligible(model) and assessment.unexplained < MAX_REST * before.unexplained
 
     def _searched_with_friction(self, current: Model, tried: Sequence[Model | None]) -> Proposed:
         """The motor with Coulomb friction from a new global search, if stiction may explain a large misfit.
