@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import typer
 
 from .errors import InputError
+from .files import check_outputs
 from .options import (
     Column,
     Controller,
@@ -101,8 +102,6 @@ def identify(
     and reports which of them the recordings do not determine. Runs without current or voltage are
     used for what they determine.
     """
-    from .files import check_outputs
-
     check_outputs({"--save": save, "--json": json, "--report": report}, [*runs, *holdout])
     columns = pairs("--column", column)
     options = fit_options(tie, known, unloaded, search, seed) | {"effects": tuple(effect)}
@@ -111,13 +110,15 @@ def identify(
     identification = _read_and_fit(identify, runs, holdout, columns, options)
     from .report.identification.json import identification_json
     from .report.identification.tables import identification_tables
+    from .report.terminal import print_findings
 
-    _print_findings_and_save(identification, save)
+    print_findings(identification)
+    _print_and_write(identification, json, identification_json, identification_tables)
+    _save(identification, save)
     if report:
         from .report.identification.page import write_identification_report
 
         write_identification_report(identification, report)
-    _write_and_print(identification, json, identification_json, identification_tables)
     return _status(identification)
 
 
@@ -141,8 +142,6 @@ def diagnose(
     Shows where simulation and measurement disagree, names the missing effect, adds it to the model,
     and shows how much of the disagreement it removes. --save writes the extended motor.
     """
-    from .files import check_outputs
-
     outputs = {"--save": save, "--json": json, "--report": report, "--experiment": experiment}
     check_outputs(outputs, [*runs, *holdout])
     columns = pairs("--column", column)
@@ -152,8 +151,11 @@ def diagnose(
     diagnosis = _read_and_fit(diagnose, runs, holdout, columns, options)
     from .report.diagnosis.json import diagnosis_json
     from .report.diagnosis.tables import diagnosis_tables
+    from .report.terminal import print_findings
 
-    _print_findings_and_save(diagnosis.final, save)
+    print_findings(diagnosis.final)
+    _print_and_write(diagnosis, json, diagnosis_json, diagnosis_tables)
+    _save(diagnosis.final, save)
     if experiment:
         from .report.experiment import write_experiment
 
@@ -163,7 +165,6 @@ def diagnose(
         from .report.diagnosis.page import write_diagnosis_report
 
         write_diagnosis_report(diagnosis, report)
-    _write_and_print(diagnosis, json, diagnosis_json, diagnosis_tables)
     return _status(diagnosis.final)
 
 
@@ -173,15 +174,13 @@ def simulate(motor: MotorFile, input: Input, out: Output, column: Column = []) -
 
     Voltage and load are read from the recording; current and speed are written to another file.
     """
-    from .files import check_outputs
-
     check_outputs({"--out": out}, [motor, input])
-    columns = dict(pairs("--column", column))
-    from .recordings.recording_file import check_recording_suffix, read_recording, write_recording
+    columns = pairs("--column", column)
+    from .recordings.recording_file import check_recording_suffix, read_recordings, write_recording
     from .simulate import simulate
 
     check_recording_suffix(out)
-    driven = read_recording(input, columns, to_simulate=True)
+    (driven,) = read_recordings([input], columns, to_simulate=True)
     write_recording(simulate(motor, driven), out)
 
 
@@ -211,8 +210,6 @@ def tune(
     Tunes on the sampled loop with its delay and limits and over the uncertainty of the motor, and
     compares with the fastest settling possible within the voltage and current limits.
     """
-    from .files import check_outputs
-
     check_outputs({"--save": save, "--json": json, "--report": report}, [motor])
     from .control.pipeline import tune
     from .report.terminal import print_messages, progress
@@ -240,6 +237,7 @@ def tune(
     from .report.tuning.tables import tuning_tables
 
     print_messages(tuning.messages)
+    _print_and_write(tuning, json, tuning_json, tuning_tables)
     if save:
         from .control.controller_file import save_controller
 
@@ -248,7 +246,6 @@ def tune(
         from .report.tuning.page import write_tuning_report
 
         write_tuning_report(tuning, report)
-    _write_and_print(tuning, json, tuning_json, tuning_tables)
 
 
 @app.command(epilog="Example: pmdc export controller.json --c controller.h")
@@ -257,8 +254,6 @@ def export(controller: ControllerFile, c: HeaderFile) -> None:
 
     One C99 header: the sampled control law with its limits and anti-windup.
     """
-    from .files import check_outputs
-
     check_outputs({"--c": c}, [controller])
     from .control.controller_file import load_controller
     from .control.export import export
@@ -327,32 +322,32 @@ def _status(identification: Identification) -> int:
     return INTERRUPTED if identification.search.interrupted else DONE
 
 
-def _print_findings_and_save(identification: Identification, path: Path | None) -> None:
-    """Print the findings about the recordings, and save the motor if a path is given."""
-    from .report.terminal import print_findings
-
-    print_findings(identification)
+def _save(identification: Identification, path: Path | None) -> None:
+    """Save the motor if a path is given."""
     if path:
         from .motor_file import save_motor
 
         save_motor(path, identification.motor, identification)
 
 
-def _write_and_print(
+def _print_and_write(
     result: Result,
     json: str | None,
     as_json: Callable[[Result], dict[str, Any]],
     tables: Callable[[Result], RenderableType],
 ) -> None:
-    """Write JSON if a path is given; print tables unless the JSON went to standard output."""
-    if json:
-        from .report.json import write_json
+    """Print tables, unless JSON goes to standard output; write JSON if a path is given.
 
-        write_json(as_json(result), json)
+    Printed first, so that the result is not lost if a file cannot be written.
+    """
     if json != "-":
         from .report.terminal import print_tables
 
         print_tables(tables(result))
+    if json:
+        from .report.json import write_json
+
+        write_json(as_json(result), json)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

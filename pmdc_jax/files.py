@@ -11,7 +11,13 @@ from pathlib import Path
 from .errors import InputError
 
 # what the file of an option may end in, if it ends in anything
-SUFFIXES = {"--save": (".json",), "--report": (".html", ".htm"), "--experiment": (".csv",)}
+SUFFIXES = {
+    "--save": (".json",),
+    "--json": (".json", ".txt"),
+    "--report": (".html", ".htm"),
+    "--experiment": (".csv",),
+    "--c": (".h", ".c"),
+}
 
 
 def check_outputs(outputs: dict[str, Path | str | None], inputs: list[Path]) -> None:
@@ -24,10 +30,10 @@ def check_outputs(outputs: dict[str, Path | str | None], inputs: list[Path]) -> 
         if output is None or (option == "--json" and str(output) == "-"):
             continue
         path = Path(output)
-        check_writable(option, path)
         if path.resolve() in taken:
             other = taken[path.resolve()]
             raise InputError(option, f"{path} is also {other}", "Give every output its own file")
+        check_writable(option, path)
         if path.is_file() or not path.exists():  # devices such as /dev/null may be shared
             taken[path.resolve()] = f"the output of {option}"
 
@@ -43,12 +49,13 @@ def check_writable(option: str, path: Path) -> None:
     wanted = SUFFIXES.get(option, ())
     if wanted and path.suffix and path.suffix.lower() not in wanted:
         mend = f"Give a name that ends in {' or '.join(wanted)}"
-        raise InputError(option, f"{path} would not be a {path.suffix} file", mend)
+        raise InputError(option, f"what it writes to {path} is no {path.suffix} file", mend)
+    path = path.resolve()  # what a link points to is written
     folder = path.parent
     if not folder.is_dir():
         raise InputError(option, f"the folder {folder} does not exist", "Create it first, or choose another")
-    writable = os.access(path, os.W_OK) if path.exists() else _takes_files(folder)
-    if not writable:
+    replaces = path.is_file() or not path.exists()  # a device is written itself
+    if (path.exists() and not os.access(path, os.W_OK)) or (replaces and not _takes_files(folder)):
         raise InputError(option, f"{path} cannot be written", "Choose another location")
 
 

@@ -20,7 +20,7 @@ def read_object(path: str | Path, form: str, mend: str) -> dict[str, Any]:
     """
     where = str(path)
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(where, "there is no such file", mend) from None
     except OSError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import reduce
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,6 +26,15 @@ class Drive(NamedTuple):
     current: Scalars | float = 0.0
     torque: Scalars | float = 0.0
     free: Scalars | float = 1.0
+
+
+DriveName = Literal["voltage", "current", "torque"]
+# By the input that drives a motor, the parameters that its simulation depends on
+PARAMETERS_OF_DRIVE: dict[DriveName, tuple[str, ...]] = {
+    "voltage": tuple(PARAMETERS),
+    "current": ("Kt", "J", "f"),
+    "torque": ("J", "f"),
+}
 
 
 class Motor(eqx.Module):

@@ -14,7 +14,7 @@ from .effects import EFFECTS, OTHER_FORMS, AbstractEffect, form_with
 from .errors import InputError
 from .files import write_text
 from .json_file import finite_number, read_object
-from .motor import PARAMETERS, Motor
+from .motor import PARAMETERS, PARAMETERS_OF_DRIVE, DriveName, Motor
 
 if TYPE_CHECKING:
     from .identify.identification import Identification
@@ -28,7 +28,8 @@ def save_motor(path: str | Path, motor: Motor, identification: Identification | 
     """Write a motor as JSON, atomically.
 
     **Arguments**: `motor`, with scalar parameters; `identification`, whose standard errors, statuses, covariance (of
-    the coordinates: natural logarithms of positive parameters) and noise of the sensors are saved with the values.
+    the coordinates: natural logarithms of positive parameters) and noise of the sensors are saved with the values. What
+    no recording depends on is null.
     """
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -38,6 +39,7 @@ def save_motor(path: str | Path, motor: Motor, identification: Identification | 
     }
     if identification is not None:
         estimates = identification.parameters
+        content["parameters"] = {name: estimates[name].value for name in PARAMETERS}
         content["stderr"] = {name: estimate.stderr for name, estimate in estimates.items()}
         content["status"] = {name: estimate.status for name, estimate in estimates.items()}
         content["covariance"] = {
@@ -77,13 +79,20 @@ class MotorFile:
                 raise InputError(where, f'"{name}" is not an object', MEND)
         return cls(where, content)
 
-    @property
-    def motor(self) -> Motor:
+    def motor(self, drive: DriveName = "voltage") -> Motor:
+        """The motor, for simulations with one kind of input; what affects none of them may be null, and is then 1."""
         for name, unit in self.content.get("units", {}).items():
             if unit != PARAMETERS.get(name, unit):
                 what = f"the unit of {name} is {unit!r}, but values are read in {PARAMETERS[name]}"
                 raise InputError(self.where, what, f"Convert the value to {PARAMETERS[name]}")
-        constants = _numbers(self.where, self.content["parameters"], PARAMETERS, "parameters")
+        given = self.content["parameters"]
+        needless = {name: 1.0 for name in PARAMETERS if name not in PARAMETERS_OF_DRIVE[drive]}
+        constants = {name: value for name, value in given.items() if value is not None}
+        for name in PARAMETERS_OF_DRIVE[drive]:
+            if name in given and given[name] is None:
+                what, mend = f"{name} is null: no recording determined it", "Identify it, or write its value in SI"
+                raise InputError(self.where, what, mend)
+        constants = _numbers(self.where, needless | constants, PARAMETERS, "parameters")
         return Motor(**constants, effects=_effects(self.where, self.content.get("effects", [])))
 
     @property
@@ -116,12 +125,15 @@ class MotorFile:
         return noise
 
 
-def load_motor(path: str | Path) -> Motor:
+def load_motor(path: str | Path, drive: DriveName = "voltage") -> Motor:
     """Read a motor written by `save_motor` or by hand; only "parameters" is required.
+
+    **Arguments**: `path`; `drive`, the input of the simulations that it is for: parameters that they do not depend on
+    may be null.
 
     **Raises**: `InputError` if the file is missing, is not JSON, or has missing or invalid entries.
     """
-    return MotorFile.read(path).motor
+    return MotorFile.read(path).motor(drive)
 
 
 def load_uncertainty(path: str | Path) -> Uncertainty | None:

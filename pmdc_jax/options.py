@@ -23,7 +23,7 @@ Experiment = Annotated[
     Path | None,
     typer.Option(metavar="OUT.csv", help="Write the voltage of the next experiment, if the verdict is ambiguous."),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Random seed of the search.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Random seed of the search.")]
 Column = Annotated[
     list[str],
     typer.Option(
@@ -94,9 +94,14 @@ Folder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result
 
 def fit_options(tie: list[str], known: list[str], unloaded: bool, search: str, seed: int) -> dict[str, Any]:
     """The keyword arguments that `identify` and `diagnose` have in common."""
+    fixed = pairs("--known", known)
+    for name, text in fixed:
+        if dict(fixed)[name] != text:
+            what = f"{name} is also given as {dict(fixed)[name]}"
+            raise InputError(f"--known {name}={text}", what, "Give each parameter one value")
     return {
         "tie": tuple(pairs("--tie", tie)),
-        "known": {name: _number("--known", name, text) for name, text in pairs("--known", known)},
+        "known": {name: _number("--known", name, text) for name, text in fixed},
         "unloaded": unloaded,
         "search": search,
         "seed": seed,

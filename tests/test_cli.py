@@ -51,7 +51,7 @@ def faked(monkeypatch, tmp_path, no_terminal):
         calls.read.append((str(path), columns))
         return Path(path).stem
 
-    def read_recordings(paths, mappings):
+    def read_recordings(paths, mappings, to_simulate=False):
         return [read_recording(path, mappings) for path in paths]
 
     def save_motor(path, motor, identification):
@@ -225,6 +225,10 @@ def test_diagnose_reports_bad_input_in_one_message(faked, capsys):
         ("identify a.csv --column speed", ["--column speed", "speed=rpm_meas:rpm"]),
         ("identify a.csv --known R=much", ["--known R=much", "not a number", "SI"]),
         ("identify a.csv --known R=nan", ["--known R=nan", "not a number"]),
+        ("identify a.csv --known R=1 --known R=2", ["--known R=1", "also given as 2"]),
+        ("identify a.csv --seed 99999999999999999999", ["--seed"]),
+        ("identify a.csv --json b.csv", ["--json", "b.csv", ".json"]),
+        ("export controller.json --c motor.json", ["--c", "motor.json", ".h"]),
         ("identify a.csv --report nowhere/x.html", ["--report", "nowhere", "does not exist"]),
         ("identify a.csv --save .", ["--save", "folder"]),
         ("identify a.csv --report=", ["--report", "the name is empty"]),

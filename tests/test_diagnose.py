@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 
 from benchmarks import virtual_bench as vb
 from experiments.bench import recording
-from pmdc_jax import Recording
+from pmdc_jax import InputError, Recording, diagnose, simulate
 from pmdc_jax.diagnose.evidence.assessment import FALSE_ALARM, Assessment
 from pmdc_jax.diagnose.evidence.quantisation import ROUNDING_DRAWS, rounding_errors
 from pmdc_jax.diagnose.evidence.regression import Block, gather_evidence
@@ -575,6 +575,34 @@ def test_the_filter_omits_rows_that_need_missing_samples():
     clean = Series(values, known, (1e-3, (0, 1)))
     white = fit_whitener([clean])
     np.testing.assert_array_equal(white(0, clean), white(0, clean._replace(values=damaged)))
+
+
+def test_gaps_do_not_prevent_whitening():
+    """Twelve samples of a hundred, scattered, so that hardly thirty in a row were measured."""
+    known = np.random.default_rng(3).random(8000) > 0.2
+    white = fit_whitener([Series(coloured(0, 8000, 1.0), known, (1e-3, (0, 1)))])
+    assert len(white.filters[0]) >= 2
+
+
+@pytest.mark.parametrize("samples", [3, 16, 25, 31, 45])
+def test_a_few_readings_are_scaled_like_the_other_runs_of_their_kind(samples):
+    kind = (1e-3, (0, 1))
+    short = Series(coloured(1, samples, 1.0), np.ones(samples, bool), kind)
+    long = Series(coloured(2, 4000, 1.0), np.ones(4000, bool), kind)
+    assert np.isfinite(fit_whitener([short]).scales[0]).all()
+    white = fit_whitener([long, short])
+    assert np.abs(np.log(np.diag(white.scales[1]) / np.diag(white.scales[0]))).max() < 0.7
+
+
+def test_too_few_readings_are_not_diagnosed():
+    time = 1e-3 * np.arange(400)
+    run = simulate(Motor(**PAPER), Recording("run", time, 12 * np.sign(np.sin(400 * time))))
+    outputs = np.stack([run.current, run.speed]) + np.random.default_rng(2).normal(0, 0.1, (2, 400))
+    apart = [np.where(np.arange(400) % 2 == k, x, np.nan) for k, x in enumerate(outputs)]
+    with pytest.raises(InputError, match="read together only 0 times"):
+        diagnose(Recording("apart", time, run.voltage, *apart), unloaded=True)
+    with pytest.raises(InputError, match="read together only 30 times"):
+        diagnose(Recording("short", time[:30], run.voltage[:30], *outputs[:, :30]), unloaded=True)
 
 
 # ------------------------------------------------------------------------- lines in the spectrum

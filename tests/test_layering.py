@@ -29,7 +29,7 @@ ALLOWED_IMPORTS = {
     "simulate": {"effects", "errors", "motor", "motor_file", "recordings", "runtime"},
     "control": {"effects", "errors", "files", "json_file", "motor", "motor_file", "progress", "runtime", "simulate"},
     "identify": {"checks", "effects", "errors", "motor", "progress", "recordings", "runtime", "simulate", "words"},
-    "diagnose": {"effects", "identify", "motor", "progress", "recordings", "runtime", "simulate"},
+    "diagnose": {"effects", "errors", "identify", "motor", "progress", "recordings", "runtime", "simulate"},
     "report": {
         "control",
         "diagnose",

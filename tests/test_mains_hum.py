@@ -54,6 +54,12 @@ def test_hum_of_a_sensor_is_removed(amplitude, frequency, of, said):
     assert unit == said.split(" ", 1)[1]
 
 
+def test_a_run_that_is_sampled_too_slowly_to_show_hum_is_left_as_it_is():
+    runs = recorded(0.1)
+    quick, slow = runs[0], {name: x[::10] for name, x in runs[1].columns().items()}
+    assert identify([quick, runs[2]], holdout=Recording("slow", **slow)).fit["slow"].role == "holdout"
+
+
 @pytest.mark.parametrize(
     ("amplitude", "frequency", "of"), [(0.0, 50.0, "current_A"), (0.1, 50.0, "torque"), (0.1, 43.0, "current_A")]
 )

@@ -51,6 +51,22 @@ def test_a_hand_written_file_needs_the_six_parameters_only(tmp_path):
     assert motor.effects == ()
 
 
+def test_what_no_recording_determined_is_refused_where_it_is_needed(tmp_path):
+    path = tmp_path / "motor.json"
+    path.write_text(json.dumps({"parameters": PAPER | dict.fromkeys(("R", "L", "Kb", "Kt"))}))
+    assert float(load_motor(path, "torque").J) == PAPER["J"]
+    with pytest.raises(InputError, match="R is null: no recording determined it"):
+        load_motor(path)
+    with pytest.raises(InputError, match="Kt is null"):
+        load_motor(path, "current")
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path):
+    path = tmp_path / "motor.json"
+    path.write_text(json.dumps({"parameters": PAPER}), encoding="utf-8-sig")
+    assert fields(load_motor(path)) == PAPER
+
+
 def test_a_file_states_the_units_of_its_values(tmp_path):
     save_motor(tmp_path / "motor.json", Motor(**PAPER))
     content = json.loads((tmp_path / "motor.json").read_text())

@@ -267,7 +267,16 @@ def test_dates_become_seconds_since_the_first(tmp_path, form):
     assert run.notes == ()
 
 
-@pytest.mark.parametrize("header", ["timestamp", "datetime", "Date/Time", "Date", "time_ms", "Zeit [µs]"])
+def test_thousands_separators_that_look_like_decimal_commas_are_refused(tmp_path):
+    rows = [f"{t};{t};{n}" for t, n in zip(T, ["998", "999", *["1,000"] * (len(T) - 2)], strict=True)]
+    with pytest.raises(InputError, match=r"line 4 a comma\. Export the file without thousands separators"):
+        read_text(tmp_path, "\n".join(["time_s;voltage_V;speed [rpm]", *rows]))
+
+
+CLOCKS = ["Time [hh:mm:ss]", "time (HH:MM:SS.fff)"]
+
+
+@pytest.mark.parametrize("header", ["timestamp", "datetime", "Date/Time", "Date", "time_ms", "Zeit [µs]", *CLOCKS])
 def test_dates_are_the_time_in_seconds_whatever_their_header_says(tmp_path, header):
     lines = [f"2026-03-01T12:00:00.{k:02},{k},{k}" for k in range(12)]
     run = read_text(tmp_path, "\n".join([f"{header},voltage_V,speed_rpm", *lines]))
@@ -401,6 +410,35 @@ def test_a_header_in_a_comment_as_by_numpy_is_read(tmp_path):
     columns = np.stack([T, T, T], axis=1)
     np.savetxt(path, columns, delimiter=",", header="time_s,voltage_V,speed_rad_s")
     np.testing.assert_allclose(read_recording(path).speed, T)
+
+
+def test_a_header_in_a_comment_may_have_semicolons(tmp_path):
+    text = table("# time_s,voltage_V,speed_rad_s", T, T, T, separator=";").replace("voltage_V,", "voltage_V;")
+    np.testing.assert_allclose(read_text(tmp_path, text.replace("time_s,", "time_s;")).speed, T)
+
+
+@pytest.mark.parametrize("header", ["Temperature [F]", "Torque [%]"])
+def test_a_column_that_is_not_used_may_have_any_unit(tmp_path, header):
+    run = read_text(tmp_path, table(f"time_s,voltage_V,current_A,speed_rad_s,{header}", T, T, T, T, T))
+    assert header in run.ignored
+
+
+def test_a_torque_in_another_unit_is_refused_where_it_would_drive_the_motor(tmp_path):
+    with pytest.raises(InputError, match="Torque"):
+        read_text(tmp_path, table("time_s,speed_rad_s,Torque [%]", T, T, T))
+
+
+def test_a_matrix_column_that_a_file_lacks_is_named_whole(tmp_path):
+    with pytest.raises(InputError, match=r"no column 'data\(:,9\)'"):
+        read_text(tmp_path, table("time_s,voltage_V,n", T, T, T), {"speed": "data(:,9)"})
+
+
+def test_a_date_column_without_dates_is_refused(tmp_path):
+    path = tmp_path / "run.parquet"
+    none = pl.Series([None] * len(T), dtype=pl.Datetime)
+    pl.DataFrame({"time": none, "voltage_V": T, "speed_rad_s": T}).write_parquet(path)
+    with pytest.raises(InputError, match="time"):
+        read_recording(path)
 
 
 @pytest.mark.parametrize("cell", ["", "NaN", "nan", "NA", " "])

@@ -422,6 +422,13 @@ def test_an_output_that_is_an_input_is_refused(tmp_path):
         files.check_outputs({"--json": tmp_path / "a" / ".." / "run.csv"}, [tmp_path / "run.csv"])
 
 
+def test_an_output_that_is_a_link_into_nowhere_is_refused(tmp_path):
+    link = tmp_path / "link.json"
+    link.symlink_to(tmp_path / "nowhere" / "motor.json")
+    with pytest.raises(InputError, match="does not exist"):
+        files.check_outputs({"--save": link}, [])
+
+
 @pytest.mark.parametrize(
     ("estimate", "expected"),
     [

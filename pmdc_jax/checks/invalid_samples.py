@@ -109,7 +109,10 @@ def _spikes(signal: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples
     size = np.where(before * after > 0, np.minimum(np.abs(before), np.abs(after)), 0.0)
     aside = np.abs(signal[2:] - signal[:-2])
     low, high = np.nanquantile(signal, [0.02, 0.98])
-    least = max(SPIKE_RATIO * np.nanmedian(np.abs(np.diff(signal, 2))), MIN_SPIKE * (high - low))
+    bends = np.abs(np.diff(signal, 2))
+    if np.isnan(bends).all():  # no three samples in a row
+        return np.zeros(len(signal), bool)
+    least = max(SPIKE_RATIO * np.nanmedian(bends), MIN_SPIKE * (high - low))
     return np.pad((size > least) & (aside < MAX_STEP_ASIDE * size), 1)
 
 

@@ -87,7 +87,7 @@ def tune(
         file = MotorFile.read(motor)
         uncertainty = uncertainty or file.uncertainty
         recorded_noise = file.speed_noise if recorded_noise is None else recorded_noise
-        motor = file.motor
+        motor = file.motor()
     requirements = LoopRequirements(
         controller=controller,
         setpoint=setpoint,

@@ -6,9 +6,12 @@ import time
 from collections.abc import Mapping, Sequence
 
 import attrs
+import numpy as np
 
+from ..errors import InputError
+from ..identify.fit.generalised_least_squares import series_of, training_indices
 from ..identify.identification import Identification
-from ..identify.prepare import prepare
+from ..identify.prepare import Prepared, prepare
 from ..identify.results import results_of
 from ..identify.solve import Solved
 from ..progress import ReportProgress, silent
@@ -25,6 +28,9 @@ from .gap import closed_fraction, gaps_by_role, gaps_of_runs
 from .judgement import implausible_effect, judge, unneeded_effect
 from .selection.attempts import Attempt, likeliest_attempt
 from .selection.naming import Naming
+
+# Fewest samples with all outputs: with 24 of them, one motor in eight that lacks nothing seemed to lack something
+MIN_READINGS = 40
 
 
 @double_precision
@@ -54,6 +60,7 @@ def diagnose(
     free_memory_maps()
     report("checking the recordings")
     prepared = prepare(recordings, holdout, tie=tie, known=known, unloaded=unloaded)
+    _refuse_few_readings(prepared)
     attempt = likeliest_attempt(prepared, search, seed, report)
     naming_ended = time.perf_counter()
     report("estimating the uncertainty", attempt.naming.chosen.fit.fitness)
@@ -64,6 +71,16 @@ def diagnose(
         "total": time.perf_counter() - began,
     }
     return attrs.evolve(diagnosis, final=attrs.evolve(diagnosis.final, seconds=seconds), seconds=seconds)
+
+
+def _refuse_few_readings(prepared: Prepared) -> None:
+    tape = prepared.problem.tape
+    readings = sum(
+        int(series_of(tape, run, np.asarray(tape.measured)).known.sum()) for run in training_indices(prepared)
+    )
+    if readings < MIN_READINGS:
+        what = f"all recorded outputs are read together only {readings} times; a diagnosis needs {MIN_READINGS}"
+        raise InputError("the training runs", what, "Record longer runs, or only identify the motor")
 
 
 def _diagnosis(attempt: Attempt) -> Diagnosis:

@@ -121,6 +121,8 @@ def unit_of(name: str) -> str:
 
 def effects_named(names: Sequence[str]) -> tuple[type[AbstractEffect], ...]:
     """Effect classes by name; raises `InputError` on an unknown one."""
+    if isinstance(names, str):
+        raise InputError("effects", f"{names!r} is a text", f'Give a list, such as ["{names}"]')
     for name in names:
         if name not in EFFECTS:
             raise InputError("--effect", f"unknown effect {name}", f"Choose from {', '.join(EFFECTS)}")

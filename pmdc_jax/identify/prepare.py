@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Real
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from ..checks.invalid_samples import without_unmeasured
 from ..checks.slow_sensors import readings_only
 from ..effects import EFFECTS, AbstractEffect
 from ..errors import InputError
-from ..motor import PARAMETERS, Drive
+from ..motor import PARAMETERS, PARAMETERS_OF_DRIVE, Drive
 from ..recordings.clock import evenly_stamped
 from ..recordings.recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
 from ..recordings.recording_file import Runs, named_apart, recordings_of, refuse_copies
@@ -164,6 +165,8 @@ def _check_options(tie: Sequence[tuple[str, str]], known: Mapping[str, float]) -
             what = f"{target} and {source} are measured in different units"
             raise InputError("--tie", what, "Tie Kt=Kb: in SI units these two are equal")
     for name, value in known.items():
+        if not isinstance(value, Real):
+            raise InputError("--known", f"{name}={value!r} is not a number", "Give a value in SI")
         if not 0 < value < np.inf:
             raise InputError("--known", f"{name}={value} is not positive", "Give a value in SI")
 
@@ -181,8 +184,6 @@ def _signals(recordings: Sequence[Recording], name: str) -> list[np.ndarray]:
 
 def _irrelevant(recordings: Sequence[Recording], tie: Sequence[tuple[str, str]]) -> dict[str, float]:
     """Parameters that affect no run, not even through a tie, with a harmless value."""
-    affecting = {"held": "R L", "torque": "J f", "current": "Kt J f", "voltage": "R L Kb Kt J f"}
-    kinds = {"held" if r.held else r.drive for r in recordings}
-    relevant = {name for kind in kinds for name in affecting[kind].split()}
+    relevant = {name for r in recordings for name in (("R", "L") if r.held else PARAMETERS_OF_DRIVE[r.drive])}
     relevant |= {source for target, source in tie if target in relevant}
     return {name: 1.0 for name in PARAMETERS if name not in relevant}

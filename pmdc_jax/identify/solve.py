@@ -74,7 +74,7 @@ def solve(
         return _corrected(search_and_refine(runs, search, seed, progress))
 
     attempts = [at(timing)]
-    if timing is None:
+    if timing is None and not attempts[0].search.interrupted:
         attempts += map(at, other_timings(attempts[0].fitted))
     solutions = [a._replace(fitted=with_fitted_reading(with_step_times(a.fitted))) for a in attempts]
     if len(solutions) == 1:

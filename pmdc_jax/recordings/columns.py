@@ -101,6 +101,8 @@ RECOGNISED_BY_UNIT = ("time", "voltage", "current", "speed", "angle", "load")
 LOADS = re.compile(r"(?i)(?<![a-z])(load|last|brak|brems|dyno)")
 # Names of columns that are the time if they hold dates with times; numbers need a unit
 DATED = ("timestamp", "time_stamp", "datetime", "date_time", "date", "datum")
+# The layout of times of the day in a header, as in Time [hh:mm:ss.fff]
+CLOCK_LAYOUT = re.compile(r"(?i)\s*[\[(]\s*h+:m+(:s+)?[.,\w]*\s*[\])]$")
 # Words in the names of columns that hold set points, limits or supplies rather than a measurement of the motor
 NOT_MEASURED = re.compile(r"(?i)(?<![a-z])(ref|set|soll|cmd|command|target|demand|desired|limit|max|min|supply|bat)")
 
@@ -154,10 +156,12 @@ def match_columns(headers: Sequence[str], columns: Mapping[str, str] | None, whe
             raise _ambiguous_headers(understood[column.quantity], column, where)
         understood[column.quantity] = column
     matched |= understood
-    for quantity, error in refused.items():
-        if quantity not in matched:
-            raise error
-    return matched | _match_by_unit_or_symbol(headers, matched)
+    matched |= _match_by_unit_or_symbol(headers, matched)
+    # neither a temperature nor, beside a voltage, a torque of the motor is used
+    needless = {"temperature", "torque"} if "voltage" in matched else {"temperature"}
+    for quantity in refused.keys() - matched.keys() - needless:
+        raise refused[quantity]
+    return matched
 
 
 def _match_by_unit_or_symbol(headers: Sequence[str], matched: Mapping[str, Column]) -> dict[str, Column]:
@@ -227,8 +231,9 @@ def likely_quantity(header: str) -> str | None:
 
 
 def may_be_dates(header: str) -> bool:
-    """Whether a header is that of a column of dates with times."""
-    return _normalised(header) in DATED
+    """Whether a header is that of a column of dates with times, or of times of the day."""
+    name = CLOCK_LAYOUT.sub("", header)
+    return _normalised(header) in DATED or (name != header and _normalised(name) in QUANTITIES["time"].names)
 
 
 def column_option(quantity: str, header: str, unit: str = "") -> str:
@@ -278,7 +283,9 @@ def header_and_unit(spec: str, headers: Sequence[str]) -> tuple[str, str]:
     header, unit = spec, ""
     if spec not in headers:
         header, _, unit = (part.strip() for part in spec.rpartition(":"))
-        header, unit = (header, unit) if header else (spec.strip(), "")
+        # nor is the colon in brackets, as of the columns of a MATLAB matrix, followed by a unit
+        is_split = header and unit.count(")") <= unit.count("(")
+        header, unit = (header, unit) if is_split else (spec.strip(), "")
     # `header` may lack the unit that was read from the line below the names
     named = [h for h in headers if h.rpartition(" [")[0] == header]
     if header not in headers and len(named) == 1:

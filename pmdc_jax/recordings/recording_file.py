@@ -59,10 +59,13 @@ def read_recording(
     return _read(open_table(path), path, columns, to_simulate)
 
 
-def read_recordings(paths: Sequence[Path], mappings: Sequence[tuple[str, str]] = ()) -> list[Recording]:
+def read_recordings(
+    paths: Sequence[Path], mappings: Sequence[tuple[str, str]] = (), to_simulate: bool = False
+) -> list[Recording]:
     """Read runs, which may be of several loggers.
 
-    **Arguments**: `paths`; `mappings` from quantity to "header" or "header:unit", each for the files with that header.
+    **Arguments**: `paths`; `mappings` from quantity to "header" or "header:unit", each for the files with that header;
+    `to_simulate` as of `read_recording`.
 
     **Raises**: `InputError` as `read_recording` does, and if no file has the header of a mapping, or one has those of
     two mappings of one quantity.
@@ -83,7 +86,7 @@ def read_recordings(paths: Sequence[Path], mappings: Sequence[tuple[str, str]] =
                 what = f"{columns[path][quantity]} is mapped to {quantity}, too"
                 mend = "Map one column of a file to each quantity"
                 raise InputError(f"{path}, --column {quantity}={spec}", what, mend)
-    return [_read(tables[path], path, columns[path]) for path in paths]
+    return [_read(tables[path], path, columns[path], to_simulate) for path in paths]
 
 
 def _has(table: Table, spec: str) -> bool:

@@ -55,10 +55,10 @@ def simulate(motor: Motor | str | Path, recording: Run) -> Recording:
 
     **Raises**: `InputError` if the simulation diverges.
     """
-    if not isinstance(motor, Motor):
-        motor = load_motor(motor)
-    subject: Motor = jax.tree.map(jnp.asarray, motor)
     (recording,) = recordings_of(recording, to_simulate=True)
+    if not isinstance(motor, Motor):
+        motor = load_motor(motor, recording.drive)
+    subject: Motor = jax.tree.map(jnp.asarray, motor)
     # the instantaneous speed is simulated, even if the recorded one is a mean
     even = attrs.evolve(uniform(recording), averaging=None)
     tape = Tape.from_recordings([even], unloaded=True)

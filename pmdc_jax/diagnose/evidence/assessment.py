@@ -76,7 +76,7 @@ class Assessment(NamedTuple):
     def best_candidate_share(self) -> float:
         """The largest gain of a single candidate over that of the clearest signal."""
         best = max((s.gain for s in self.candidate_signals), default=0.0)
-        return float(best / self.clearest.gain)
+        return float(best / self.clearest.gain) if best > 0 else 0.0
 
     def calls_for_effect(self) -> bool:
         """Whether something more is missing, and a single candidate would explain enough of it for a trial."""

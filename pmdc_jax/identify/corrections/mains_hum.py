@@ -117,6 +117,8 @@ def _without(
 ) -> tuple[Recording, float]:
     """A run with the hum removed from one of its outputs, and the amplitude of that hum."""
     orders = [k for k in HARMONICS if k * frequency * 2 * run.sample_time < MAX_SHARE]
+    if not orders:  # sampled too slowly to show it
+        return run, 0.0
 
     def waves(time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "samples waves"]:
         angles = 2 * np.pi * frequency * time[:, None] * np.array(orders)

@@ -98,9 +98,13 @@ def _slow_power(white: Rows) -> float:
 def _scales(
     residuals: Sequence[Series], filters: Sequence[Float[np.ndarray, "_ _ _"]]
 ) -> list[Float[np.ndarray, "outputs outputs"]]:
+    """The scale of each run, from all runs of its kind if it has too few rows itself."""
+    rests = [_filtered(series, of_run) for series, of_run in zip(residuals, filters, strict=True)]
     scales = []
-    for series, of_run in zip(residuals, filters, strict=True):
-        rest = _filtered(series, of_run)
+    for series, rest in zip(residuals, rests, strict=True):
+        if len(rest) < MIN_ROWS_PER_COEFFICIENT:
+            of_kind = (other for s, other in zip(residuals, rests, strict=True) if s.kind == series.kind)
+            rest = np.concatenate(list(of_kind))
         covariance = rest.T @ rest / max(len(rest), 1)
         floor = 1e-12 * np.trace(covariance) + 1e-300
         values, vectors = np.linalg.eigh(covariance)
@@ -114,19 +118,22 @@ def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order out
 
     Each run is weighted by the inverse of its variance, because noise may differ between runs.
     """
-    outputs, longest = residuals[0].values.shape[1], max(ORDERS)
+    outputs = residuals[0].values.shape[1]
+    # of a record with gaps, few samples follow on many without one
+    usable = [n for n in ORDERS if _count_rows(residuals, n) >= MIN_ROWS_PER_COEFFICIENT * n * outputs]
+    if not usable:
+        return np.zeros((0, outputs, outputs))
+    longest = usable[-1]
     lagged = [_lagged(series, longest) for series in residuals]
     rms = np.sqrt(np.mean(np.square(np.concatenate(lagged)), axis=0))[:outputs] + 1e-300
     size, rows = outputs * (longest + 1), sum(len(x) for x in lagged)
     gram = np.zeros((size, size))
-    for x in lagged:
+    for x in filter(len, lagged):
         scaled = x / np.tile(rms, longest + 1)
         gram += scaled.T @ scaled / (np.mean(np.square(scaled)) + 1e-300)
-    best = rows * np.linalg.slogdet(gram[:outputs, :outputs] / max(rows, 1))[1]
+    best = rows * np.linalg.slogdet(gram[:outputs, :outputs] / rows)[1]
     chosen = np.zeros((0, outputs, outputs))
-    for order in ORDERS:
-        if rows < MIN_ROWS_PER_COEFFICIENT * order * outputs:
-            break
+    for order in usable:
         now, past = slice(0, outputs), slice(outputs, outputs * (order + 1))
         ridge = 1e-9 * np.trace(gram[past, past]) * np.eye(order * outputs) / (order * outputs)
         coefficients = np.linalg.solve(gram[past, past] + ridge, gram[past, now])
@@ -138,8 +145,15 @@ def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order out
     return chosen * rms[:, None] / rms
 
 
+def _count_rows(residuals: Sequence[Series], order: int) -> int:
+    """How many samples of all runs were measured, together with the `order` samples before them."""
+    return sum(int(with_history(s.known, order)[order:].sum()) for s in residuals if len(s.known) > order)
+
+
 def _lagged(series: Series, order: int) -> Float[np.ndarray, "rows lags"]:
     values = series.values
+    if len(values) <= order:
+        return np.zeros((0, values.shape[1] * (order + 1)))
     whole = np.concatenate([values[order - k : len(values) - k] for k in range(order + 1)], axis=1)
     return whole[with_history(series.known, order)[order:]]
 
@@ -150,6 +164,8 @@ def _filtered(
     scale: Float[np.ndarray, "outputs outputs"] | None = None,
 ) -> Rows:
     values, order, outputs = series.values, len(filters), series.values.shape[1]
+    if len(values) <= order:
+        return values[:0]
     flat = np.ascontiguousarray(values).reshape(len(values) * outputs, -1)
     by_chunk = band_matrix(filters, np.eye(outputs) if scale is None else scale)
     rest = np.empty(((len(values) - order) * outputs, flat.shape[1]))

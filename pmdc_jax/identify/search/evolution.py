@@ -108,10 +108,10 @@ def search(
     `population` and `generations`, by default the method's own; `progress`, called in every generation.
     An interrupt from the keyboard ends the search with the candidates found so far.
 
-    **Raises**: `InputError` on an unknown method, or a negative seed.
+    **Raises**: `InputError` on an unknown method, or a seed that is negative or does not fit into 63 bits.
     """
-    if seed < 0:
-        raise InputError("--seed", f"{seed} is negative", "Give zero or a positive number")
+    if not 0 <= seed < 2**63:
+        raise InputError("--seed", f"{seed} is negative or too large", "Give a number from 0 to 2**63 - 1")
     if method not in METHODS:
         raise InputError("--search", f"unknown search {method}", f"Choose from {', '.join(METHODS)}")
     chosen = METHODS[method]

@@ -16,6 +16,9 @@ NUMBERS_ONLY = "Recordings hold plain numbers; leave a cell empty where a sample
 # By thousands separator: numbers with it and with a decimal separator, without which they would be ambiguous
 THOUSANDS_PATTERNS = {",": r"^[+-]?\d{1,3}(,\d{3})+\.\d*$", ".": r"^[+-]?\d{1,3}(\.\d{3})+,\d*$"}
 
+# By decimal separator: numbers with it
+DECIMAL_PATTERNS = {".": r"^[+-]?\d*\.\d+$", ",": r"^[+-]?\d*,\d+$"}
+
 
 def is_number(cell: str) -> bool:
     """Whether a cell holds one plain number, with a decimal point or comma."""
@@ -36,7 +39,11 @@ def without_thousands_separators(text: pl.Series) -> pl.Series:
 
 def seconds_since_first(dates: pl.Series) -> pl.Series:
     """Dates with times as seconds since the first of them."""
+    import polars as pl
+
     first = dates.drop_nulls().first()
+    if first is None:
+        return pl.Series(dates.name, [None] * len(dates), pl.Float64)
     return (dates - first).dt.cast_time_unit("ns").dt.total_nanoseconds() / 1e9
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...errors import InputError
-from .cells import NUMBERS_ONLY, seconds_of_dates, without_thousands_separators
+from .cells import DECIMAL_PATTERNS, NUMBERS_ONLY, seconds_of_dates, without_thousands_separators
 from .csv_header import find_header, split_fields
 
 if TYPE_CHECKING:
@@ -67,6 +67,15 @@ class CsvTable:
             body = body.removesuffix(last).rstrip(b"\r\n")
         return body
 
+    @property
+    def _has_decimal_commas(self) -> bool:
+        return self._header.separator != "," and b"," in self._body
+
+    @property
+    def _may_mix_decimals(self) -> bool:
+        """Whether there are commas and points, as of decimals, thousands or dates."""
+        return self._has_decimal_commas and b"." in self._body
+
     def _frame(self, wanted: Sequence[str]) -> pl.DataFrame:
         """The wanted columns as numbers, and the last column, of any type, to detect short lines; null if empty."""
         import polars as pl
@@ -75,7 +84,8 @@ class CsvTable:
         if not self._body:
             return pl.DataFrame(schema=dict.fromkeys({*wanted, last}, pl.Float64))
         try:
-            return self._parse(dict.fromkeys(wanted, pl.Float64), last)
+            if not self._may_mix_decimals:  # polars would accept both
+                return self._parse(dict.fromkeys(wanted, pl.Float64), last)
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
             self._refuse_unequal_lines()
         try:  # padded numbers, dates and the like: slower
@@ -83,7 +93,22 @@ class CsvTable:
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
             what = "it cannot be read as a table"
             raise InputError(str(self._path), what, "Export it as plain CSV") from None
+        self._refuse_mixed_decimals(text, wanted)
         return text.with_columns(self._numbers(text[i], self.headers[int(i)]) for i in wanted)
+
+    def _refuse_mixed_decimals(self, text: pl.DataFrame, wanted: Sequence[str]) -> None:
+        """`InputError` if some numbers have a decimal point and others a comma: one of both separates thousands."""
+        if not self._may_mix_decimals:
+            return
+        found: dict[str, str] = {}
+        for i in wanted:
+            for sign, pattern in DECIMAL_PATTERNS.items():
+                rows = text[i].str.strip_chars().str.contains(pattern).fill_null(False).arg_true()
+                if len(rows):
+                    found.setdefault(sign, f"'{text[i][int(rows[0])]}' in {self.place(int(rows[0]))}")
+        if len(found) == len(DECIMAL_PATTERNS):
+            what = f"{found['.']} has a decimal point, but {found[',']} a comma"
+            raise InputError(str(self._path), what, "Export the file without thousands separators")
 
     def _parse(self, kinds: Mapping[str, Any], last: str) -> pl.DataFrame:
         import polars as pl
@@ -96,7 +121,7 @@ class CsvTable:
             separator=self._header.separator,
             comment_prefix="#",
             null_values=NULL_VALUES,
-            decimal_comma=self._header.separator != "," and b"," in self._body,
+            decimal_comma=self._has_decimal_commas,
         )
         return frame.select(i for i in schema if i in kinds or i == last or not kinds)
 

@@ -63,7 +63,7 @@ def split_fields(line: str, separator: str) -> list[str]:
 def _first_text_line(raw: bytes, path: Path) -> _Line:
     """The first line that is neither empty nor a comment: the header, or the first line of a preamble.
 
-    A comment directly above numbers is the header if it has as many commas.
+    A comment directly above numbers is the header if it has as many fields.
 
     **Raises**: `InputError` if numbers come first without one, or there is no such line.
     """
@@ -72,7 +72,8 @@ def _first_text_line(raw: bytes, path: Path) -> _Line:
         if line.text.strip() and not line.text.startswith(("#", "sep=")):
             if not _has_only_numbers(line.text):
                 return line
-            if above.text.count(",") == line.text.count(",") and "," in line.text:
+            separator = _separator(line.text)
+            if above.text.count(separator) == line.text.count(separator) > 0:
                 return above  # as numpy.savetxt writes it
             what = "the first line holds numbers where the header should be"
             raise InputError(f"{path}, line {line.number}", what, "Begin with time_s,voltage_V,...")

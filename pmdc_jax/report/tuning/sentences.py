@@ -27,10 +27,10 @@ def summary(tuning: Tuning) -> list[str]:
 def _step_sentence(tuning: Tuning) -> str:
     settling, overshoot = tuning.metrics["SettlingTime"], tuning.metrics["Overshoot"]
     if settling is None:
-        return f"The loop does not settle at {tuning.setpoint:g} rad/s."
+        return f"The loop does not settle at {significant(tuning.setpoint)} rad/s."
     ratio = settling / tuning.fastest_possible_settling
     return (
-        f"Settles at {tuning.setpoint:g} rad/s in {time_text(settling)},"
+        f"Settles at {significant(tuning.setpoint)} rad/s in {time_text(settling)},"
         f" {significant(ratio)} times the fastest possible with {limits_text(tuning)}"
         f" ({time_text(tuning.fastest_possible_settling)}), {_overshoot_words(overshoot)}."
     )
