@@ -43,7 +43,7 @@ from pmdc_jax.identify.results import results_of
 from pmdc_jax.identify.rotor_angle import with_rotor_angle
 from pmdc_jax.identify.search.binary_ga import BinaryGA
 from pmdc_jax.identify.search.bounds import effect_bounds
-from pmdc_jax.identify.search.evolution import METHODS, SearchResult, search
+from pmdc_jax.identify.search.evolution import METHODS, SearchResult, global_search
 from pmdc_jax.identify.solve import _distinct, solve
 from pmdc_jax.identify.uncertainty.covariance import information, long_run_variance
 from pmdc_jax.motor import PARAMETERS
@@ -800,7 +800,7 @@ def problem(runs) -> tuple[Parameters, Tape, np.ndarray]:
 def test_every_search_method_improves_within_the_bounds(x64, problem, method):
     parameters = problem[0]
     generations = 12
-    result = search(*problem, method, seed=1, population=32, generations=generations)
+    result = global_search(*problem, method, seed=1, population=32, generations=generations)
     assert result.best[-1] < 0.9 * result.best[0]
     assert len(result.best) == len(result.median) == generations
     assert result.evaluations >= 32 * generations
@@ -813,13 +813,13 @@ def test_every_search_method_improves_within_the_bounds(x64, problem, method):
 
 def test_an_unknown_method_is_refused(problem):
     with pytest.raises(InputError, match="annealing"):
-        search(*problem, "annealing")
+        global_search(*problem, "annealing")
 
 
 def test_the_paper_ga_finds_more_than_random_sampling(x64, problem):
     """With the same number of evaluations."""
-    random = search(*problem, "paper_ga", seed=2, population=32 * 12, generations=1)
-    evolved = search(*problem, "paper_ga", seed=2, population=32, generations=12)
+    random = global_search(*problem, "paper_ga", seed=2, population=32 * 12, generations=1)
+    evolved = global_search(*problem, "paper_ga", seed=2, population=32, generations=12)
     assert random.evaluations == evolved.evaluations
     assert evolved.best[-1] < random.best[-1]
 
@@ -852,7 +852,11 @@ def test_the_best_of_a_generation_survives():
     assert len(np.unique(np.asarray(children), axis=0)) > 10
 
 
-def test_an_interrupted_search_still_gives_a_result(runs):
+def test_an_interrupted_search_still_gives_a_result(runs, monkeypatch):
+    """And no other timing of the inputs is searched for, where the first search would call for that."""
+    solving = importlib.import_module("pmdc_jax.identify.solve")
+    monkeypatch.setattr(solving, "other_timings", lambda fitted: pytest.fail("another search"))
+
     def progress(what, fitness=None, share=None):
         if share and share > 0.3:
             raise KeyboardInterrupt

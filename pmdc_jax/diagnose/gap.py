@@ -8,9 +8,9 @@ import numpy as np
 
 from ..identify.identification import Role, RunFit
 from ..identify.noise.sensor_noise import MIN_RELATIVE_NOISE, noise_of_sensor, rms
+from ..recordings.recording import CHANNELS
 from .diagnosis import Gap, share_left
 
-CHANNELS = ("current", "speed")
 # Least gap, in squares over those of the noise, of which a share can be closed: less is rounding
 MIN_OPEN_GAP = 1e-9
 

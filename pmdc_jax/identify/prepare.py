@@ -20,7 +20,7 @@ from ..effects import EFFECTS, AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS, PARAMETERS_OF_DRIVE, Drive
 from ..recordings.clock import evenly_stamped
-from ..recordings.recording import NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
+from ..recordings.recording import CHANNELS, NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
 from ..recordings.recording_file import Runs, named_apart, recordings_of, refuse_copies
 from ..simulate import ZERO_ORDER_HOLD, Tape, Timing, uniform
 from .identification import Role
@@ -125,7 +125,7 @@ def _laid_out(
     """The recordings as a least-squares problem for the motor without effects, all of whose parameters are fitted."""
     runs = [uniform(evenly_stamped(r)) for r in recordings]
     training = runs[: roles.count("train")]
-    noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in ("current", "speed")])
+    noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in CHANNELS])
     # hold-out runs are on the tape too, but only their own unknowns may be fitted to them
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True))
     fitted_runs = jnp.arange(tape.runs) < len(training)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..motor import PARAMETERS, Motor
+from ..recordings.recording import CHANNELS
 from ..words import enumerate_words
 from .equivalent_fits import fits_with_visible, released_from_bounds, with_Kt_equal_Kb
 from .estimates import estimates_of
@@ -39,10 +40,7 @@ def results_of(solved: Solved) -> Identification:
     unknowns, ended = fit_run_unknowns(problem, best.unknowns)
     fit = run_fits(prepared.runs, prepared.roles, problem.tape, np.asarray(ended.simulated), unknowns.runs)
     names, covariance = parameters.with_tied(info.covariance)
-    noise = {
-        name: white_noise([residual for _, residual in measured_and_residuals(fit, name)])
-        for name in ("current", "speed")
-    }
+    noise = {name: white_noise([residual for _, residual in measured_and_residuals(fit, name)]) for name in CHANNELS}
     return Identification(
         motor=motor,
         parameters=estimates_of(problem, best, info, prepared),

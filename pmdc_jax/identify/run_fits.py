@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..recordings.recording import Recording
+from ..recordings.recording import CHANNELS, Recording
 from ..simulate import RunUnknowns, Tape
 from .identification import Role, RunFit
 from .noise.sensor_noise import ratio_to_noise, rms
@@ -62,7 +62,7 @@ def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | 
 def large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:
     """RMS of the residuals over the white noise of the runs, for the outputs for which that exceeds
     `MAX_RESIDUAL_RATIO`."""
-    ratios = {name: ratio_to_noise(measured_and_residuals(fit, name)) for name in ("current", "speed")}
+    ratios = {name: ratio_to_noise(measured_and_residuals(fit, name)) for name in CHANNELS}
     return {name: ratio for name, ratio in ratios.items() if ratio > MAX_RESIDUAL_RATIO}
 
 

@@ -34,8 +34,7 @@ from .prepare import Prepared
 from .problem import Evaluation, Problem, Unknowns
 from .rotor_angle import with_rotor_angle
 from .search.bounds import effect_bounds
-from .search.evolution import SearchResult
-from .search.evolution import search as global_search
+from .search.evolution import SearchResult, global_search
 
 STARTS = 4
 # Two refinements found the same optimum if their fitness agrees to this share.

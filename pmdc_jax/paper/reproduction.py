@@ -116,7 +116,7 @@ def recovered_by_paper_ga(seed: int = 0) -> Recovered:
     """Identify by the paper's binary genetic algorithm alone: 20 chromosomes of 60 bits."""
     from ..identify.parameters import Parameters
     from ..identify.search.bounds import search_bounds
-    from ..identify.search.evolution import search
+    from ..identify.search.evolution import global_search
     from ..simulate import Tape, uniform
 
     run = load_test()
@@ -125,7 +125,7 @@ def recovered_by_paper_ga(seed: int = 0) -> Recovered:
         parameters = Parameters.of(search_bounds([run]))
         tape = Tape.from_recordings([uniform(run)])
         noise = np.array([NOISE["current"], NOISE["speed"]])
-        result = search(parameters, tape, noise, method="paper_ga", seed=seed)
+        result = global_search(parameters, tape, noise, method="paper_ga", seed=seed)
         motor = jax.tree.map(float, parameters(jax.numpy.asarray(result.candidates[0])))
     seconds = time.perf_counter() - begin
     return Recovered("the paper's GA", motor, result.evaluations, seconds, result.best)

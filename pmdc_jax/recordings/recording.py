@@ -23,6 +23,8 @@ MAX_MISSING = 0.2  # share of an output's samples, or of the readings of a slowe
 # fit into memory
 MAX_INTERVALS_PER_SAMPLE = 20
 OUTPUTS = ("speed", "angle", "current")
+# The simulated outputs, in the order of their axis in a tape
+CHANNELS = ("current", "speed")
 # Columns needed besides time: to simulate, and to identify
 NEEDED_TO_SIMULATE = "voltage, current or torque"
 NEEDED_TO_IDENTIFY = "voltage with current, speed or angle; or current or torque with speed or angle"

@@ -258,42 +258,51 @@ def _in_file(fault: Fault, matched: Mapping[str, Column], table: Table, where: s
 
 
 def _notes(run: str, headers: tuple[str, ...], matched: Mapping[str, Column], empty: list[str]) -> Iterator[Finding]:
-    def note(column: str, what: str, mend: str) -> Finding:
-        return Finding(run, column, "note", what, "", mend)
-
-    used = {column.header for column in matched.values()}
-    # a position of the shaft stands in for its speed
-    lacking = [q for q in ("voltage", "current", "speed") if q not in matched]
-    if "angle" in matched and "speed" in lacking:
-        lacking.remove("speed")
-    for quantity, column in matched.items():
-        if quantity in empty:
-            yield note(column.header, "the column is empty", "It is ignored")
-        elif column.by_unit:
-            mend = f"If it is something else, map the right column: --column {quantity}=HEADER:UNIT"
-            why = "name and unit" if quantity == "load" else "unit"
-            yield note(column.header, f"used as the {quantity}, because of its {why}", mend)
-        elif column.unit is None:
-            mend = f"If this is wrong, write the unit in the header, as in {QUANTITIES[quantity].header}"
-            yield note(column.header, f"the header has no unit: {column.base} assumed", mend)
-    if "temperature" in matched and "temperature" not in empty:
-        mend = "That of the winding is computed from its current: see resistance_heating"
-        yield note(matched["temperature"].header, "a recorded temperature is not used", mend)
+    """What was assumed about the columns, and which were not used."""
+    yield from _notes_on_used(run, matched, empty)
     if mixed := mixed_axes(matched):
         shaft, axis = mixed
         what = f"{shaft.base} is a unit of a rotating shaft, but the {axis.base} of {axis.header} is not"
         mend = "Give all columns in shaft units (rad, N m) or all in linear-axis units (m, N)"
         yield Finding(run, shaft.header, "warning", what, "", mend)
+    yield from _notes_on_unused(run, headers, matched)
+
+
+def _notes_on_used(run: str, matched: Mapping[str, Column], empty: list[str]) -> Iterator[Finding]:
+    for quantity, column in matched.items():
+        if quantity in empty:
+            yield _note(run, column.header, "the column is empty", "It is ignored")
+        elif quantity == "temperature":
+            mend = "That of the winding is computed from its current: see resistance_heating"
+            yield _note(run, column.header, "a recorded temperature is not used", mend)
+        elif column.by_unit:
+            mend = f"If it is something else, map the right column: --column {quantity}=HEADER:UNIT"
+            why = "name and unit" if quantity == "load" else "unit"
+            yield _note(run, column.header, f"used as the {quantity}, because of its {why}", mend)
+        elif column.unit is None:
+            mend = f"If this is wrong, write the unit in the header, as in {QUANTITIES[quantity].header}"
+            yield _note(run, column.header, f"the header has no unit: {column.base} assumed", mend)
+
+
+def _notes_on_unused(run: str, headers: tuple[str, ...], matched: Mapping[str, Column]) -> Iterator[Finding]:
+    used = {column.header for column in matched.values()}
+    # a position of the shaft stands in for its speed
+    moving = ("angle",) if "angle" in matched else ("speed",)
+    lacking = [q for q in ("voltage", "current", *moving) if q not in matched]
     not_understood: list[str] = []
     for header in headers:
         quantity = likely_quantity(header)
         if quantity and quantity not in matched:
             what = f"not used, although it looks like {quantity}"
-            yield note(header, what, f"Map it with {column_option(quantity, header, 'UNIT')}")
+            yield _note(run, header, what, f"Map it with {column_option(quantity, header, 'UNIT')}")
         elif header and header not in used:
             not_understood.append(header)
     if not_understood and lacking:
         what = f"not understood, and not used: {', '.join(not_understood[:20])}"
         example = column_option(lacking[0], not_understood[0], "UNIT")
         mend = f"If this includes the {' or the '.join(lacking)}, map it, as in {example}"
-        yield Finding(run, None, "note", what, "", mend)
+        yield _note(run, None, what, mend)
+
+
+def _note(run: str, column: str | None, what: str, mend: str) -> Finding:
+    return Finding(run, column, "note", what, "", mend)

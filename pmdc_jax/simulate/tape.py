@@ -99,17 +99,15 @@ class Tape(eqx.Module):
             known = np.array(list(values))
             return np.append(known, np.zeros((empty_runs, *known.shape[1:]), known.dtype), axis=0)
 
+        voltage, current, torque = (np.where(drives == kind, 1.0, 0.0) for kind in Drive._fields[:3])
+        slow = averaged and max(run.span for run in runs) > 1
         return cls(
             **_laid_in_blocks(runs, grids, empty_runs, rises, follow),
             sample_time=sample_times,
-            drive=Drive(
-                *(np.where(drives == kind, 1.0, 0.0) for kind in Drive._fields[:3]), free=np.where(free, 1.0, 0.0)
-            ),
+            drive=Drive(voltage, current, torque, free=np.where(free, 1.0, 0.0)),
             initial=of_runs(run.initial for run in runs),
             averaging=of_runs(map(_averaging_shares, recordings)) if averaged else None,
-            span=np.maximum(of_runs(run.span for run in runs), 1)
-            if averaged and max(r.span for r in runs) > 1
-            else None,
+            span=np.maximum(of_runs(run.span for run in runs), 1) if slow else None,
             later=later if np.any(later) else None,
             load_unknown=of_runs(r.load is None and not unloaded and not r.held for r in recordings),
             angle=of_runs(_first(r.angle) for r in recordings),

@@ -145,15 +145,16 @@ class StepwiseSelection:
         What gains little to first order is accepted only if it then leaves little.
         """
         propose, genuine, little = self.proposals, self._is_genuine_improvement, self._leaves_little
+        unfiltered = [(propose.by_unfiltered_misfit, genuine)]
+        absorbed = self.assess(current).unexplained < ABSORBED_SHARE
         kinds: list[tuple[Callable[[Model], Proposed], Accepts]] = [
+            *(unfiltered if absorbed else []),
             (propose.by_evidence, genuine),
             (propose.by_largest_gain, little),
-            (propose.by_unfiltered_misfit, genuine),
+            *([] if absorbed else unfiltered),
             (propose.by_earlier_evidence, little),
             (propose.by_exchange, genuine),
         ]
-        if self.assess(current).unexplained < ABSORBED_SHARE:
-            kinds.insert(0, kinds.pop(2))
         for proposed, accepts in kinds:
             better = self._better(current, proposed(current))
             if accepted := self._in_accepted_form(accepts, current, better):

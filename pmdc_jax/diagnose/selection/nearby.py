@@ -12,7 +12,7 @@ from ...identify.fit.polish import Fit, fit_at
 from ...identify.fit.refine import Optimum
 from ...identify.parameters import Parameters
 from ...identify.problem import Problem
-from ...identify.search.evolution import search
+from ...identify.search.evolution import global_search
 from ...motor import PARAMETERS
 from ...simulate import Tape
 
@@ -43,7 +43,7 @@ def best_nearby(problem: Problem, fit: Fit, factors: Mapping[str, float], seed: 
     free = Parameters.of(bounds, parameters.effects, known)
     # a fit that cannot be simulated has no finite noise
     noise = np.where(np.isfinite(fit.noise), fit.noise, problem.noise)
-    search_result = search(
+    search_result = global_search(
         free, _worst_fitted_runs(problem, fit), noise, seed=seed, population=POPULATION, generations=GENERATIONS
     )
     places = [parameters.names.index(name) for name in free.names]

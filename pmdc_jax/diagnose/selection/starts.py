@@ -62,8 +62,7 @@ class Starts:
     def from_simple_form(self, current: Model, effect: str, effects: tuple[str, ...]) -> Start:
         """The start with the fuller form of an effect, from the fit of the simple one."""
         fuller = FULLER[effect]
-        simple = next(e for e in current.motor.effects if e.name == effect)
-        values = fuller.from_simple(simple, self.scales)
+        values = fuller.from_simple(current.motor.effect_named(effect), self.scales)
         return self.from_model(current, effects, {fuller.effect: values})
 
     def values_from_replaced(self, current: Model, old: str, new: str) -> dict[str, Values]:
@@ -74,7 +73,7 @@ class Starts:
             convert = FULLER[new].to_simple
         if convert is None:
             return {}
-        return {new: convert(next(e for e in current.motor.effects if e.name == old))}
+        return {new: convert(current.motor.effect_named(old))}
 
     def from_model(
         self,

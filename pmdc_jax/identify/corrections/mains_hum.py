@@ -16,7 +16,7 @@ from jaxtyping import Complex, Float
 
 from ...motor import Motor
 from ...recordings.readings import reading_interval
-from ...recordings.recording import Recording
+from ...recordings.recording import CHANNELS, Recording
 from ...simulate import Tape
 from ..fit.fitted_runs import FittedRuns
 from ..fit.generalised_least_squares import training_indices
@@ -41,7 +41,7 @@ def without_mains_hum(fitted: FittedRuns) -> FittedRuns:
     residuals = [fitted.residuals(k) for k in range(len(prepared.runs))]
     runs, removed = list(prepared.runs), dict(prepared.mains_hum)
     for output, frequency in hums.items():
-        name = ("current", "speed")[output]
+        name = CHANNELS[output]
         for k, run in enumerate(runs):
             if getattr(run, name) is not None:
                 runs[k], amplitude = _without(run, name, residuals[k][:, output], frequency)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...recordings.clock import GAP
-from ...recordings.recording import Recording
+from ...recordings.recording import CHANNELS, Recording
 from ...simulate import Tape
 from ...simulate.uneven import simulated_at_stamps
 from ..fit.fitted_runs import FittedRuns
@@ -89,7 +89,7 @@ def _nearest_samples(run: Recording, now: np.ndarray, then: np.ndarray) -> Recor
     near = np.abs(record.time[nearest] - run.time) <= GAP / 2 * run.sample_time
     outputs = {
         name: np.where(near, signal[nearest] + now[:, c] - then[nearest, c], np.nan)
-        for c, name in enumerate(("current", "speed"))
+        for c, name in enumerate(CHANNELS)
         if getattr(run, name) is not None and (signal := getattr(record, name)) is not None
     }
     return attrs.evolve(run, **outputs)

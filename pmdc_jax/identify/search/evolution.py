@@ -88,7 +88,7 @@ class _Generation(NamedTuple):
         return bool(np.all(np.ptp(width * elite, axis=0) < AGREEMENT))
 
 
-def search(
+def global_search(
     parameters: Parameters,
     tape: Tape,
     noise: np.ndarray,
