@@ -5,6 +5,7 @@ Almost every case has two runs of 1,000 samples, so that few shapes are compiled
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import replace
 from unittest.mock import Mock
