@@ -22,13 +22,18 @@ LINES = 8000
 NOISE = 0.5
 
 
-def recorded(kind: str, lines: int = LINES, **changed: float) -> list[Recording]:
-    """Runs with a speed from encoder counts, or from a tachometer with noise of the same deviation."""
+def recorded(kind: str, lines: int = LINES, torque_noise: float = 0.0, **changed: float) -> list[Recording]:
+    """Runs with a speed from encoder counts, or from a tachometer with noise of the same deviation.
+
+    **Arguments**: `torque_noise`, N m, standard deviation of a torque that is not recorded, correlated over 0.2 s.
+    """
     rng = np.random.default_rng(5)
     runs = {"prbs": prbs(rng, 4.0), "stairs": staircase(4.0)}
     found = []
     for name, excitation in runs.items():
-        outputs = simulate(Plant(**(FAST_MOTOR | changed)), *excitation)
+        white = np.random.default_rng(len(found)).standard_normal(len(excitation.time))
+        slow = signal.lfilter([torque_noise * 0.1], [1, -0.995], white)
+        outputs = simulate(Plant(**(FAST_MOTOR | changed)), *excitation._replace(load=excitation.load + slow))
         count = np.floor(outputs[:, 2] * lines / (2 * np.pi))
         speed = np.gradient(count, excitation.time) * 2 * np.pi / lines
         if kind == "counts of the last sample":
@@ -87,6 +92,13 @@ def test_coarse_counts_around_the_instant_are_no_missing_effect():
     """They fit better as instantaneous speeds than as means over the last sample; taken for instantaneous, what is left
     was a delay of the sensor."""
     found = diagnose(recorded("counts around the instant", lines=1000, J=1.5e-4))
+    assert found.verdict == "none_detected"
+    assert [m for m in found.final.messages if "around each instant" in m]
+
+
+@pytest.mark.slow
+def test_counts_around_the_instant_are_no_missing_effect_in_torque_noise():
+    found = diagnose(recorded("counts around the instant", lines=1000, torque_noise=0.01, J=1.5e-4))
     assert found.verdict == "none_detected"
     assert [m for m in found.final.messages if "around each instant" in m]
 

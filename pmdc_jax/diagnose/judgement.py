@@ -31,6 +31,13 @@ def implausible_effect(motor: Motor) -> str | None:
     return next((e.name for e in shafts if e.damping_ratio(motor) > MAX_DAMPING_RATIO), None)
 
 
+def is_doubtful(naming: Naming) -> bool:
+    """Whether something was found, but no effect, or only an implausible one."""
+    if not naming.chosen.effects:
+        return naming.p_nothing_more < FALSE_ALARM
+    return implausible_effect(naming.chosen.motor) is not None
+
+
 def unneeded_effect(naming: Naming, base: Identification, final: Identification, library: Library) -> str | None:
     """The effect that the runs need least, if there is one that they do not need; else None.
 

@@ -21,6 +21,7 @@ from ...identify.solve import Solved, solve
 from ...progress import ReportProgress
 from ...recordings.recording import AROUND
 from ...simulate import ZERO_ORDER_HOLD, Timing
+from ..judgement import is_doubtful
 from ..model import Model, model_of, refit_from
 from .naming import Naming, StepwiseSelection
 
@@ -41,12 +42,11 @@ def likeliest_attempt(prepared: Prepared, search: str, seed: int, report: Report
     """The effects named, and then once more if these reveal another timing of the voltages or of counted speeds, a
     sensor that hums, or runs that begin with a warm winding."""
     attempt = _of_likeliest_timing(prepared, search, seed, report)
+    if _may_be_around(attempt):
+        around = _of_likeliest_timing(with_means(prepared, AROUND), search, seed, report)
+        settles = is_doubtful(attempt.naming) and not is_doubtful(around.naming)
+        attempt = around if settles else _likelier(attempt, around)
     chosen = attempt.naming.chosen
-    averaging = chosen.prepared.averaging
-    if chosen.effects and averaging != AROUND and with_averaging(chosen.fitted).prepared.averaging == AROUND:
-        around = with_means(prepared, AROUND)
-        attempt = _likelier(attempt, _of_likeliest_timing(around, search, seed, report))
-        chosen = attempt.naming.chosen
     quiet = without_mains_hum(chosen.fitted)
     if quiet.prepared is not chosen.prepared:
         return _named(_without_hum_of(quiet.prepared, attempt.solved), attempt.identifying, report)
@@ -56,6 +56,17 @@ def likeliest_attempt(prepared: Prepared, search: str, seed: int, report: Report
     prepared, fit = attempt.solved.fitted
     begins_warm = FittedRuns(prepared.with_problem(begins_warm=warm.problem.begins_warm), fit)
     return _likelier(attempt, _named(attempt.solved._replace(fitted=begins_warm), attempt.identifying, report))
+
+
+def _may_be_around(attempt: Attempt) -> bool:
+    """Whether counted speeds may be means around each instant rather than as they were treated: beside the effects
+    named, or without any where these are doubtful."""
+    if attempt.naming.chosen.prepared.averaging == AROUND:
+        return False
+    if is_doubtful(attempt.naming):
+        return with_averaging(attempt.selection.base.fitted, beside_more=True).prepared.averaging == AROUND
+    chosen = attempt.naming.chosen
+    return bool(chosen.effects) and with_averaging(chosen.fitted).prepared.averaging == AROUND
 
 
 def _of_likeliest_timing(prepared: Prepared, search: str, seed: int, report: ReportProgress) -> Attempt:

@@ -69,16 +69,18 @@ def with_means(prepared: Prepared, averaging: Averaging) -> Prepared:
     return _with_speeds_averaged(without_ends(prepared, SPEED), averaging)
 
 
-def with_averaging(fitted: FittedRuns) -> FittedRuns:
+def with_averaging(fitted: FittedRuns, beside_more: bool = False) -> FittedRuns:
     """The runs with their speeds treated as means, where that is what was recorded, and the fit to them.
 
     A speed that lags more than a mean would is late for another reason.
+
+    **Arguments**: `beside_more`, whether a mean around each instant is found even if more than noise is then left.
 
     **Returns**: both unchanged if no other mean was found.
     """
     prepared, fit = fitted
     if prepared.averaging == OVER_LAST and not _is_slow(prepared):
-        return _or_around(fitted)
+        return _or_around(fitted, beside_more)
     if prepared.averaging:
         return fitted
     mean, min_gain, counted = _averaging_by_noise(prepared)
@@ -89,7 +91,7 @@ def with_averaging(fitted: FittedRuns) -> FittedRuns:
     averaged = refitted(_with_speeds_averaged(inner, mean), fit)
     unlikeliness = negative_log_likelihood(averaged)
     if not negative_log_likelihood(instantaneous) - unlikeliness > min_gain:
-        around = _or_around(instantaneous) if counted and mean == OVER_LAST else instantaneous
+        around = _or_around(instantaneous, beside_more) if counted and mean == OVER_LAST else instantaneous
         return fitted if around is instantaneous else around
     if not counted:
         # a mean over the last and the next sample has no lag: a speed that fits better a sample earlier, or as a mean
@@ -101,12 +103,12 @@ def with_averaging(fitted: FittedRuns) -> FittedRuns:
     return averaged
 
 
-def _or_around(other: FittedRuns) -> FittedRuns:
+def _or_around(other: FittedRuns, beside_more: bool) -> FittedRuns:
     """The runs with their speeds treated as means around each instant, if these are clearly likelier than as they are
-    treated now and leave nothing but noise, and the fit to them; otherwise both unchanged."""
+    treated now and leave nothing but noise, unless `beside_more`, and the fit to them; otherwise both unchanged."""
     around = refitted(_with_speeds_averaged(other.prepared, AROUND), other.fit)
     gain = negative_log_likelihood(other) - negative_log_likelihood(around)
-    return around if gain > MIN_LOG_LIKELIHOOD_GAIN and leaves_only_noise(around) else other
+    return around if gain > MIN_LOG_LIKELIHOOD_GAIN and (beside_more or leaves_only_noise(around)) else other
 
 
 def without_averaging(prepared: Prepared) -> Prepared:

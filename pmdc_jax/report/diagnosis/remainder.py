@@ -86,12 +86,15 @@ def varying_sentence(diagnosis: Diagnosis, varies: VaryingParameter) -> str:
     by_size = sorted(varies.by_run, key=lambda run: varies.by_run[run].value or 0.0)
     ends = [f"{estimate_words(varies.by_run[run])} in the run {run}" for run in (by_size[0], by_size[-1])]
     other = f" (or {enumerate_words(varies.also_possible)})" if varies.also_possible else ""
-    run, gap = max(diagnosis.gap_by_own_value.items(), key=lambda named: named[1].before)
+    run, gap = max(diagnosis.gap_by_own_value.items(), key=lambda named: named[1].before - named[1].after)
+    closes = (
+        f" With a value for each run, the error of the run {run} falls from {significant(gap.before)} to"
+        f" {significant(gap.after)} times the noise."
+    )
     return (
         f"{varies.name}{other} is not the same in all runs: {ends[0]}, {ends[1]} ({p_value_words(varies.p_value)}),"
-        f" as {REASONS[varies.name]} would make it. With a value for each run, the error of the run {run} falls from"
-        f" {significant(gap.before)} to {significant(gap.after)} times the noise. Record all runs in one state of the"
-        " motor, or identify those of each state separately."
+        f" as {REASONS[varies.name]} would make it.{closes if gap.after < gap.before else ''} Record all runs in one"
+        " state of the motor, or identify those of each state separately."
     )
 
 
