@@ -28,12 +28,13 @@ class Drive(NamedTuple):
     free: Scalars | float = 1.0
 
 
-DriveName = Literal["voltage", "current", "torque"]
-# By the input that drives a motor, the parameters that its simulation depends on
+DriveName = Literal["voltage", "current", "torque", "held"]
+# By the input that drives a motor, or for a locked rotor, the parameters that its simulation depends on
 PARAMETERS_OF_DRIVE: dict[DriveName, tuple[str, ...]] = {
     "voltage": tuple(PARAMETERS),
     "current": ("Kt", "J", "f"),
     "torque": ("J", "f"),
+    "held": ("R", "L"),
 }
 
 

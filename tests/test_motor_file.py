@@ -59,6 +59,8 @@ def test_what_no_recording_determined_is_refused_where_it_is_needed(tmp_path):
         load_motor(path)
     with pytest.raises(InputError, match="Kt is null"):
         load_motor(path, "current")
+    with pytest.raises(InputError, match="R is null"):
+        load_motor(path, "held")
 
 
 def test_a_byte_order_mark_is_skipped(tmp_path):

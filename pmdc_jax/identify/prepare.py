@@ -184,6 +184,6 @@ def _signals(recordings: Sequence[Recording], name: str) -> list[np.ndarray]:
 
 def _irrelevant(recordings: Sequence[Recording], tie: Sequence[tuple[str, str]]) -> dict[str, float]:
     """Parameters that affect no run, not even through a tie, with a harmless value."""
-    relevant = {name for r in recordings for name in (("R", "L") if r.held else PARAMETERS_OF_DRIVE[r.drive])}
+    relevant = {name for r in recordings for name in PARAMETERS_OF_DRIVE["held" if r.held else r.drive]}
     relevant |= {source for target, source in tie if target in relevant}
     return {name: 1.0 for name in PARAMETERS if name not in relevant}

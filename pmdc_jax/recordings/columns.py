@@ -159,8 +159,9 @@ def match_columns(headers: Sequence[str], columns: Mapping[str, str] | None, whe
     matched |= _match_by_unit_or_symbol(headers, matched)
     # neither a temperature nor, beside a voltage, a torque of the motor is used
     needless = {"temperature", "torque"} if "voltage" in matched else {"temperature"}
-    for quantity in refused.keys() - matched.keys() - needless:
-        raise refused[quantity]
+    for quantity, error in refused.items():
+        if quantity not in matched.keys() | needless:
+            raise error
     return matched
 
 

@@ -57,7 +57,7 @@ def simulate(motor: Motor | str | Path, recording: Run) -> Recording:
     """
     (recording,) = recordings_of(recording, to_simulate=True)
     if not isinstance(motor, Motor):
-        motor = load_motor(motor, recording.drive)
+        motor = load_motor(motor, "held" if recording.stands_still else recording.drive)
     subject: Motor = jax.tree.map(jnp.asarray, motor)
     # the instantaneous speed is simulated, even if the recorded one is a mean
     even = attrs.evolve(uniform(recording), averaging=None)
