@@ -259,6 +259,14 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
     assert [signal.effect for signal in call.args[1]] == list(gains)[:2]
 
 
+def test_signals_without_any_gain_are_no_effect():
+    """As under a constant voltage without noise."""
+    nothing = Signal(0.0, 0.0, Mock(spec=Curve), Mock(spec=Block))
+    found = Assessment(Mock(spec=Screen), [], [nothing], p_value=1.0, explained=0.0, explained_unfiltered=0.0)
+    assert found.best_candidate_share == 0.0
+    assert not found.is_clearly_effect()
+
+
 @pytest.mark.parametrize(("missed", "verdict"), [({}, "none_detected"), ({"current": 8.1}, "not_in_library")])
 def test_a_small_ripple_of_the_speed_sensor_is_accepted_only_beside_white_noise(missed, verdict):
     """The inertia of a crank leaves such a ripple, too, but also residuals of the current far above its noise."""

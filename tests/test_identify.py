@@ -1034,6 +1034,8 @@ INVALID = {
         "nothing is left to identify",
     ),
     "unknown effect": (lambda r: identify(r, effects=("magic",)), "magic"),
+    "effects as a text": (lambda r: identify(r, effects="coulomb_friction"), "is a text"),
+    "a seed of more than 63 bits": (lambda r: identify(r, seed=2**63), "too large"),
     "unknown search": (lambda r: identify(r, search="magic"), "magic"),
     "negative seed": (lambda r: identify(r, seed=-1), "negative"),
 }
