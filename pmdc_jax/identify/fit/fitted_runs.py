@@ -32,6 +32,7 @@ class FittedRuns(NamedTuple):
 
     def residuals(self, run: int) -> Float[np.ndarray, "samples 2"]:
         """Measured less simulated current and speed of a run, A and rad/s; NaN where nothing was measured."""
-        tape, length = self.problem.tape, len(self.prepared.runs[run])
-        residual = np.asarray(tape.measured) - np.asarray(self.fit.evaluation.simulated)
-        return tape.samples_of(run, np.where(np.asarray(tape.weight) > 0, residual, np.nan), length)
+        tape = self.problem.tape
+        signals = (np.asarray(x) for x in (tape.measured, self.fit.evaluation.simulated, tape.weight))
+        measured, simulated, weight = (tape.samples_of(run, x, len(self.prepared.runs[run])) for x in signals)
+        return np.where(weight > 0, measured - simulated, np.nan)
