@@ -62,7 +62,7 @@ def nominal_table(volts: list[float], options: dict, continuous: bool) -> Table:
 
 def _cells(volts: float, kind: str, found: Tuning, continuous: bool) -> list[str]:
     limit, settling = found.fastest_possible_settling, found.metrics["SettlingTime"]
-    second = found.candidates[0].second_step
+    second = found.tuned.second_step
     cells = [
         f"{volts:g}",
         kind,
@@ -100,7 +100,7 @@ def robust_table(volts: list[float]) -> Table:
         for kind in ("pi", "pid", "state-feedback-integral"):
             robust = tuned(kind, v, **SAMPLED | {"max_overshoot": 1.0}, spread=0.1)
             alone = tuned(kind, v, **SAMPLED)
-            for candidate in robust.candidates:
+            for candidate in (robust.tuned, robust.textbook):
                 name = "robust" if candidate.name == "tuned" else candidate.name
                 shown.add_row(f"{v:g}", kind, name, *_percentiles(candidate.robust, nominal))
             cells = _percentiles(robustness(alone, 0.1, robust.seed), nominal)

@@ -119,7 +119,7 @@ class Motor(eqx.Module):
         return any(effect.holds or effect.contact_state for effect in self.effects)
 
     @property
-    def toothed(self) -> AbstractEffect | None:
+    def gear(self) -> AbstractEffect | None:
         """The effect with teeth, if there is one."""
         return next((effect for effect in self.effects if effect.contact_state), None)
 

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 FORMAT = "pmdc motor 1"
 MEND = "Give the motor file that pmdc identify --save wrote"
 UNDETERMINED = ("not_identifiable", "at_bound")
+COVARIANCE_OF = "natural logarithms of positive parameters, and other parameters in SI"
 
 
 def save_motor(path: str | Path, motor: Motor, identification: Identification | None = None) -> None:
     """Write a motor as JSON, atomically.
 
-    **Arguments**: `motor`, with scalar parameters; `identification`, whose standard errors, statuses, covariance (of
-    the coordinates: natural logarithms of positive parameters) and noise of the sensors are saved with the values. What
-    no recording depends on is null.
+    **Arguments**: `motor`, with scalar parameters; `identification`, whose standard errors, statuses, covariance
+    (`COVARIANCE_OF`) and noise of the sensors are saved with the values. What no recording depends on is null.
     """
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -43,7 +43,7 @@ def save_motor(path: str | Path, motor: Motor, identification: Identification | 
         content["stderr"] = {name: estimate.stderr for name, estimate in estimates.items()}
         content["status"] = {name: estimate.status for name, estimate in estimates.items()}
         content["covariance"] = {
-            "of": "coordinates: natural logarithms of positive parameters",
+            "of": COVARIANCE_OF,
             "names": list(identification.covariance_names),
             "matrix": np.asarray(identification.covariance).tolist(),
         }

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from importlib.metadata import version
 
-# Most of the time of the tests is compilation, which this shortens by a quarter; see pmdc_jax/compiled.py. Later
-# versions do not have this option, and end the process if it is set.
+# Most of the time of the tests is compilation, which this shortens by a quarter; see pmdc_jax/runtime/compiled.py.
+# Later versions do not have this option, and end the process if it is set.
 if version("jaxlib").startswith("0.10."):
     flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_use_fusion_emitters=false"

@@ -32,7 +32,7 @@ from pmdc_jax.diagnose.hypotheses.library import Library
 from pmdc_jax.diagnose.hypotheses.trials import TRIALS
 from pmdc_jax.diagnose.judgement import _by_evidence, implausible_effect, may_be_absent
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
-from pmdc_jax.diagnose.response import path_of, respond, sensor_changes, state_increments
+from pmdc_jax.diagnose.response import respond, sensor_changes, state_increments, trajectory_of
 from pmdc_jax.diagnose.selection import naming, proposals
 from pmdc_jax.diagnose.selection.compare import Fitted
 from pmdc_jax.diagnose.selection.naming import Naming, StepwiseSelection
@@ -102,7 +102,7 @@ def test_candidates_are_within_the_ranges(name):
         assert candidate.effect == name
         for values in candidate.columns:
             EFFECTS[name](**{field: np.asarray(x) for field, x in values.items()})
-        built = candidate.build(np.full(candidate.order, 0.3 * max(candidate.units)), 0.0)
+        built = candidate.build(np.full(candidate.width, 0.3 * max(candidate.units)), 0.0)
         assert built is not None
         for field, r in EFFECTS[name].ranges.items():
             assert r.scale == "linear" or built[field] > 0
@@ -147,7 +147,7 @@ class UndecidedSelection(StepwiseSelection):
 
 def test_the_selection_does_not_return_to_a_superseded_model():
     selection = UndecidedSelection()
-    assert selection.name().chosen is selection.other
+    assert selection.select().chosen is selection.other
     assert selection.trials == 3
 
 
@@ -158,7 +158,7 @@ def test_a_model_with_warm_runs_takes_the_place_of_one_in_which_all_begin_cold(m
     )
     selection.refits = Mock(spec=Refits, replace=lambda model: model)
     monkeypatch.setattr(naming, "with_initial_temperatures", lambda fitted: FittedRuns("warm", "fit"))
-    monkeypatch.setattr(naming, "model_of", lambda effects, prepared, fit: warm if prepared == "warm" else None)
+    monkeypatch.setattr(naming, "model_of", lambda fitted: warm if fitted.prepared == "warm" else None)
     monkeypatch.setattr(naming, "with_gradual_brushes", lambda fitted: fitted)
     assert StepwiseSelection._with_refined_runs(selection, cold) is warm
     assert cold in selection.superseded
@@ -719,7 +719,7 @@ def test_the_first_order_response_matches_the_change_of_the_simulation(x64, name
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
     own = RunUnknowns.as_recorded(tape)._replace(angle=INITIAL_ANGLES)
     without, with_it = (free_run(m, tape, own) for m in (bare, motor))
-    path = path_of(without, tape, INITIAL_ANGLES, False, False)
+    path = trajectory_of(without, tape, INITIAL_ANGLES, False, False)
     if EFFECTS[name].equation == "sensor":
         found = sensor_changes(motor, bare, tape, path)
     else:
@@ -742,7 +742,7 @@ def test_the_response_lasts_while_the_rotor_coasts(x64):
     bare = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()})
     own = RunUnknowns.as_recorded(tape)
     without, with_it = (free_run(bare.with_effects(e), tape, own) for e in ([brushes], [brushes, drag]))
-    path = path_of(without, tape, jnp.zeros(1), False, True)
+    path = trajectory_of(without, tape, jnp.zeros(1), False, True)
     motor = bare.with_effects([drag])
     found = respond(bare, tape, path, state_increments(motor, bare, tape, path)[..., None])[..., 0]
     expected = tape.samples_of(0, with_it - without, 500)
@@ -824,7 +824,7 @@ def model_at(coordinates: list[float], effects: tuple[str, ...] = (), **missing:
     given = prepare([run], [], effects=[EFFECTS[e] for e in effects], unloaded=True)
     start = Unknowns(jnp.asarray(coordinates), RunUnknowns(*jnp.zeros((UNKNOWNS_PER_RUN, 1))))
     point = Optimum(start, np.inf, ())
-    return model_of(effects, given, fit_at(given.problem, point))
+    return model_of(FittedRuns(given, fit_at(given.problem, point)))
 
 
 def test_an_undetermined_effect_without_start_values_is_kept_as_it_is(x64):
@@ -834,8 +834,10 @@ def test_an_undetermined_effect_without_start_values_is_kept_as_it_is(x64):
     assert model.undetermined == {"coulomb_friction.torque_Nm"}
     values = {"current_sensor_offset": {"offset_A": 0.5}}
     effects = ("coulomb_friction", "current_sensor_offset")
-    start = Starts(SCALES).from_model(model, effects, values).point.unknowns.coordinates
-    np.testing.assert_allclose(start, [*coordinates, 0.5])
+    prepared, point = Starts(SCALES).from_model(model, effects, values)
+    start = np.asarray(point.unknowns.coordinates)
+    np.testing.assert_allclose(start[:-1], coordinates)
+    assert prepared.problem.parameters.value("current_sensor_offset.offset_A", start) == pytest.approx(0.5)
 
 
 def test_effects_that_need_a_current_are_not_tried_without_one(x64):

@@ -359,7 +359,7 @@ def test_the_page_is_complete_and_self_contained(case, tmp_path):
         assert sentence in page.text
     assert "if nothing were missing" in page.text
     for effect in diagnosis.effects:
-        assert formula_text(effect.name) in page.text
+        assert formula_text(effect.name, effect.parameters) in page.text
     expected_figures = 1 + len(diagnosis.curves) + (diagnosis.next_experiment is not None)
     expected_figures += len(diagnosis.base.fit) * (2 if diagnosis.effects else 1)
     expected_figures += bool(diagnosis.where)

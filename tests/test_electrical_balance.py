@@ -36,7 +36,7 @@ def fitted(current_mean_samples: int = 1, voltage_noise: float = 0.0) -> Model:
         columns["current_A"] = lfilter(average, 1.0, columns["current_A"])
         runs.append(recording(name, columns))
     given = prepare(runs, (), effects=[EFFECTS["brush_voltage_drop"]])
-    return model_of(("brush_voltage_drop",), *solve(given, "cma_es", 0).fitted)
+    return model_of(solve(given, "cma_es", 0).fitted)
 
 
 @pytest.mark.slow
@@ -79,7 +79,7 @@ def test_a_hidden_shaft_causes_no_electrical_misfit():
     """It biases R and L by a tenth, with which the misfit would be 8.5."""
     runs = [run_with_compliant_shaft(1, 12.0), run_with_compliant_shaft(2, 20.0)]
     solved = solve(prepare(runs, (), unloaded=True, tie=[("Kt", "Kb")]), "cma_es", 0)
-    model = model_of((), *solved.fitted)
+    model = model_of(solved.fitted)
     assert abs(model.motor.R / PAPER["R"] - 1) > 0.05
     assert electrical_misfit(model) < 1.1
 
@@ -98,7 +98,7 @@ def test_brushes_whose_drop_sets_in_gradually_cause_no_electrical_misfit():
 
     def misfit(*effects: str) -> float:
         given = prepare(runs, (), unloaded=True, effects=[EFFECTS[e] for e in effects])
-        return electrical_misfit(model_of(effects, *solve(given, "cma_es", 0).fitted))
+        return electrical_misfit(model_of(solve(given, "cma_es", 0).fitted))
 
     assert misfit() > MAX_ELECTRICAL
     assert misfit("brush_voltage_drop") < 1.2
@@ -113,4 +113,4 @@ def test_coloured_noise_of_the_current_is_no_electrical_misfit():
         columns["current_A"] += lfilter([0.08], [1.0, -0.9], rng.standard_normal(len(excitation.time)))
         runs.append(recording(name, columns))
     solved = solve(prepare(runs, (), unloaded=True), "cma_es", 0)
-    assert electrical_misfit(model_of((), *solved.fitted)) < 1.1
+    assert electrical_misfit(model_of(solved.fitted)) < 1.1

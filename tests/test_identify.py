@@ -204,6 +204,25 @@ def test_a_constant_load_is_not_identifiable_where_the_scale_of_torques_is_not()
     assert tied.ci95[1] - tied.ci95[0] < 0.2 * tied.value
 
 
+def test_a_motor_20_000_times_as_strong_is_identified_as_well(runs):
+    """With 100 times the voltages and 200 times the currents, every torque is 20,000 times as large, and so is its
+    standard error: here several N m for a constant load."""
+    volts, amperes = 100.0, 200.0
+    torques = volts * amperes
+    strong = [
+        attrs.evolve(r, voltage=volts * r.voltage, current=amperes * r.current, load=torques * (r.load - 0.02))
+        for r in runs
+    ]
+    found = identify(strong, effects=["constant_load"])
+    factors = {"R": volts / amperes, "L": volts / amperes, "Kb": volts, "Kt": volts, "J": torques, "f": torques}
+    for name, factor in factors.items():
+        estimate = found.parameters[name]
+        assert abs(estimate.value / factor - getattr(PAPER, name)) < 3 * estimate.stderr / factor, name
+    load = found.parameters["constant_load.torque_Nm"]
+    assert load.stderr > 0.5
+    assert load.ci95[0] < 0.02 * torques < load.ci95[1] < 0.03 * torques
+
+
 @pytest.mark.parametrize("declared", [True, False], ids=["declared", "unknown constant load"])
 def test_without_a_known_load_only_ratios_are_identified(declared):
     result = identify(unloaded(5), unloaded=declared)
@@ -462,7 +481,6 @@ def test_an_inductance_too_small_for_the_sampling_has_no_overconfident_interval(
     result = identify(light_and_loaded(10, truth))
     assert_accurate(result, truth, ("R", "Kb", "Kt", "J", "f"), percent=2.0)
     L = result.parameters["L"]
-    assert L.status in ("identified", "not_identifiable", "at_bound")
     if L.status == "identified":
         assert L.ci95[0] < truth.L < L.ci95[1], L
 
@@ -718,9 +736,9 @@ def test_a_fit_that_cannot_compete_is_given_up(x64, runs, monkeypatch):
     evaluations = Mock(side_effect=evaluate)
     monkeypatch.setattr(polishing, "evaluate", evaluations)
 
-    def made(useful: float) -> tuple[int, float]:
+    def made(give_up_above: float) -> tuple[int, float]:
         evaluations.reset_mock()
-        fitness = polish(held, far, useful=useful).fitness
+        fitness = polish(held, far, give_up_above=give_up_above).fitness
         return evaluations.call_count, fitness * held.most_samples
 
     count, least = made(np.inf)
@@ -795,6 +813,17 @@ def problem(runs) -> tuple[Parameters, Tape, np.ndarray]:
     bounds = {n: (getattr(PAPER, n) / 10, getattr(PAPER, n) * 10) for n in PARAMETERS}
     noise = np.array([NOISE.current_A, NOISE.speed_rad_s])
     return Parameters.of(bounds), Tape.from_recordings(runs), noise
+
+
+def test_the_search_and_the_fit_measure_the_same_fitness(x64, runs):
+    """With a speed that was read at every tenth sample, the fitness of a perfect model is 1.1 to both."""
+    slow = [attrs.evolve(r, speed=np.where(np.arange(len(r)) % 10, np.nan, r.speed)) for r in runs]
+    problem = problem_of(slow)
+    assert problem.perfect_fitness == pytest.approx(1.1, rel=1e-3)
+    noise = np.asarray(problem.noise)
+    found = global_search(problem.parameters, Tape.from_recordings(slow), noise, population=32, generations=3)
+    best = Unknowns(jnp.asarray(found.candidates[0]), RunUnknowns.as_recorded(problem.tape))
+    assert fit_at(problem, Optimum(best, np.inf, ())).fitness == pytest.approx(found.fitness[0], rel=1e-6)
 
 
 @pytest.mark.parametrize("method", METHODS)

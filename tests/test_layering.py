@@ -37,6 +37,7 @@ ALLOWED_IMPORTS = {
         "files",
         "identify",
         "motor",
+        "motor_file",
         "paper",
         "progress",
         "recordings",

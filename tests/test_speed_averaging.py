@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from benchmarks.naming.plant import Plant, simulate
 from benchmarks.virtual_bench import prbs, staircase
 from pmdc_jax import diagnose, identify
-from pmdc_jax.identify.corrections.speed_averaging import _in_counts, averaging_of_counts, averaging_of_differences
+from pmdc_jax.identify.corrections.averaging_by_noise import averaging_of_counts, averaging_of_differences, in_counts
 from pmdc_jax.recordings.recording import AROUND, OVER_BOTH, OVER_LAST, Averaging, Recording
 from pmdc_jax.recordings.resolution import quantum
 
@@ -218,10 +218,10 @@ def test_counts_printed_in_few_digits_are_recognised():
         rng = np.random.default_rng(seed)
         counts = np.round(rng.uniform(40, 90) * np.sin(np.linspace(0, 9, 3000)))
         rpm = np.round(60 / 1920 / 0.01 * counts, 2)
-        (found,) = _in_counts([(rpm * 2 * np.pi / 60, 0.01)])
+        (found,) = in_counts([(rpm * 2 * np.pi / 60, 0.01)])
         np.testing.assert_allclose(found, counts, atol=0.01)
         # steps of a converter are not counts
-        assert not _in_counts([(1.0003 * rpm * 2 * np.pi / 60, 0.01)])
+        assert not in_counts([(1.0003 * rpm * 2 * np.pi / 60, 0.01)])
 
 
 @pytest.mark.slow

@@ -45,10 +45,10 @@ def test_the_tuned_loop_settles_nearly_as_fast_as_possible():
     assert found.margins.sensitivity_peak < 2.1
     assert found.peak_current < 150 * 1.01
     assert abs(found.load["SteadyStateError"]) < 0.1
-    second = found.candidates[0].second_step
+    second = found.tuned.second_step
     assert second["Overshoot"] < 3
     assert second["SettlingTime"] < found.fastest_possible_settling
-    small = found.candidates[0].small_step
+    small = found.tuned.small_step
     assert 0.9 * 24.05 < small["Peak"] < 1.2 * 24.05
     mentioned = any("a small step of 24.1 rad/s" in message for message in found.messages)
     assert mentioned == (small["Overshoot"] > 1.2)
@@ -69,7 +69,7 @@ def test_gains_are_tuned_against_the_noise_of_the_recordings():
 
 @pytest.mark.slow
 def test_the_tuned_loop_is_robust_over_drawn_motors():
-    ours, textbook = example().candidates
+    ours, textbook = example().tuned, example().textbook
     assert ours.robust.samples == 256
     assert ours.robust.Overshoot_p95 <= 1.0
     assert ours.robust.Overshoot_p95 < textbook.robust.Overshoot_p95
@@ -124,7 +124,7 @@ def test_a_loop_that_misses_its_specification_is_reported():
     missing = evolve(found, requirements=requirements)
     assert not missing.meets_specification
     slow = {**found.metrics, "SettlingTime": None}
-    unsettled = evolve(found, candidates=(evolve(found.candidates[0], metrics=slow),))
+    unsettled = evolve(found, tuned=evolve(found.tuned, metrics=slow))
     assert "does not settle" in summary(unsettled)[0]
     assert not unsettled.meets_specification
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from ..recordings.angle import unwrapped
 from ..recordings.clock import GAP, is_evenly_sampled
+from ..recordings.noise import noise_by_differences
 from ..recordings.readings import reading_interval
 from ..recordings.recording import Finding, Recording, place_of_sample
-from ..recordings.white_noise import noise_by_differences
 from .alignment import shifted_channels, slow_sampling
 from .invalid_samples import clipped_extremes
 from .plausibility import angle_against_speed, implausible_units, lost_signs, reversed_signs, speed_of

@@ -9,14 +9,14 @@ import attrs
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..recordings.noise import noise_by_differences
 from ..recordings.recording import MAX_MISSING, Finding, Recording, place_of_sample
 from ..recordings.resolution import quantum
-from ..recordings.white_noise import noise_by_differences
 
 RANGE = "If the values are real, sample faster and with a larger measuring range"
-# Least height of a spike over the median absolute second difference of the signal ...
+# Least height of a spike over the median absolute second difference of the signal
 SPIKE_RATIO = 50.0
-# ... and over the range of the signal (from its 2 % to its 98 % quantile)
+# Least height of a spike over the range of the signal (from its 2 % to its 98 % quantile)
 MIN_SPIKE = 0.2
 # Largest difference between the two neighbours of a spike, over its height
 MAX_STEP_ASIDE = 0.2
@@ -28,15 +28,18 @@ MAX_SPIKES = 0.01
 CHANCE_OF_STAY = 1e-9
 # The same for the repeated values of stays at an extreme that begin and end with a leap of so many times the noise
 CHANCE_OF_REPEATS, MIN_LEAP = 1e-6, 5.0
+# Fewer equal values than this are no stay
+MIN_STAY = 5.0
 # Largest probability assumed for a value to repeat the one before, with a resolution far coarser than the noise
 MAX_CHANCE_TO_REPEAT = 0.9
 # Part of the range that is next to an extreme, and the least number of values there
 NEAR, MIN_NEAR = 0.1, 30
 # Bits of magnitude of the coarsest converter, and by how much its last code may differ from a whole number
 MIN_BITS, LAST_CODE_TOLERANCE = 9, 0.1
-# Least number of equal values from a failed sensor, and the least jump after them, over the noise; at zero, where a
-# sensor may truly rest, before and after them, over the range of the signal
-MIN_FROZEN, MIN_JUMP, MIN_JUMP_AT_ZERO = 20, 10.0, 0.05
+# Least number of equal values from a failed sensor, and the least jump after them, over the noise
+MIN_FROZEN, MIN_JUMP = 20, 10.0
+# Least jump before and after equal values of zero, where a sensor may truly rest, over the range of the signal
+MIN_JUMP_AT_ZERO = 0.05
 # Largest share of neighbouring values that are equal elsewhere: a counted speed often stays at one value
 MAX_REPEATS = 0.02
 
@@ -210,7 +213,7 @@ def _longest_stay_at(values: np.ndarray, extreme: float) -> tuple[int, int, floa
     expected = 1 + np.log(CHANCE_OF_STAY / len(values)) / np.log(min(repeats, 0.999))
     # a speed in encoder counts stays at one value whenever the motor turns steadily
     elsewhere = 2.0 * _second_longest_stay(inner[inner != 0])
-    return (int(starts[longest]), int(ends[longest] - starts[longest]), max(float(expected), elsewhere, 5.0))
+    return int(starts[longest]), int(ends[longest] - starts[longest]), max(float(expected), elsewhere, MIN_STAY)
 
 
 def _frozen(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:

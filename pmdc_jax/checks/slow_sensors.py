@@ -6,7 +6,7 @@ import attrs
 import numpy as np
 
 from ..recordings.readings import repeated_readings
-from ..recordings.recording import OUTPUTS, Recording
+from ..recordings.recording import RECORDED_OUTPUTS, Recording
 
 
 def readings_only(run: Recording) -> Recording:
@@ -14,7 +14,7 @@ def readings_only(run: Recording) -> Recording:
 
     If nothing else changes in between either, only the samples remain at which all these sensors are read.
     """
-    outputs = [name for name in OUTPUTS if getattr(run, name) is not None and name != run.drive]
+    outputs = [name for name in RECORDED_OUTPUTS if getattr(run, name) is not None and name != run.drive]
     repeated = {name: repeated_readings(getattr(run, name)) for name in outputs}
     slow = [name for name in outputs if repeated[name].any()]
     if not slow:

@@ -93,7 +93,7 @@ class PI(_Integrating):
     name: ClassVar = "pi"
     label: ClassVar = "PI controller"
     units: ClassVar = {"proportional": "V s/rad", "integral": "V/rad", "setpoint_weight": "", "tracking_time": "s"}
-    coordinates: ClassVar = ("stiffness", "integral_time", "setpoint_weight", "tracking_time")
+    coordinates: ClassVar = ("proportional_gain", "integral_time", "setpoint_weight", "tracking_time")
     c_command: ClassVar = "PMDC_PROPORTIONAL * (PMDC_SETPOINT_WEIGHT * reference - speed) + state->integral"
 
     proportional: Number
@@ -118,7 +118,7 @@ class PID(_Integrating):
     label: ClassVar = "PID controller"
     units: ClassVar = PI.units | {"derivative": "V s^2/rad", "filter_time": "s"}
     coordinates: ClassVar = (
-        "stiffness",
+        "proportional_gain",
         "integral_time",
         "derivative_time",
         "filter_time",
@@ -161,7 +161,7 @@ class StateFeedback(AbstractController):
     name: ClassVar = "state-feedback"
     label: ClassVar = "State feedback"
     units: ClassVar = {"reference_gain": "V s/rad", "current_gain": "V/A", "speed_gain": "V s/rad"}
-    coordinates: ClassVar = ("stiffness", "derivative_time")
+    coordinates: ClassVar = ("proportional_gain", "derivative_time")
     c_command: ClassVar = "PMDC_REFERENCE_GAIN * reference - (PMDC_CURRENT_GAIN * current + PMDC_SPEED_GAIN * ahead)"
     feeds_back_current: ClassVar = True
 
@@ -186,7 +186,7 @@ class StateFeedbackIntegral(_Integrating):
     name: ClassVar = "state-feedback-integral"
     label: ClassVar = "State feedback with integral action"
     units: ClassVar = StateFeedback.units | {"integral": "V/rad", "tracking_time": "s"}
-    coordinates: ClassVar = ("stiffness", "derivative_time", "integral_time", "tracking_time")
+    coordinates: ClassVar = ("proportional_gain", "derivative_time", "integral_time", "tracking_time")
     c_command: ClassVar = f"{StateFeedback.c_command} + state->integral"
     feeds_back_current: ClassVar = True
 

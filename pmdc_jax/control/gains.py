@@ -13,12 +13,12 @@ from ..motor import Motor
 from .controllers import CONTROLLERS, AbstractController, Number
 from .steady import steady_state
 
-# (lower, upper): the stiffness in units of voltage limit over set point, times in units of the fastest settling time,
+# (lower, upper): the gain in units of voltage limit over set point, times in units of the fastest settling time,
 # or of what the dead time of the loop allows.
 # The ranges are wide: in a long search for PI and PID at seven voltages, the best gains lay inside them by a factor of
 # at least three.
 RANGES: Mapping[str, tuple[float, float]] = {
-    "stiffness": (0.1, 300.0),  # Kp, K2
+    "proportional_gain": (0.1, 300.0),  # Kp, K2
     "integral_time": (0.05, 100.0),  # Kp / Ki
     "derivative_time": (0.003, 0.5),  # Kd / Kp; for state feedback K1 J / (K2 Kt)
     "filter_time": (0.001, 0.1),
@@ -52,19 +52,19 @@ class GainSpace(NamedTuple):
         kind = CONTROLLERS[self.kind]
         relative = {name: jnp.exp(x) for name, x in zip(self.names, coordinates, strict=True)}
         times = {name: self.time_unit * value for name, value in relative.items() if name.endswith("_time")}
-        stiffness, gains = self.gain_unit * relative["stiffness"], {}
+        gain, gains = self.gain_unit * relative["proportional_gain"], {}
         if kind.feeds_back_current:
             # K1 i equals K2 times the change of speed that the torque Kt i produces in derivative_time
-            current_gain = stiffness * times["derivative_time"] * self.motor.Kt / self.motor.J
-            gains["reference_gain"] = reference_gain(self.motor, self.setpoint, current_gain, stiffness)
-            gains |= {"current_gain": current_gain, "speed_gain": stiffness}
+            current_gain = gain * times["derivative_time"] * self.motor.Kt / self.motor.J
+            gains["reference_gain"] = reference_gain(self.motor, self.setpoint, current_gain, gain)
+            gains |= {"current_gain": current_gain, "speed_gain": gain}
         else:
-            gains |= {"proportional": stiffness, "setpoint_weight": relative["setpoint_weight"]}
+            gains |= {"proportional": gain, "setpoint_weight": relative["setpoint_weight"]}
         if kind.integrates:
-            gains["integral"] = stiffness / times["integral_time"]
+            gains["integral"] = gain / times["integral_time"]
             gains["tracking_time"] = jnp.maximum(times["tracking_time"], self.sample_time)
         if kind.filters_derivative:
-            gains["derivative"] = stiffness * times["derivative_time"]
+            gains["derivative"] = gain * times["derivative_time"]
             gains["filter_time"] = times["filter_time"]
         return kind(**gains)
 

@@ -188,10 +188,8 @@ def _evaluated(
         motor=motor,
         task=task,
         requirements=requirements,
-        candidates=(
-            evaluate("tuned", task, motor, controller, validation_motors),
-            evaluate(rule, task, motor, rival, validation_motors),
-        ),
+        tuned=evaluate("tuned", task, motor, controller, validation_motors),
+        textbook=evaluate(rule, task, motor, rival, validation_motors),
         validation_speeds=None
         if validation_motors is None
         else np.asarray(simulate_speeds(task, validation_motors, law)),

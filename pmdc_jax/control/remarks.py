@@ -71,7 +71,7 @@ def _unmet_requirements(result: Tuning) -> Iterator[str]:
 def _small_step_remark(result: Tuning) -> Iterator[str]:
     """A message where a small step overshoots notably more than the step to the set point, and by more than the
     sensor's quantum."""
-    overshoot = result.candidates[0].small_step["Overshoot"] or 0.0
+    overshoot = result.tuned.small_step["Overshoot"] or 0.0
     step = SMALL_STEP * result.setpoint
     allowed = OVERSHOOT_TO_REPORT * max(result.requirements.max_overshoot, result.metrics["Overshoot"] or 0.0)
     quantum = result.requirements.speed_step or 0.0

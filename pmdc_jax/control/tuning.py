@@ -26,7 +26,8 @@ class Tuning:
     motor: Motor
     task: Task
     requirements: LoopRequirements
-    candidates: tuple[EvaluatedController, ...]  # the tuned one, and that of a textbook rule
+    tuned: EvaluatedController
+    textbook: EvaluatedController  # by a rule
     validation_speeds: np.ndarray | None = field(repr=False)  # (motors, samples) rad/s
     seed: int
     seconds: Mapping[str, float] = field(factory=dict)
@@ -35,27 +36,27 @@ class Tuning:
     @property
     def metrics(self) -> Mapping[str, float | None]:
         """Metrics of the step, on the nominal motor."""
-        return self.candidates[0].metrics
+        return self.tuned.metrics
 
     @property
     def margins(self) -> Margins:
         """Margins of the loop."""
-        return self.candidates[0].margins
+        return self.tuned.margins
 
     @property
     def response(self) -> Response:
         """The response over the whole course, on the nominal motor."""
-        return self.candidates[0].response
+        return self.tuned.response
 
     @property
     def load(self) -> Mapping[str, float | None]:
         """Metrics of the load step, on the nominal motor."""
-        return self.candidates[0].load
+        return self.tuned.load
 
     @property
     def robust(self) -> Robustness | None:
         """Metrics over the drawn motors; None without an uncertainty or spread."""
-        return self.candidates[0].robust
+        return self.tuned.robust
 
     @property
     def setpoint(self) -> float:

@@ -17,6 +17,14 @@ from .selection.naming import Naming
 
 # A knot of a curve is part of a region if its misfit is so many standard errors
 REGION_Z = 4.0
+# Largest p-value of a curve whose regions are told, and most regions
+REGION_P_VALUE, MAX_REGIONS = 1e-4, 12
+# Most curves that are told
+MAX_CURVES = 3
+# Directions of a curve with a smaller eigenvalue, which the motor's own parameters can imitate, are no part of it
+CURVE_EIGENVALUE = 1e-3
+# Probability with which an effect of the amplitude called detectable is detected
+DETECTION_PROBABILITY = 0.9
 
 
 def effects_found(naming: Naming, final: Identification) -> tuple[EffectFound, ...]:
@@ -39,7 +47,8 @@ def rival_sets(naming: Naming) -> tuple[tuple[str, ...], ...]:
 
 
 def regions_of_misfit(naming: Naming) -> tuple[Region, ...]:
-    """Where the curves of the motor without effects are far from zero, the clearest first; also a line in frequency."""
+    """Where the curves of the motor without effects are far from zero, and a line in frequency; at most `MAX_REGIONS`,
+    the clearest first."""
     screen, line = naming.base_screen, naming.line
     base = screen.evidence.regress().squares
     regions = []
@@ -47,14 +56,14 @@ def regions_of_misfit(naming: Naming) -> tuple[Region, ...]:
         if curve.per_run or curve.is_sensor_error:
             continue
         gain = base - screen.evidence.regress([block]).squares
-        if log_p_value(gain, screen.evidence.degrees_of_freedom(block)) > np.log(1e-4):
+        if log_p_value(gain, screen.evidence.degrees_of_freedom(block)) > np.log(REGION_P_VALUE):
             continue
         z = np.array([_z_of_column(screen, column) for column in block.columns])
         regions += _regions_of_curve(curve, z)
     if line is not None:
         region = (line.low, line.high)
         regions.append(Region("mechanical", "frequency", region, float(np.sqrt(line.height))))
-    return tuple(sorted(regions, key=lambda r: -abs(r.z))[:12])
+    return tuple(sorted(regions, key=lambda r: -abs(r.z))[:MAX_REGIONS])
 
 
 def _z_of_column(screen: Screen, column: int) -> float:
@@ -82,15 +91,14 @@ def _regions_of_curve(curve: Curve, z: np.ndarray) -> list[Region]:
 
 
 def learned_curves(naming: Naming) -> tuple[LearnedCurve, ...]:
-    """The curves that the data still show, at most three, the most significant first; none for a line in frequency."""
+    """The curves that the data still show, at most `MAX_CURVES`, the most significant first."""
     screen = naming.chosen_screen
     if naming.p_nothing_more >= FALSE_ALARM:
         return ()
     base = screen.evidence.regress().squares
     learned = []
     for curve, block in zip(screen.curves, screen.curve_blocks, strict=True):
-        # directions that the motor's own parameters can imitate are no part of the curve
-        least = 1e-3 if curve.order > 1 else MIN_EIGENVALUE
+        least = CURVE_EIGENVALUE if curve.width > 1 else MIN_EIGENVALUE
         fit = screen.evidence.regress([block], min_eigenvalue=least)
         log_p = log_p_value(base - fit.squares, screen.evidence.degrees_of_freedom(block))
         value, error = fit.coefficients[0], fit.errors[0]
@@ -108,13 +116,15 @@ def learned_curves(naming: Naming) -> tuple[LearnedCurve, ...]:
             curve.reverses,
         )
         learned.append((log_p, estimated))
-    return tuple(curve for _, curve in sorted(learned, key=lambda pair: pair[0])[:3])
+    return tuple(curve for _, curve in sorted(learned, key=lambda pair: pair[0])[:MAX_CURVES])
 
 
 def detectable_effects(screen: Screen) -> tuple[Detectable, ...]:
-    """The smallest amplitude of each effect that would be detected with a probability of 90 %, if it is physical."""
+    """The smallest amplitude of each effect that would be detected with `DETECTION_PROBABILITY`, if it is physical."""
     count = len(screen.candidates) + len(screen.curves)
-    needed = max(stats.norm.isf(FALSE_ALARM / count / 2) + stats.norm.isf(0.1), np.sqrt(screen.least_gain))
+    needed = max(
+        stats.norm.isf(FALSE_ALARM / count / 2) + stats.norm.isf(1 - DETECTION_PROBABILITY), np.sqrt(screen.least_gain)
+    )
     smallest: dict[str, Detectable] = {}
     for candidate, block in zip(screen.candidates, screen.candidate_blocks, strict=True):
         field = candidate.amplitude

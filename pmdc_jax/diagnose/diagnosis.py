@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 from attrs import field, frozen
+from jaxtyping import Float
 
 from ..identify.identification import Estimate, Identification, Role, RunFit
 
@@ -56,16 +57,16 @@ class Region:
 
 @frozen
 class LearnedCurve:
-    """An unknown term of one equation over a variable, as estimated from the data: (knots,) arrays, SI."""
+    """An unknown term of one equation over a variable, as estimated from the data, in SI."""
 
     equation: str
     variable: str
     # of `value`: "N m" opposing motion, "V" at the terminals, "A" of the current that is read, or "" for a share of the
     # speed that is read
     unit: str
-    x: np.ndarray
-    value: np.ndarray
-    stderr: np.ndarray
+    x: Float[np.ndarray, " knots"]
+    value: Float[np.ndarray, " knots"]
+    stderr: Float[np.ndarray, " knots"]
     p_value: float
     reverses: bool  # changes sign with the direction of motion, as friction does
 
@@ -98,8 +99,8 @@ class NextExperiment:
     why: str
     description: str
     power: float  # probability of distinguishing them, 0 to 1
-    time: np.ndarray  # s, (samples,)
-    voltage: np.ndarray  # V, (samples,)
+    time: Float[np.ndarray, " samples"]  # s
+    voltage: Float[np.ndarray, " samples"]  # V
 
 
 @frozen

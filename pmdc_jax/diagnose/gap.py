@@ -8,7 +8,7 @@ import numpy as np
 
 from ..identify.identification import Role, RunFit
 from ..identify.noise.sensor_noise import MIN_RELATIVE_NOISE, noise_of_sensor, rms
-from ..recordings.recording import CHANNELS
+from ..recordings.recording import SIMULATED_OUTPUTS
 from .diagnosis import Gap, share_left
 
 # Least gap, in squares over those of the noise, of which a share can be closed: less is rounding
@@ -25,7 +25,7 @@ def gaps_of_runs(before: Fits, after: Fits, noise: Noise) -> dict[str, Gap]:
     def misfit(run: str, fit: RunFit) -> float:
         ratios = [
             getattr(fit, f"{channel}_rmse") / noise[channel][run]
-            for channel in CHANNELS
+            for channel in SIMULATED_OUTPUTS
             if getattr(fit, f"{channel}_rmse") is not None and noise[channel][run]
         ]
         return float(np.sqrt(np.mean(np.square(ratios)))) if ratios else 1.0
@@ -64,7 +64,7 @@ def noise_of_runs(fits: Fits, share: float) -> Noise:
     the sensor's, is not that of all runs together but each run's own, and may be larger in a hold-out. The noise is at
     least `MIN_RELATIVE_NOISE` times what was measured.
     """
-    return {channel: _noise_of_runs(fits, channel, share) for channel in CHANNELS}
+    return {channel: _noise_of_runs(fits, channel, share) for channel in SIMULATED_OUTPUTS}
 
 
 def _noise_of_runs(fits: Fits, channel: str, share: float) -> dict[str, float]:

@@ -10,16 +10,17 @@ import numpy as np
 from ..effects import AsymmetricFriction, CoulombFriction, InputDeadZone
 from ..identify.fit.fitted_runs import FittedRuns
 from ..identify.fit.gauss_newton import TRIAL_TOLERANCE
-from ..identify.fit.generalised_least_squares import last_fit, residuals_of, series_of, training_indices, with_whitening
+from ..identify.fit.generalised_least_squares import last_fit, residuals_of, series_of, with_whitening
 from ..identify.fit.polish import Fit, fit_at, reweighted
 from ..identify.fit.refine import Optimum
 from ..identify.noise.noise_model import Series, Whitener
 from ..identify.prepare import Prepared
+from ..identify.problem import Problem
 from ..identify.rotor_angle import rotor_outputs, with_rotor_angle
 from ..identify.solve import polish_with_angle
 from ..identify.uncertainty.covariance import MIN_UNSEEN_STDERR
 from ..motor import Motor
-from .response import Path, path_of
+from .response import Trajectory, trajectory_of
 
 # Largest number of effects in a set
 MAX_EFFECTS = 3
@@ -33,19 +34,32 @@ EXACT_MISFIT = 1e-4
 class Model:
     """A motor with some effects, fitted to the recordings; compared and hashed by identity."""
 
-    effects: tuple[str, ...]
-    prepared: Prepared
-    fit: Fit
+    fitted: FittedRuns
 
     @property
-    def fitted(self) -> FittedRuns:
-        """The recordings as prepared for it, and its fit to them."""
-        return FittedRuns(self.prepared, self.fit)
+    def prepared(self) -> Prepared:
+        """The recordings as prepared for it."""
+        return self.fitted.prepared
+
+    @property
+    def problem(self) -> Problem:
+        """The least-squares problem that its fit solves."""
+        return self.fitted.problem
+
+    @property
+    def fit(self) -> Fit:
+        """Its fit to the recordings."""
+        return self.fitted.fit
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """The names of its effects."""
+        return tuple(effect.name for effect in self.problem.parameters.effects)
 
     @property
     def motor(self) -> Motor:
         """The fitted motor."""
-        return self.prepared.problem.parameters(self.fit.coordinates)
+        return self.problem.parameters(self.fit.coordinates)
 
     @property
     def is_possible(self) -> bool:
@@ -71,8 +85,8 @@ class Model:
         recorded voltage where that is zero.
         """
         width = sum(float(e.width_V) for e in self.motor.effects if isinstance(e, InputDeadZone))
-        tape = self.prepared.problem.tape
-        driven = [k for k in self.training if tape.drive_of(k).voltage]
+        tape = self.problem.tape
+        driven = [k for k in self.prepared.training_indices if tape.drive_of(k).voltage]
         if not width or not driven:
             return True
         voltage = np.abs(np.asarray(tape.value)[np.isin(np.asarray(tape.run), driven)])
@@ -82,13 +96,13 @@ class Model:
     @property
     def travel(self) -> float:
         """The largest range of rotor angles, in rad, of any training run."""
-        angle, tape = np.asarray(self.path.angle), self.prepared.problem.tape
-        return float(max(np.ptp(angle[:, tape.blocks_of(run)]) for run in self.training))
+        angle, tape = np.asarray(self.trajectory.angle), self.problem.tape
+        return float(max(np.ptp(angle[:, tape.blocks_of(run)]) for run in self.prepared.training_indices))
 
     @property
     def at_bound(self) -> set[str]:
         """The parameters that are held at their bounds."""
-        return {self.prepared.problem.parameters.names[k] for k in self.fit.at_bound}
+        return {self.problem.parameters.names[k] for k in self.fit.at_bound}
 
     @property
     def effects_at_end(self) -> set[str]:
@@ -100,7 +114,7 @@ class Model:
     def undetermined(self) -> set[str]:
         """The parameters to which no run is sensitive (standard error above `MIN_UNSEEN_STDERR`), so that a refit would
         not move them."""
-        problem = self.prepared.problem
+        problem = self.problem
         names = problem.parameters.names
         # columns of each run's own unknowns follow those of the parameters
         jacobian = np.asarray(self.fit.evaluation.jacobian)
@@ -130,12 +144,12 @@ class Model:
         return 0.0, 0.0
 
     @property
-    def path(self) -> Path:
+    def trajectory(self) -> Trajectory:
         """The free run of the fitted motor: the states of the rotor itself, before any sensor."""
         held = {effect.holds for effect in self.motor.effects}
-        problem = self.prepared.problem
+        problem = self.problem
         start_angle = self.fit.unknowns.runs.angle
-        return path_of(
+        return trajectory_of(
             rotor_outputs(problem, self.fit),
             problem.tape,
             start_angle,
@@ -146,7 +160,7 @@ class Model:
     @property
     def relative_misfit(self) -> float:
         """Its residuals over what was measured, as root mean squares, for the output where that is larger."""
-        sizes = self.prepared.problem.measured_rms
+        sizes = self.problem.measured_rms
         measured = sizes > 0
         return float(np.max(self.fit.noise[measured] / sizes[measured], initial=0.0))
 
@@ -155,38 +169,34 @@ class Model:
         """Whether its residuals are negligible, as small as between two simulations."""
         return self.relative_misfit < EXACT_MISFIT
 
-    @property
-    def training(self) -> list[int]:
-        """The runs that it was fitted to."""
-        return training_indices(self.prepared)
 
-
-def refit_from(
-    effects: tuple[str, ...], prepared: Prepared, start: Optimum, white: Whitener, useful: float = np.inf
-) -> Model:
+def refit_from(prepared: Prepared, start: Optimum, white: Whitener, give_up_above: float = np.inf) -> Model:
     """A model fitted from a start to whitened residuals; its `fit` is evaluated without the filter.
 
-    **Arguments**: `useful`, the largest sum of squared white residuals that is of any use, as of `polish`.
+    **Arguments**: `give_up_above`, a sum of squared white residuals, as of `polish`.
     """
-    prepared, whitened = polish_with_angle(with_whitening(prepared, white), start, TRIAL_TOLERANCE, useful=useful)
+    prepared, whitened = polish_with_angle(
+        with_whitening(prepared, white), start, TRIAL_TOLERANCE, give_up_above=give_up_above
+    )
     prepared = prepared.with_problem(whitening=None)
     # no step: the unfiltered residuals at the same point
     unfiltered = fit_at(prepared.problem, whitened.optimum)
     optimum = whitened.optimum._replace(fitness=unfiltered.fitness)
-    return model_of(effects, prepared, unfiltered._replace(optimum=optimum))
+    return model_of(FittedRuns(prepared, unfiltered._replace(optimum=optimum)))
 
 
-def model_of(effects: tuple[str, ...], prepared: Prepared, fit: Fit) -> Model:
+def model_of(fitted: FittedRuns) -> Model:
     """A fitted model, with the rotor angle of each sample estimated from recordings and fit together."""
+    prepared, fit = fitted
     if not prepared.problem.depends_on_angle:  # with an effect of the angle, the fit has done this
         prepared = prepared._replace(problem=with_rotor_angle(prepared.problem, fit))
-    return Model(effects, prepared, fit)
+    return Model(FittedRuns(prepared, fit))
 
 
 def final_fit(model: Model, white: Whitener) -> FittedRuns:
     """The last fit of a model: to whitened residuals where `last_fit` allows it, else by plain least squares."""
-    known = reweighted(model.prepared.problem, model.fit)
-    unfiltered = polish_with_angle(model.prepared, model.fit.optimum, known=known)
+    at_start = reweighted(model.problem, model.fit)
+    unfiltered = polish_with_angle(model.prepared, model.fit.optimum, at_start=at_start)
     return last_fit(unfiltered, model.fit, white)
 
 
@@ -201,9 +211,9 @@ class RunSeries(NamedTuple):
 
 def series_of_runs(model: Model) -> list[RunSeries]:
     """The fit of every training run, in the order of time."""
-    evaluation, tape = model.fit.evaluation, model.prepared.problem.tape
+    evaluation, tape = model.fit.evaluation, model.problem.tape
     J = np.asarray(evaluation.jacobian) * model.fit.noise[:, None, None]
-    count = model.prepared.problem.free.shape[0]
+    count = model.problem.free.shape[0]
     residuals = residuals_of(model.prepared, model.fit)
     return [
         RunSeries(
@@ -212,5 +222,5 @@ def series_of_runs(model: Model) -> list[RunSeries]:
             residual,
             series_of(tape, run, np.asarray(evaluation.simulated)),
         )
-        for run, residual in zip(model.training, residuals, strict=True)
+        for run, residual in zip(model.prepared.training_indices, residuals, strict=True)
     ]

@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 
 from ..errors import InputError
-from ..identify.fit.generalised_least_squares import series_of, training_indices
+from ..identify.fit.generalised_least_squares import series_of
 from ..identify.identification import Identification
 from ..identify.prepare import Prepared, prepare
 from ..identify.results import results_of
@@ -76,7 +76,7 @@ def diagnose(
 def _refuse_few_readings(prepared: Prepared) -> None:
     tape = prepared.problem.tape
     readings = sum(
-        int(series_of(tape, run, np.asarray(tape.measured)).known.sum()) for run in training_indices(prepared)
+        int(series_of(tape, run, np.asarray(tape.measured)).known.sum()) for run in prepared.training_indices
     )
     if readings < MIN_READINGS:
         what = f"all recorded outputs are read together only {readings} times; a diagnosis needs {MIN_READINGS}"

@@ -24,31 +24,30 @@ from ..simulate.propagator import Instant, Propagator, grid_propagators, pick_gr
 from ..simulate.sensing import outputs, reported
 from ..simulate.solver import Input, held_step, held_step_and_mean
 
-Signal = Float[Array, "samples blocks"]
 Outputs = Float[Array, "samples 2 blocks"]
 Columns = Float[Array, "2 blocks columns"]  # at one sample
 Extra = dict[str, Scalars]  # states that effects add, by name
 
 
-class Path(NamedTuple):
+class Trajectory(NamedTuple):
     """A free run, sample by sample: current (A) and speed (rad/s), and where dry elements hold one of them at zero."""
 
-    current: Signal
-    speed: Signal
-    angle: Signal  # rad, by the turns on the tape, or else by the simulated speed
+    current: Float[Array, "samples blocks"]
+    speed: Float[Array, "samples blocks"]
+    angle: Float[Array, "samples blocks"]  # rad, by the turns on the tape, or else by the simulated speed
     stuck: Bool[Array, "samples blocks"]  # the rotor, by dry friction
     coasting: Bool[Array, "samples blocks"]  # the rotor, without a current, which the brushes block
 
 
 @compiled
-def path_of(
+def trajectory_of(
     simulated: Float[Array, "blocks 2 samples"],
     tape: Tape,
     start_angle: Float[Array, " runs"],
     can_stick: bool | Array,
     can_coast: bool | Array,
-) -> Path:
-    """The path of free runs.
+) -> Trajectory:
+    """The trajectory of free runs.
 
     **Arguments**: `simulated`, current in A and speed in rad/s; `start_angle`, the angle in rad where each run begins;
     `can_stick` and `can_coast`, whether the motor has friction that can hold the rotor, and brushes that can block the
@@ -65,28 +64,28 @@ def path_of(
     first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
     angle = before - before[first, :1] + start_angle[tape.run][:, None]
     coasting = (current == 0) & can_coast & (drive.voltage > 0)
-    return Path(current, speed, angle.T, (speed == 0) & can_stick, coasting)
+    return Trajectory(current, speed, angle.T, (speed == 0) & can_stick, coasting)
 
 
 @compiled
-def state_increments(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
-    """The difference in current and speed between `motor` and `bare` one sample after each point of the path."""
-    after = _after_one_sample(motor, tape, path)
-    without = _after_one_sample(bare, tape, path)
+def state_increments(motor: Motor, bare: Motor, tape: Tape, trajectory: Trajectory) -> Outputs:
+    """The difference in current and speed between `motor` and `bare` one sample after each point of the trajectory."""
+    after = _after_one_sample(motor, tape, trajectory)
+    without = _after_one_sample(bare, tape, trajectory)
     return jnp.stack([after.current - without.current, after.speed - without.speed], 1)
 
 
 @compiled
-def sensor_changes(motor: Motor, bare: Motor, tape: Tape, path: Path) -> Outputs:
-    """The difference between what the sensors of `motor` and those of `bare` report of the path."""
-    return _sensor_outputs(motor, tape, path) - _sensor_outputs(bare, tape, path)
+def sensor_changes(motor: Motor, bare: Motor, tape: Tape, trajectory: Trajectory) -> Outputs:
+    """The difference between what the sensors of `motor` and those of `bare` report of the trajectory."""
+    return _sensor_outputs(motor, tape, trajectory) - _sensor_outputs(bare, tape, trajectory)
 
 
 @compiled  # one trace of the bare motor serves all effects
-def _sensor_outputs(motor: Motor, tape: Tape, path: Path) -> Outputs:
-    """What the motor's sensors report of the path."""
+def _sensor_outputs(motor: Motor, tape: Tape, trajectory: Trajectory) -> Outputs:
+    """What the motor's sensors report of the trajectory."""
     propagator, inputs = _propagator_and_inputs(motor, tape)
-    state, steps = _states(motor, tape, path), steps_in_sample(motor, tape)
+    state, steps = _states(motor, tape, trajectory), steps_in_sample(motor, tape)
     mean = None
     if propagator.mean is not None:
         _, mean = held_step_and_mean(motor, propagator, inputs, state, steps)
@@ -104,14 +103,13 @@ def input_gains(motor: Motor, tape: Tape) -> tuple[Outputs, Outputs]:
     """The change of current and speed within one sample by 1 V, and by a torque of 1 N m that opposes motion."""
     propagator, _ = _propagator_and_inputs(motor, tape)
     ones = jnp.ones((tape.value.shape[1], 1, 1))
-    assert propagator.inputs is not None, "an effect would need a step of its own"
     voltage = jnp.asarray(tape.drive.voltage)[tape.grid]
     return ones * propagator.inputs[:, 0, 0] * voltage, ones * propagator.inputs[:, 1, 0]
 
 
 @compiled
 def respond(
-    motor: Motor, tape: Tape, path: Path, increments: Float[Array | np.ndarray, "samples 2 blocks columns"]
+    motor: Motor, tape: Tape, trajectory: Trajectory, increments: Float[Array | np.ndarray, "samples 2 blocks columns"]
 ) -> Float[Array, "samples 2 blocks columns"]:
     """The response of the linear `motor` to the state increments of every column, in current and speed.
 
@@ -134,7 +132,7 @@ def respond(
         speed = moves[:, None] * jnp.where(conducts[:, None] > 0, after[1], coasting)
         return jnp.stack([current, speed]), x
 
-    moves, conducts = (1.0 - held.astype(increments.dtype) for held in (path.stuck, path.coasting))
+    moves, conducts = (1.0 - held.astype(increments.dtype) for held in (trajectory.stuck, trajectory.coasting))
     zero = jnp.zeros(increments.shape[1:])
     end, forced = jax.lax.scan(step, zero, (increments, moves, conducts))
     basis = jnp.broadcast_to(jnp.eye(2)[:, None, :], (2, increments.shape[2], 2))
@@ -223,10 +221,10 @@ def _propagator_and_inputs(motor: Motor, tape: Tape) -> tuple[Propagator, Input]
 
 
 @compiled  # one trace of the bare motor serves all effects
-def _after_one_sample(motor: Motor, tape: Tape, path: Path) -> State:
-    """The motor's states one sample after each point of the path."""
+def _after_one_sample(motor: Motor, tape: Tape, trajectory: Trajectory) -> State:
+    """The motor's states one sample after each point of the trajectory."""
     propagator, inputs = _propagator_and_inputs(motor, tape)
-    states, steps = _states(motor, tape, path), steps_in_sample(motor, tape)
+    states, steps = _states(motor, tape, trajectory), steps_in_sample(motor, tape)
     return held_step(motor, propagator, inputs, states, steps)
 
 
@@ -234,10 +232,10 @@ def _after_one_sample(motor: Motor, tape: Tape, path: Path) -> State:
 OfSample = tuple[Bool[Array, ""], Extra, Scalars, Scalars, Scalars, Scalars, Int[Array, ""]]
 
 
-def _states(motor: Motor, tape: Tape, path: Path) -> State:
-    """The motor's states on the path; those that its effects add are simulated along its current and speed."""
+def _states(motor: Motor, tape: Tape, trajectory: Trajectory) -> State:
+    """The motor's states on the trajectory; those that its effects add are simulated along its current and speed."""
     load = jnp.asarray(tape.load).T
-    start = motor.initial_state(path.current, path.speed, load, path.angle)
+    start = motor.initial_state(trajectory.current, trajectory.speed, load, trajectory.angle)
     if not set(motor.states) - {"angle"}:
         return start
     propagator, inputs = _propagator_and_inputs(motor, tape)
@@ -253,7 +251,7 @@ def _states(motor: Motor, tape: Tape, path: Path) -> State:
         return held_step(motor, block_propagator, Input(drive, value, load), state, steps).extra, extra
 
     block = jnp.broadcast_to(jnp.arange(load.shape[1]), load.shape)
-    samples = (begins, start.extra, path.current, path.speed, inputs.value, load, block)
+    samples = (begins, start.extra, trajectory.current, trajectory.speed, inputs.value, load, block)
     in_time = jax.tree.map(lambda x: x.T.reshape(-1), samples)
     zero = jax.tree.map(lambda x: 0.0 * x[0], in_time[1])
     extra = jax.lax.scan(advance, zero, in_time)[1]

@@ -23,7 +23,7 @@ class BrushVoltageDrop(AbstractEffect):
 
     name: ClassVar = "brush_voltage_drop"
     label: ClassVar = "Brush voltage drop"
-    formula: ClassVar = "v_b = V_b sign(i), or V_b tanh(i / i_0)"
+    formula: ClassVar = "v_b = V_b sign(i)"
     equation: ClassVar = "electrical"
     variable: ClassVar = "current"
     holds: ClassVar = "current"
@@ -48,7 +48,7 @@ class GradualBrushDrop(AbstractEffect):
 
     name: ClassVar = BrushVoltageDrop.name
     label: ClassVar = BrushVoltageDrop.label
-    formula: ClassVar = BrushVoltageDrop.formula
+    formula: ClassVar = "v_b = V_b tanh(i / i_0)"
     equation: ClassVar = "electrical"
     variable: ClassVar = "current"
     ranges: ClassVar = {**BrushVoltageDrop.ranges, "onset_A": ParameterRange("A", 1e-5, 1e3)}

@@ -38,13 +38,9 @@ def estimates_of(problem: Problem, best: Optimum, info: Information, prepared: P
             estimates[name] = Estimate(value, None, None, unit, status)
             continue
         spread = float(np.sqrt(info.covariance[k, k]))
-        low, high = intervals[k]
-        if parameters.logarithmic[k]:
-            stderr, low, high = value * spread, np.exp(low), np.exp(high)
-        else:
-            stderr = spread
-        ends = (float(low), float(high))
-        estimates[name] = Estimate(value, stderr, ends, unit, "tied" if name in ties else status)
+        low, high = (parameters.in_SI(k, end) for end in intervals[k])
+        stderr = spread * (value if parameters.logarithmic[k] else float(parameters.scale[k]))
+        estimates[name] = Estimate(value, stderr, (low, high), unit, "tied" if name in ties else status)
     return estimates
 
 
@@ -52,7 +48,7 @@ def _intervals(problem: Problem, best: Optimum, info: Information) -> dict[int, 
     """The 95 % intervals of the identified coordinates, in parallel on all cores."""
     coordinates = np.asarray(best.unknowns.coordinates)
     # teeth that meet at another moment change all that follows: the sum of squares jumps, and no profile is smooth
-    jumps = problem.parameters(best.unknowns.coordinates).toothed is not None
+    jumps = problem.parameters(best.unknowns.coordinates).gear is not None
 
     def interval(k: int) -> tuple[float, float]:
         spread, reach = float(np.sqrt(info.covariance[k, k])), float(info.interval_factor[k])
@@ -74,7 +70,7 @@ def _status(k: int, parameters: Parameters, best: Optimum, info: Information) ->
     variance, unseen_variance = info.covariance[k, k], info.unseen_variance[k]
     if info.unseen_share[k] > MIN_SHARE or np.sqrt(variance) > MIN_UNSEEN_STDERR:
         return "not_identifiable"
-    # a torque of either sign whose scale is unseen: in its unit it is too small to make up much of a direction
+    # a torque of either sign whose scale is unseen: a small one does not make up much of a direction
     size = 0.0 if parameters.logarithmic[k] else abs(float(best.unknowns.coordinates[k]))
     if size and np.sqrt(unseen_variance) > max(MIN_UNSEEN_STDERR * size, np.sqrt(variance / 2)):
         return "not_identifiable"

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 from attrs import field, frozen
+from jaxtyping import Float
 
 from ..motor import Motor
 from ..recordings.recording import Finding
@@ -48,7 +49,7 @@ class RunFit:
     """How a free-run simulation from the estimated initial state reproduces one run.
 
     `*_rmse` in A and rad/s; `*_fit_percent` is 100 (1 - |y - yhat| / |y - mean y|); None where the run
-    does not hold that quantity. The `current*` and `speed*` arrays have the shape of `time` (s).
+    does not hold that quantity.
     """
 
     role: Role
@@ -59,13 +60,13 @@ class RunFit:
     load_offset: float | None  # N m, estimated constant load of a run whose load is unknown
     # by which share the resistance is larger at the start of a run that begins with a warm winding
     initial_rise: float | None
-    time: np.ndarray
-    voltage: np.ndarray | None
-    current: np.ndarray | None
-    current_simulated: np.ndarray | None
-    speed: np.ndarray | None
-    speed_simulated: np.ndarray
-    load: np.ndarray | None
+    time: Float[np.ndarray, " samples"]  # s
+    voltage: Float[np.ndarray, " samples"] | None
+    current: Float[np.ndarray, " samples"] | None
+    current_simulated: Float[np.ndarray, " samples"] | None
+    speed: Float[np.ndarray, " samples"] | None
+    speed_simulated: Float[np.ndarray, " samples"]
+    load: Float[np.ndarray, " samples"] | None
 
     def residual(self, channel: str) -> np.ndarray | None:
         """Measured minus simulated "speed" or "current"; None if it was not recorded."""
@@ -80,9 +81,9 @@ class Search:
 
     method: str
     evaluations: int
-    best: np.ndarray  # (generations,)
-    median: np.ndarray  # (generations,)
-    refined: np.ndarray  # (starts,) fitness after refinement, ascending
+    best: Float[np.ndarray, " generations"]
+    median: Float[np.ndarray, " generations"]
+    refined: Float[np.ndarray, " starts"]  # fitness after refinement, ascending
     times_found: int  # how many of the starts ended in the best optimum
     interrupted: bool = False  # whether the keyboard ended it early
 
@@ -102,9 +103,9 @@ class Identification:
     seconds: Mapping[str, float]
     search: Search
     findings: tuple[Finding, ...]
-    # of the coordinates (logarithms of positive parameters, others as they are), in the order of `covariance_names`;
+    # of logarithms of positive parameters, and of others in SI, in the order of `covariance_names`;
     # zero rows for those held at a bound
-    covariance: np.ndarray = field(repr=False)
+    covariance: Float[np.ndarray, "coordinates coordinates"] = field(repr=False)
     covariance_names: tuple[str, ...] = ()
     messages: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()  # those messages which say that the model lacks something

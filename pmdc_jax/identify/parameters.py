@@ -22,12 +22,13 @@ TORQUE_UNITS = ("N m", "kg m^2")
 class Parameters(eqx.Module):
     """The free parameters with their bounds, and those that are known or tied.
 
-    A coordinate is the natural logarithm of its parameter, or the parameter itself where the effect's table
-    says so; effects' parameters are named like coulomb_friction.torque_Nm.
+    A coordinate is the natural logarithm of its parameter, or the parameter over its `scale` where the effect's table
+    says that it is linear; effects' parameters are named like coulomb_friction.torque_Nm.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
+    scale: Float[Array | np.ndarray, " parameters"]  # of linear coordinates, in SI; 1 for logarithms
     effects: tuple[type[AbstractEffect], ...] = eqx.field(static=True)
     ties: tuple[tuple[str, str], ...] = eqx.field(static=True)
     known: dict[str, Float[Array | np.ndarray, ""]]
@@ -41,12 +42,13 @@ class Parameters(eqx.Module):
         effects: Sequence[type[AbstractEffect]] = (),
         known: Mapping[str, float] | None = None,
         ties: Sequence[tuple[str, str]] = (),
+        magnitudes: Mapping[str, float] | None = None,
     ) -> Parameters:
         """Make every parameter free that is neither known nor tied.
 
         **Arguments**: `bounds` of R, L, Kb, Kt, J, f in SI, lower > 0; `effects`, whose parameters have the
         ranges of their own table unless `bounds` holds others; `known` values in SI; `ties`, pairs (a, b) for
-        a = b, of which only b is free.
+        a = b, of which only b is free; `magnitudes`, by unit, the scales of linear coordinates: 1 for all others.
         """
         ranges = {name: (*bounds[name], True) for name in PARAMETERS}
         for effect in effects:
@@ -57,10 +59,13 @@ class Parameters(eqx.Module):
         names = tuple(n for n in ranges if n not in fixed and n not in {a for a, _ in ties})
         limits = np.array([ranges[n][:2] for n in names], float).reshape(-1, 2)
         logarithmic = np.array([ranges[n][2] for n in names], bool)
-        limits[logarithmic] = np.log(limits[logarithmic])
+        scale = np.array([1.0 if ranges[n][2] else (magnitudes or {}).get(unit_of(n), 1.0) for n in names])
+        limits = np.where(logarithmic[:, None], np.log(np.where(logarithmic[:, None], limits, 1.0)), limits)
+        limits /= scale[:, None]
         return cls(
             names=names,
             logarithmic=tuple(logarithmic.tolist()),
+            scale=scale,
             effects=tuple(effects),
             ties=tuple(ties),
             known={name: np.asarray(float(value)) for name, value in fixed.items()},
@@ -78,7 +83,7 @@ class Parameters(eqx.Module):
         like = jnp.zeros(coordinates.shape[:-1])
         values = {name: like + value for name, value in self.known.items()}
         for k, (name, log) in enumerate(zip(self.names, self.logarithmic, strict=True)):
-            values[name] = jnp.exp(coordinates[..., k]) if log else coordinates[..., k]
+            values[name] = jnp.exp(coordinates[..., k]) if log else coordinates[..., k] * self.scale[k]
         for target, source in self.ties:
             values[target] = values[source]
         effects = tuple(
@@ -102,13 +107,23 @@ class Parameters(eqx.Module):
         if source in self.known:
             return float(self.known[source])
         k = self.names.index(source)
-        return float(np.exp(coordinates[k]) if self.logarithmic[k] else coordinates[k])
+        return self.in_SI(k, coordinates[k])
+
+    def in_SI(self, k: int, coordinate: float) -> float:
+        """The value of parameter `k` at a coordinate."""
+        return float(np.exp(coordinate) if self.logarithmic[k] else coordinate * self.scale[k])
+
+    def coordinate(self, k: int, value: float) -> float:
+        """The coordinate of parameter `k` at a value in SI, at least 1e-300 if its coordinate is a logarithm."""
+        return float(np.log(max(value, 1e-300)) if self.logarithmic[k] else value / self.scale[k])
 
     def with_tied(self, covariance: Float[np.ndarray, "n n"]) -> tuple[tuple[str, ...], Float[np.ndarray, "m m"]]:
-        """Names and covariance of the free coordinates and of those that are tied to one of them."""
+        """Names and covariance of the free parameters, and of those that are tied to one of them: of their logarithms,
+        and of those with linear coordinates in SI."""
         tied = {target: source for target, source in self.ties if source in self.names}
         rows = [self.names.index(tied.get(name, name)) for name in (*self.names, *tied)]
-        return (*self.names, *tied), covariance[np.ix_(rows, rows)]
+        in_SI = covariance * np.outer(self.scale, self.scale)
+        return (*self.names, *tied), in_SI[np.ix_(rows, rows)]
 
 
 def unit_of(name: str) -> str:

@@ -13,8 +13,8 @@ from ..runtime.compiled import free_memory_maps
 from ..runtime.precision import double_precision
 from ..runtime.threads import one_blas_thread
 from .fit.generalised_least_squares import last_fit, residuals_of
-from .friction_test import friction_messages, missing_friction
 from .identification import Identification
+from .missing_friction import friction_messages, missing_friction
 from .noise.noise_model import fit_whitener
 from .parameters import effects_named
 from .prepare import prepare
@@ -41,8 +41,8 @@ def identify(
     **Arguments**: `recordings` to fit, or their files, at least one; `holdout`, runs kept out of the fit; `tie`, pairs
     such as ("Kt", "Kb") of parameters set equal, of which only the second is fitted; `known`, fixed values in SI;
     `unloaded` declares that runs without a load column have no load (otherwise a constant unknown one); `effects`,
-    names of effects to identify too; `search`, a key of `pmdc_jax.identify.search.METHODS`; `seed` of the search;
-    `progress`, called now and then with the current activity and the fitness.
+    names of effects to identify too; `search`, a key of `pmdc_jax.identify.search.evolution.METHODS`; `seed` of the
+    search; `progress`, called now and then with the current activity and the fitness.
 
     **Returns**: the motor, its parameters with uncertainty and status, and the fit of every run.
 

@@ -20,14 +20,18 @@ from ..effects import EFFECTS, AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS, PARAMETERS_OF_DRIVE, Drive
 from ..recordings.clock import evenly_stamped
-from ..recordings.recording import CHANNELS, NEEDED_TO_IDENTIFY, Averaging, Finding, Recording
+from ..recordings.readings import reading_interval
+from ..recordings.recording import NEEDED_TO_IDENTIFY, SIMULATED_OUTPUTS, Averaging, Finding, Recording
 from ..recordings.recording_file import Runs, named_apart, recordings_of, refuse_copies
 from ..simulate import ZERO_ORDER_HOLD, Tape, Timing, uniform
 from .identification import Role
 from .noise.sensor_noise import white_noise
 from .parameters import Parameters, check_names
 from .problem import Problem
-from .search.bounds import search_bounds
+from .search.bounds import effect_magnitudes, search_bounds
+
+# The outputs of a tape: current and speed, or speed alone
+BOTH, SPEED = slice(None), slice(1, None)
 
 
 class Prepared(NamedTuple):
@@ -39,6 +43,7 @@ class Prepared(NamedTuple):
     irrelevant: Mapping[str, float]  # parameters that affect no run, with a harmless value
     known: Mapping[str, float]
     ties: tuple[tuple[str, str], ...]
+    magnitudes: Mapping[str, float]  # of the parameters of effects, by unit (see `effect_magnitudes`)
     problem: Problem
     # which runs have a speed computed from their angle
     differentiated: tuple[bool, ...] = ()
@@ -61,17 +66,44 @@ class Prepared(NamedTuple):
         """The same runs with some fields of the tape replaced."""
         return self.with_problem(tape=replace(self.problem.tape, **fields))
 
+    def with_tape_of(self, runs: Sequence[Recording], *fields: str, **layout: Any) -> Prepared:
+        """The same problem with these fields of the tape as other runs have them.
+
+        **Arguments**: `layout`, as of `Tape.from_recordings`.
+        """
+        tape = Tape.from_recordings(runs, **layout)
+        return self.with_tape(**jax.tree.map(jnp.asarray, {name: getattr(tape, name) for name in fields}))
+
+    def without_ends(self, outputs: slice = BOTH) -> Prepared:
+        """The same runs without the first and the last sample of some outputs, of a slow sensor without as many as from
+        one reading to the next: there a mean, or a voltage that acts at another time, depends on what was not recorded.
+        """
+        tape = self.problem.tape
+        weight = np.array(tape.weight)
+        for k, run in enumerate(self.runs):
+            first = int(np.argmax(tape.blocks_of(k)))
+            interval = 1 if run.speed is None else reading_interval(~np.isnan(run.speed))
+            for sample in (*range(interval), *range(len(run) - interval, len(run))):
+                block, at = divmod(sample, weight.shape[2])
+                weight[first + block, outputs, at] = 0.0
+        return self.with_tape(weight=jnp.asarray(weight))
+
     @property
     def training(self) -> list[Recording]:
         """The training runs."""
-        return [run for run, role in zip(self.runs, self.roles, strict=True) if role == "train"]
+        return [self.runs[k] for k in self.training_indices]
+
+    @property
+    def training_indices(self) -> list[int]:
+        """The indices of the training runs."""
+        return [k for k, role in enumerate(self.roles) if role == "train"]
 
     def parameters(
         self, effects: Sequence[type[AbstractEffect]], bounds: Mapping[str, tuple[float, float]] | None = None
     ) -> Parameters:
         """The parameters of a motor with these effects; `bounds` overrides those of the search and of the effects."""
         bounds = {**search_bounds(self.training), **(bounds or {})}
-        return Parameters.of(bounds, effects, {**self.irrelevant, **self.known}, self.ties)
+        return Parameters.of(bounds, effects, {**self.irrelevant, **self.known}, self.ties, self.magnitudes)
 
     def forms_of(self, effects: Sequence[str]) -> list[type[AbstractEffect]]:
         """The classes of some effects, by name: in the form in which they are fitted to these runs, if they are."""
@@ -125,7 +157,7 @@ def _laid_out(
     """The recordings as a least-squares problem for the motor without effects, all of whose parameters are fitted."""
     runs = [uniform(evenly_stamped(r)) for r in recordings]
     training = runs[: roles.count("train")]
-    noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in CHANNELS])
+    noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in SIMULATED_OUTPUTS])
     # hold-out runs are on the tape too, but only their own unknowns may be fitted to them
     tape = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, unloaded, follow=True))
     fitted_runs = jnp.arange(tape.runs) < len(training)
@@ -138,6 +170,7 @@ def _laid_out(
         _irrelevant(training, tie),
         known,
         tuple(tie),
+        effect_magnitudes(training),
         problem,
         differentiated=tuple(r.speed is None and r.angle is not None for r in recordings),
     )

@@ -19,7 +19,7 @@ from .parameters import Parameters
 
 # Derivative of an output by an unknown, in noise standard deviations, from which a simulation counts as failed: it is
 # so sensitive that rounding errors make its derivatives meaningless
-MAX_SENSITIVITY = 1e12
+MAX_DERIVATIVE = 1e12
 
 
 class Unknowns(NamedTuple):
@@ -54,11 +54,6 @@ class Problem(eqx.Module):
     nuisance: Nuisance | None = None
 
     @property
-    def outputs(self) -> int:
-        """How many of the two outputs the training runs have measured."""
-        return int(np.count_nonzero(np.asarray(self.tape.weight)[self.fitted_blocks].any((0, 2))))
-
-    @property
     def fitted_blocks(self) -> Bool[np.ndarray, " blocks"]:
         """Which blocks belong to training runs."""
         return np.asarray(self.fitted_runs)[np.asarray(self.tape.run)]
@@ -72,6 +67,11 @@ class Problem(eqx.Module):
     def most_samples(self) -> float:
         """Number of measured samples of the output that has more of them, at least one."""
         return max(float(self.samples.max()), 1.0)
+
+    @property
+    def perfect_fitness(self) -> float:
+        """The fitness of a model that leaves nothing but noise: 2, or 1 with a single output."""
+        return float(self.samples.sum()) / self.most_samples
 
     @property
     def measured_rms(self) -> Float[np.ndarray, "2"]:
@@ -123,7 +123,8 @@ class Problem(eqx.Module):
 
 
 class Evaluation(NamedTuple):
-    """A free run, its residuals over the noise, and their derivatives.
+    """A free run; its residuals, simulated minus measured, over the noise of the problem (in a `Fit`, over that of the
+    fit), less what the problem's nuisance parameters explain and whitened, if it has such; and their derivatives.
 
     Columns: the coordinates, then the run's own unknowns.
     """
@@ -213,7 +214,7 @@ def _evaluated(
     scale = tape.weight / problem.noise[:, None]
     jacobian = jacobian * scale[..., None] * problem.determinable()[tape.run][:, None, None, :]
     residuals = (simulated - tape.measured) * scale
-    wild = ~jnp.all(jnp.abs(jacobian) < MAX_SENSITIVITY, (1, 2, 3)) & problem.fitted_runs[tape.run]
+    wild = ~jnp.all(jnp.abs(jacobian) < MAX_DERIVATIVE, (1, 2, 3)) & problem.fitted_runs[tape.run]
     residuals = jnp.where(wild[:, None, None], jnp.inf, residuals)
     return Evaluation(simulated, residuals, jacobian, starts, d_starts)
 

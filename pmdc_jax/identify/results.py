@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..motor import PARAMETERS, Motor
-from ..recordings.recording import CHANNELS
+from ..recordings.recording import SIMULATED_OUTPUTS
 from ..words import enumerate_words
 from .equivalent_fits import fits_with_visible, released_from_bounds, with_Kt_equal_Kb
 from .estimates import estimates_of
@@ -34,13 +34,15 @@ def results_of(solved: Solved) -> Identification:
     # what any fit as good does not determine is not determined
     info = max([info, *others], key=lambda i: i.unseen_share.sum())
     best = chosen.optimum
-    motor = _with_numpy_arrays(parameters(best.unknowns.coordinates))
+    motor = jax.tree.map(np.asarray, parameters(best.unknowns.coordinates))
     problem = eqx.tree_at(lambda p: p.noise, problem, jnp.asarray(chosen.noise))
 
     unknowns, ended = fit_run_unknowns(problem, best.unknowns)
     fit = run_fits(prepared.runs, prepared.roles, problem.tape, np.asarray(ended.simulated), unknowns.runs)
     names, covariance = parameters.with_tied(info.covariance)
-    noise = {name: white_noise([residual for _, residual in measured_and_residuals(fit, name)]) for name in CHANNELS}
+    noise = {
+        name: white_noise([residual for _, residual in measured_and_residuals(fit, name)]) for name in SIMULATED_OUTPUTS
+    }
     return Identification(
         motor=motor,
         parameters=estimates_of(problem, best, info, prepared),
@@ -67,11 +69,3 @@ def _without_effect(prepared: Prepared) -> list[Direction]:
     lacking = "a voltage" if {"R", "L"} & set(names) else "a turning rotor"
     why = f"No run has {lacking}, so {enumerate_words(names)} affect none of them"
     return [Direction(names, why, "Add a run with a voltage, a current and a speed")]
-
-
-def _with_numpy_arrays(motor: Motor) -> Motor:
-    return eqx.tree_at(
-        lambda m: [getattr(m, name) for name in PARAMETERS],
-        motor,
-        [np.asarray(getattr(motor, name)) for name in PARAMETERS],
-    )

@@ -10,14 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import fft, ndimage
 
+from ..recordings.noise import NORMAL_MEDIAN
 from ..simulate import free_run
 from .fit.polish import Fit
 from .problem import Problem
 
 # Neighbouring frequencies over which the power of the residuals is averaged
 SMOOTHING_WIDTH = 33
-# Median of the square of a normal variable, over its variance
-CHI2_MEDIAN = 0.4549
 
 
 def rotor_outputs(problem: Problem, fit: Fit) -> Float[Array, "blocks 2 samples"]:
@@ -76,7 +75,7 @@ def motion_in(error: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " sampl
     """
     spectrum = np.asarray(fft.dct(error, norm="ortho"))
     power = spectrum**2
-    noise = np.median(power[len(power) // 2 :]) / CHI2_MEDIAN
+    noise = np.median(power[len(power) // 2 :]) / NORMAL_MEDIAN**2
     # two standard deviations of the average of so few powers: fluctuations of the noise are no motion
     noise *= 1 + 2 * np.sqrt(2 / SMOOTHING_WIDTH)
     around = ndimage.uniform_filter1d(power, SMOOTHING_WIDTH, mode="reflect")

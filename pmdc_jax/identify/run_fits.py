@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..recordings.recording import CHANNELS, Recording
+from ..recordings.recording import SIMULATED_OUTPUTS, Recording
 from ..simulate import RunUnknowns, Tape
 from .identification import Role, RunFit
 from .noise.sensor_noise import ratio_to_noise, rms
@@ -16,7 +16,7 @@ MAX_RESIDUAL_RATIO = 2.0
 
 
 def run_fits(
-    runs: Sequence[Recording], roles: Sequence[Role], tape: Tape, simulated: np.ndarray, own: RunUnknowns
+    runs: Sequence[Recording], roles: Sequence[Role], tape: Tape, simulated: np.ndarray, run_unknowns: RunUnknowns
 ) -> dict[str, RunFit]:
     """The fit of each run: what was measured beside what was `simulated`, the outputs in the blocks of the tape."""
     # as fitted: a speed corrected for what the sensor added, and both without samples that do not count
@@ -34,8 +34,8 @@ def run_fits(
             speed_rmse=_rmse(w, speed),
             current_fit_percent=_fit_percent(i, current),
             speed_fit_percent=_fit_percent(w, speed),
-            load_offset=float(own.load_offset[index]) if tape.load_unknown[index] else None,
-            initial_rise=float(own.rise[index]) or None,  # exactly zero where it was not fitted
+            load_offset=float(run_unknowns.load_offset[index]) if tape.load_unknown[index] else None,
+            initial_rise=float(run_unknowns.resistance_rise[index]) or None,  # exactly zero where it was not fitted
             time=run.time,
             voltage=run.voltage,
             current=i if driven else run.current,
@@ -62,7 +62,7 @@ def _fit_percent(measured: np.ndarray | None, simulated: np.ndarray) -> float | 
 def large_residuals(fit: Mapping[str, RunFit]) -> dict[str, float]:
     """RMS of the residuals over the white noise of the runs, for the outputs for which that exceeds
     `MAX_RESIDUAL_RATIO`."""
-    ratios = {name: ratio_to_noise(measured_and_residuals(fit, name)) for name in CHANNELS}
+    ratios = {name: ratio_to_noise(measured_and_residuals(fit, name)) for name in SIMULATED_OUTPUTS}
     return {name: ratio for name, ratio in ratios.items() if ratio > MAX_RESIDUAL_RATIO}
 
 

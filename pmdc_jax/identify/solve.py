@@ -46,7 +46,7 @@ POOR_FIT = 1.5
 MAX_SEARCHES = 5
 # Updates of the rotor angle at most, and the share of the fitness that each must gain
 ANGLE_ITERATIONS, MIN_ANGLE_GAIN = 3, 1e-5
-# Starts that differ by less than this in all natural logarithms count as one.
+# Starts that differ by less than this in all coordinates count as one.
 MIN_DISTANCE = 0.3
 
 
@@ -127,13 +127,13 @@ def search_and_refine(
     compiled.result()
     ends = _refine_all(problem, search_result)
     for attempt in range(1, searches):
-        if search_result.interrupted or _agreed(ends, problem.outputs):
+        if search_result.interrupted or _agreed(ends, problem.perfect_fitness):
             break
         search_result = _continued(search_result, run_search(seed + attempt))
         ends = _refine_all(problem, search_result, ends)
     fitted = polish_with_angle(prepared, ends[0])
     seconds = {"search": search_ended - began, "refine": time.perf_counter() - search_ended}
-    record = _search_record(search, search_result, ends, problem.outputs)
+    record = _search_record(search, search_result, ends, problem.perfect_fitness)
     return Solved(fitted, record, seed, seconds)
 
 
@@ -156,18 +156,18 @@ def polish_with_angle(
     prepared: Prepared,
     end: Optimum,
     tolerance: float = TOLERANCE,
-    known: Evaluation | None = None,
-    useful: float = np.inf,
+    at_start: Evaluation | None = None,
+    give_up_above: float = np.inf,
 ) -> FittedRuns:
     """Polish; where a torque depends on the rotor angle, update the angle from the fit and repeat while that helps.
 
     **Arguments**: as of `polish`.
     """
-    polished = polish(prepared.problem, end, tolerance=tolerance, known=known, useful=useful)
-    is_useful = polished.fitness * prepared.problem.most_samples <= useful
+    polished = polish(prepared.problem, end, tolerance=tolerance, at_start=at_start, give_up_above=give_up_above)
+    is_useful = polished.fitness * prepared.problem.most_samples <= give_up_above
     for _ in range(ANGLE_ITERATIONS if prepared.problem.depends_on_angle and is_useful else 0):
         again = prepared._replace(problem=with_rotor_angle(prepared.problem, polished))
-        better = polish(again.problem, polished.optimum, tolerance=tolerance, useful=useful)
+        better = polish(again.problem, polished.optimum, tolerance=tolerance, give_up_above=give_up_above)
         if not better.fitness < (1 - MIN_ANGLE_GAIN) * polished.fitness:
             break
         prepared, polished = again, better
@@ -202,7 +202,7 @@ def _refine_all(problem: Problem, search_result: SearchResult, before: Sequence[
     starts = [_start(problem.tape, candidate) for candidate in _distinct(search_result, problem.parameters)]
 
     def agreed(ends: list[Optimum]) -> bool:
-        return _agreed(sorted([*before, *ends], key=_fitness), problem.outputs)
+        return _agreed(sorted([*before, *ends], key=_fitness), problem.perfect_fitness)
 
     ends = map_in_threads_until(lambda s: refine(problem, s), starts, agreed)
     return sorted([*before, *ends], key=_fitness)
@@ -212,33 +212,35 @@ def _fitness(end: Optimum) -> float:
     return end.fitness
 
 
-def _agreed(ends: Sequence[Optimum], outputs: int) -> bool:
+def _agreed(ends: Sequence[Optimum], perfect: float) -> bool:
     """Whether the best optimum was found often enough: twice if its residuals are about as small as the noise, else by
     more starts than one search has. Larger residuals may be due to the model or to a local optimum: only another search
     can tell.
+
+    **Arguments**: `ends`, the best first; `perfect`, the fitness of a perfect model.
     """
-    needed = 2 if _is_good(ends[0], outputs) else STARTS + 1
-    return _times_found(ends, outputs) >= needed
+    needed = 2 if _is_good(ends[0], perfect) else STARTS + 1
+    return _times_found(ends, perfect) >= needed
 
 
-def _is_good(end: Optimum, outputs: int) -> bool:
+def _is_good(end: Optimum, perfect: float) -> bool:
     """Whether the residuals are about as small as the noise."""
-    return end.fitness < POOR_FIT * outputs
+    return end.fitness < POOR_FIT * perfect
 
 
-def _times_found(ends: Sequence[Optimum], outputs: int) -> int:
+def _times_found(ends: Sequence[Optimum], perfect: float) -> int:
     fitness = np.array([end.fitness for end in ends])
-    tolerance = FITNESS_TOLERANCE if _is_good(ends[0], outputs) else POOR_FIT_TOLERANCE
+    tolerance = FITNESS_TOLERANCE if _is_good(ends[0], perfect) else POOR_FIT_TOLERANCE
     return int(np.sum(fitness <= fitness[0] * (1 + tolerance) + 1e-12))
 
 
-def _search_record(method: str, search_result: SearchResult, ends: Sequence[Optimum], outputs: int) -> Search:
+def _search_record(method: str, search_result: SearchResult, ends: Sequence[Optimum], perfect: float) -> Search:
     return Search(
         method=method,
         evaluations=search_result.evaluations,
         best=search_result.best,
         median=search_result.median,
         refined=np.array([end.fitness for end in ends]),
-        times_found=_times_found(ends, outputs),
+        times_found=_times_found(ends, perfect),
         interrupted=search_result.interrupted,
     )

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 import attrs
 import jax
+import jax.numpy as jnp
 import numpy as np
 from attrs import field, frozen
 
 from ..motor import PARAMETERS, Motor
 from ..progress import ReportProgress, silent
+from ..runtime.precision import double_precision
 from .printed import LOADS, LOWER_SETPOINT, PRINTED, SETPOINT, TABLE_2, VOLTAGE
 
 if TYPE_CHECKING:
@@ -112,6 +114,7 @@ def load_test(seed: int = 0) -> Recording:
     )
 
 
+@double_precision
 def recovered_by_paper_ga(seed: int = 0) -> Recovered:
     """Identify by the paper's binary genetic algorithm alone: 20 chromosomes of 60 bits."""
     from ..identify.parameters import Parameters
@@ -121,12 +124,11 @@ def recovered_by_paper_ga(seed: int = 0) -> Recovered:
 
     run = load_test()
     begin = time.perf_counter()
-    with jax.enable_x64(True):
-        parameters = Parameters.of(search_bounds([run]))
-        tape = Tape.from_recordings([uniform(run)])
-        noise = np.array([NOISE["current"], NOISE["speed"]])
-        result = global_search(parameters, tape, noise, method="paper_ga", seed=seed)
-        motor = jax.tree.map(float, parameters(jax.numpy.asarray(result.candidates[0])))
+    parameters = Parameters.of(search_bounds([run]))
+    tape = Tape.from_recordings([uniform(run)])
+    noise = np.array([NOISE["current"], NOISE["speed"]])
+    result = global_search(parameters, tape, noise, method="paper_ga", seed=seed)
+    motor = jax.tree.map(float, parameters(jnp.asarray(result.candidates[0])))
     seconds = time.perf_counter() - begin
     return Recovered("the paper's GA", motor, result.evaluations, seconds, result.best)
 
@@ -153,18 +155,18 @@ def load_errors(motor: Motor) -> dict[str, np.ndarray]:
     return {"speed": 100 * (speed / printed_speed - 1), "current": 100 * (current / printed_current - 1)}
 
 
+@double_precision
 def step_up_and_down(tuning: Tuning) -> Response:
     """Simulated step from rest to 481 rad/s and, 200 samples later, to 240.5 rad/s."""
     from ..control.loop import Course, Response, closed_loop_jit
 
-    with jax.enable_x64(True):
-        samples = 200
-        reference = jax.numpy.repeat(jax.numpy.asarray([SETPOINT, LOWER_SETPOINT]), samples)
-        course = Course(reference, 0.0 * reference, 0.0 * reference)
-        response = closed_loop_jit(tuning.motor, tuning.law, course, 4)
-        return Response(*(np.asarray(x) for x in response))
+    reference = jnp.repeat(jnp.asarray([SETPOINT, LOWER_SETPOINT]), 200)
+    course = Course(reference, 0.0 * reference, 0.0 * reference)
+    response = closed_loop_jit(tuning.motor, tuning.law, course, 4)
+    return Response(*(np.asarray(x) for x in response))
 
 
+@double_precision
 def simulated_as_printed(proportional: float, integral: float, derivative: float) -> AsPrinted:
     """Ideal loop of equation (9) with PI or PID, filtered derivative of the error; simulated by `scipy.signal`."""
     from scipy.signal import lsim
@@ -174,10 +176,9 @@ def simulated_as_printed(proportional: float, integral: float, derivative: float
     s, lag = np.poly1d([1.0, 0.0]), FILTER_RATIO * derivative / proportional
     controller_numerator = (proportional * s + integral) * (lag * s + 1) + derivative * s * s
     controller_denominator = s * (lag * s + 1)
-    with jax.enable_x64(True):
-        numerators, denominator = jax.tree.map(jax.numpy.asarray, PRINTED).transfer_function()
-        motor_numerator = np.poly1d(np.asarray(numerators["voltage -> speed"]))
-        motor_denominator = np.poly1d(np.asarray(denominator))
+    numerators, denominator = jax.tree.map(jnp.asarray, PRINTED).transfer_function()
+    motor_numerator = np.poly1d(np.asarray(numerators["voltage -> speed"]))
+    motor_denominator = np.poly1d(np.asarray(denominator))
     closed = controller_denominator * motor_denominator + controller_numerator * motor_numerator
     samples, step = 4000, 1e-4
     time = step * np.arange(samples)
@@ -187,8 +188,6 @@ def simulated_as_printed(proportional: float, integral: float, derivative: float
     _, speed, _ = lsim((to_speed.coeffs, closed.coeffs), reference, time, interp=False)
     _, voltage, _ = lsim((to_voltage.coeffs, closed.coeffs), reference, time, interp=False)
     first = slice(0, samples // 2)
-    with jax.enable_x64(True):
-        t, w = (jax.numpy.asarray(x[first]) for x in (time, speed))
-        metrics = step_metrics(t, w, SETPOINT)
-        overshoot, settling = float(metrics.Overshoot), float(metrics.SettlingTime)
+    metrics = step_metrics(jnp.asarray(time[first]), jnp.asarray(speed[first]), SETPOINT)
+    overshoot, settling = float(metrics.Overshoot), float(metrics.SettlingTime)
     return AsPrinted(overshoot, settling, float(np.abs(voltage).max()), time, speed)

@@ -22,9 +22,9 @@ MAX_MISSING = 0.2  # share of an output's samples, or of the readings of a slowe
 # Most sample intervals that a run may last, per sample: an even clock ticks through the gaps, too, and its ticks must
 # fit into memory
 MAX_INTERVALS_PER_SAMPLE = 20
-OUTPUTS = ("speed", "angle", "current")
+RECORDED_OUTPUTS = ("speed", "angle", "current")
 # The simulated outputs, in the order of their axis in a tape
-CHANNELS = ("current", "speed")
+SIMULATED_OUTPUTS = ("current", "speed")
 # Columns needed besides time: to simulate, and to identify
 NEEDED_TO_SIMULATE = "voltage, current or torque"
 NEEDED_TO_IDENTIFY = "voltage with current, speed or angle; or current or torque with speed or angle"
@@ -146,6 +146,11 @@ class Recording:
         return float(self.time[-1] - self.time[0])
 
     @property
+    def has_even_clock(self) -> bool:
+        """Whether its samples are those of its record, not resampled from an uneven clock."""
+        return self.resampled_from is None
+
+    @property
     def recorded(self) -> Recording:
         """The original record, before any resampling to an even clock."""
         return self if self.resampled_from is None else self.resampled_from
@@ -232,7 +237,7 @@ def _faults_of_values(quantity: str, values: np.ndarray, columns: Mapping[str, n
         what = f"{infinite.sum()} infinite values, the first here"
         yield Fault(quantity, first, what, "Leave cells without a measurement empty")
     # the current is an input if neither voltage nor torque was recorded
-    output = quantity in OUTPUTS and (quantity != "current" or "voltage" in columns or "torque" in columns)
+    output = quantity in RECORDED_OUTPUTS and (quantity != "current" or "voltage" in columns or "torque" in columns)
     if not output and quantity != "temperature":
         what = f"{count} of {len(values)} values are missing (empty or NaN), the first here"
         yield Fault(quantity, first, what, "Inputs must be complete: fill the gaps, or cut the run")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from math import floor, isfinite, log10
 
 from attrs import evolve, frozen
 
-from ..effects import EFFECTS, range_of
+from ..effects import EFFECTS, form_with, range_of
 from ..identify.identification import Estimate, Role, Status
 
 UNKNOWN = "–"
@@ -46,9 +47,10 @@ def write_estimate(estimate: Estimate) -> EstimateText:
     error."""
     if estimate.status == "known":
         estimate = evolve(estimate, stderr=None, ci95=None)
-    exponent = engineering_exponent(estimate.value or 0.0, estimate.unit)
+    value, stderr = estimate.value or 0.0, estimate.stderr or 0.0
+    exponent = engineering_exponent(max(abs(value), stderr), estimate.unit)
     scale = 10.0**exponent
-    decimals = _decimals((estimate.value or 0.0) / scale, (estimate.stderr or 0.0) / scale)
+    decimals = _decimals(value / scale, stderr / scale)
 
     def write(number: float | None) -> str:
         return fixed(None if number is None else number / scale, decimals)
@@ -126,10 +128,11 @@ def percent(value: float | None) -> str:
 
 
 def fixed(value: float | None, decimals: int) -> str:
-    """A number with fixed decimals and a true minus sign; a dash if it is unknown."""
+    """A number with fixed decimals and a true minus sign, none before zero; a dash if it is unknown."""
     if value is None or not isfinite(value):
         return UNKNOWN
-    return f"{value:.{decimals}f}".replace("-", "−")
+    written = f"{value:.{decimals}f}"
+    return written.replace("-", "−" if float(written) else "")
 
 
 def status_word(status: Status) -> str:
@@ -142,9 +145,9 @@ def role_word(role: Role) -> str:
     return "hold-out" if role == "holdout" else "training"
 
 
-def formula_text(effect: str) -> str:
-    """The formula of an effect, in which the speed is ω."""
-    return re.sub(r"\bw(?![a-zA-Z0-9])", "ω", EFFECTS[effect].formula).replace("-", "−")
+def formula_text(effect: str, fields: Iterable[str] = ()) -> str:
+    """The formula of an effect, in the form that has these parameters; the speed is ω."""
+    return re.sub(r"\bw(?![a-zA-Z0-9])", "ω", form_with(effect, fields).formula).replace("-", "−")
 
 
 def effect_words(effect: str) -> str:

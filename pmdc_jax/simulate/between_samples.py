@@ -30,7 +30,7 @@ MeanAndRise = tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]
 
 def mean_and_rise(run: Recording, timing: Timing) -> MeanAndRise:
     """Mean of the drive of a run over each of its samples, and the rise of the straight line in its place."""
-    if run.resampled_from is not None:
+    if not run.has_even_clock:
         return mean_and_rise_of_pieces(run, pieces_of(run, timing.first_order_hold))
     value = np.asarray(getattr(run, run.drive))
     if timing.smooth is not None:

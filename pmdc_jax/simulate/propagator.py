@@ -103,7 +103,7 @@ def make_propagator(
     """
     A, B = _linear_part(motor, drive)
     propagator = _by_linear_part(motor, step, A, B, linear_drive, averaged)
-    teeth = motor.toothed
+    teeth = motor.gear
     if teeth is None:
         return propagator
     assert teeth.contact_state is not None

@@ -46,7 +46,7 @@ class RunUnknowns(NamedTuple):
     load_offset: Float[Array, " runs"]  # N m
     angle: Float[Array, " runs"]  # of the rotor, rad; used only by effects that depend on it
     twist: Float[Array, " runs"]  # of a spring, beyond that due to the load, rad
-    rise: Float[Array, " runs"]  # of the resistance of a winding that is still warm, relative
+    resistance_rise: Float[Array, " runs"]  # of a winding that is still warm, relative
 
     @classmethod
     def as_recorded(cls, tape: Tape) -> RunUnknowns:
@@ -61,18 +61,18 @@ UNKNOWNS_PER_RUN = len(RunUnknowns._fields)
 
 
 @compiled
-def free_run(motor: Motor, tape: Tape, own: RunUnknowns | None = None) -> Float[Array, "blocks 2 samples"]:
+def free_run(motor: Motor, tape: Tape, run_unknowns: RunUnknowns | None = None) -> Float[Array, "blocks 2 samples"]:
     """Current (A) and speed (rad/s) as the sensors report them, simulated freely.
 
-    `own`, the unknowns of each run, is by default as recorded.
+    `run_unknowns`, the unknowns of each run, is by default as recorded.
     """
-    own = own or RunUnknowns.as_recorded(tape)
+    run_unknowns = run_unknowns or RunUnknowns.as_recorded(tape)
     motor_on_grids = (motor, grid_propagators(motor, tape))
-    initial = _initial_states(motor, own, tape)
+    initial = _initial_states(motor, run_unknowns, tape)
     states = initial.shape[1]
-    guess = _guessed_starts(motor, own, tape, initial)
-    constant = _constant(motor_on_grids, states)
-    starts, joined, last, *_ = _join_blocks(motor_on_grids, constant, tape, own, initial, guess)
+    guess = _guessed_starts(motor, run_unknowns, tape, initial)
+    constant = _zero_derivatives(motor_on_grids, states)
+    starts, joined, last, *_ = _join_blocks(motor_on_grids, constant, tape, run_unknowns, initial, guess)
     simulated = last.simulated + jnp.einsum("sncb,bn->scb", last.d_simulated[:, -states:], joined - starts)
     return reported(motor, tape, simulated.transpose(2, 1, 0))
 
@@ -91,7 +91,7 @@ def sensitivities(
     assemble: Callable[[Float[Array, " parameters"]], Motor],
     parameters: Float[Array, " parameters"],
     tape: Tape,
-    own: RunUnknowns | None = None,
+    run_unknowns: RunUnknowns | None = None,
     starts: Starts | Float[np.ndarray, "blocks states"] | None = None,
 ) -> Sensitivities:
     """Free run, and its derivatives with respect to `parameters` and then to the unknowns of the sample's own run.
@@ -100,7 +100,7 @@ def sensitivities(
     rest is as in `free_run`. The free run is NaN if `MAX_PASSES` passes do not join the blocks, as for a motor that
     depends chaotically on its initial state; its derivatives then say nothing.
     """
-    own = own or RunUnknowns.as_recorded(tape)
+    run_unknowns = run_unknowns or RunUnknowns.as_recorded(tape)
     count = len(parameters)
 
     def prepare(parameters: Float[Array, " parameters"]) -> MotorOnGrids:
@@ -109,20 +109,22 @@ def sensitivities(
 
     motor_on_grids, d_motor_on_grids = value_and_derivatives(prepare, (parameters,), (jnp.eye(count),))
     motor, d_motor = motor_on_grids[0], _pad_columns(d_motor_on_grids[0], count + UNKNOWNS_PER_RUN)
-    initial, d_initial = _initial_states_with_derivatives(motor, d_motor, own, tape, count)
+    initial, d_initial = _initial_states_with_derivatives(motor, d_motor, run_unknowns, tape, count)
     states = initial.shape[1]
     # the parameters, the load offset and the start of the block
     d_motor_on_grids = _pad_columns(d_motor_on_grids, count + 1 + states)
 
-    guess = _guessed_starts(motor, own, tape, initial)
+    guess = _guessed_starts(motor, run_unknowns, tape, initial)
     if starts is not None:
         guess = jnp.where(jnp.isnan(starts), guess, starts)
-    if not motor.effects or motor.toothed:
+    if not motor.effects or motor.gear:
         # passes with the columns of the start only, where one is enough or many are needed
-        constant, passes = _constant(motor_on_grids, states), MAX_PASSES if motor.effects else 1
-        guess = _join_blocks(motor_on_grids, constant, tape, own, initial, guess, passes).joined
+        constant, passes = _zero_derivatives(motor_on_grids, states), MAX_PASSES if motor.effects else 1
+        guess = _join_blocks(motor_on_grids, constant, tape, run_unknowns, initial, guess, passes).joined
     # otherwise every pass has all columns, because a pass with other columns is compiled anew
-    starts, _, passed, *_ = _join_blocks(motor_on_grids, d_motor_on_grids, tape, own, initial, guess, MAX_PASSES)
+    starts, _, passed, *_ = _join_blocks(
+        motor_on_grids, d_motor_on_grids, tape, run_unknowns, initial, guess, MAX_PASSES
+    )
     joined, d_starts = _newton_correction_with_derivatives(passed, tape, starts, initial, d_initial, count)
     simulated, d_simulated = _joined_outputs_with_derivatives(passed, joined - starts, d_starts, count)
     if motor.speed_delay() is not None or tape.averaging is not None:
@@ -136,13 +138,15 @@ def sensitivities(
 
 
 def _initial_states_with_derivatives(
-    motor: Motor, d_motor: Motor, own: RunUnknowns, tape: Tape, count: int
+    motor: Motor, d_motor: Motor, run_unknowns: RunUnknowns, tape: Tape, count: int
 ) -> tuple[Starts, Float[Array, "columns blocks states"]]:
     """Initial state of the run of each block, and its derivatives with respect to all columns."""
     columns = count + UNKNOWNS_PER_RUN
     ones = jnp.eye(UNKNOWNS_PER_RUN, columns, count)[:, :, None]
     d_own = RunUnknowns(*(jnp.broadcast_to(one, (columns, tape.runs)) for one in ones))
-    return value_and_derivatives(lambda motor, own: _initial_states(motor, own, tape), (motor, own), (d_motor, d_own))
+    return value_and_derivatives(
+        lambda motor, unknowns: _initial_states(motor, unknowns, tape), (motor, run_unknowns), (d_motor, d_own)
+    )
 
 
 def _joined_outputs_with_derivatives(
@@ -164,21 +168,21 @@ def _in_all_columns(own: Float[Array, "... own"], count: int) -> Float[Array, ".
     return jnp.concatenate([own[..., :count], *of_run], -1)
 
 
-def _initial_states(motor: Motor, own: RunUnknowns, tape: Tape) -> Starts:
+def _initial_states(motor: Motor, run_unknowns: RunUnknowns, tape: Tape) -> Starts:
     """Initial state of the run of each block."""
     first = jnp.searchsorted(jnp.asarray(tape.run), jnp.arange(tape.runs))
-    load = jnp.asarray(tape.load)[first, 0] + own.load_offset
-    state = motor.initial_state(own.current, own.speed, load, own.angle)
+    load = jnp.asarray(tape.load)[first, 0] + run_unknowns.load_offset
+    state = motor.initial_state(run_unknowns.current, run_unknowns.speed, load, run_unknowns.angle)
     extra = dict(state.extra)
     for effect in motor.effects:
         if effect.spring_state:
-            extra[effect.spring_state] += own.twist
+            extra[effect.spring_state] += run_unknowns.twist
         if effect.thermal_state:
-            extra[effect.thermal_state] += own.rise
+            extra[effect.thermal_state] += run_unknowns.resistance_rise
     return pack(state._replace(extra=extra)).T[tape.run]
 
 
-def _guessed_starts(motor: Motor, own: RunUnknowns, tape: Tape, initial: Starts) -> Starts:
+def _guessed_starts(motor: Motor, run_unknowns: RunUnknowns, tape: Tape, initial: Starts) -> Starts:
     """Guessed starts of the blocks: current and speed as last measured before, or else as the run begins, and the angle
     from the measured speed."""
     known = (tape.weight > 0).any(-1).T
@@ -188,8 +192,8 @@ def _guessed_starts(motor: Motor, own: RunUnknowns, tape: Tape, initial: Starts)
     turned = jnp.cumsum(jnp.where(jnp.isnan(tape.turn), by_speed, tape.turn).sum(-1))
     before = jnp.append(0.0, turned)
     first = jnp.searchsorted(jnp.asarray(tape.run), tape.run)
-    angle = own.angle[tape.run] + before[:-1] - before[first]
-    load = jnp.asarray(tape.load)[:, 0] + own.load_offset[tape.run]
+    angle = run_unknowns.angle[tape.run] + before[:-1] - before[first]
+    load = jnp.asarray(tape.load)[:, 0] + run_unknowns.load_offset[tape.run]
     guess = pack(motor.initial_state(current, speed, load, angle)).T
     return jnp.where(jnp.asarray(tape.begins)[:, None], initial, guess)
 
@@ -204,7 +208,7 @@ class Joining(NamedTuple):
     passes: Int[Array, ""]
 
 
-def _constant(motor_on_grids: MotorOnGrids, columns: int) -> MotorOnGrids:
+def _zero_derivatives(motor_on_grids: MotorOnGrids, columns: int) -> MotorOnGrids:
     """Derivatives of zero, for columns that are with respect to the starts only."""
     return jax.tree.map(lambda leaf: jnp.zeros((columns, *leaf.shape)), motor_on_grids)
 
@@ -213,7 +217,7 @@ def _join_blocks(
     motor_on_grids: MotorOnGrids,
     d_motor_on_grids: MotorOnGrids,
     tape: Tape,
-    own: RunUnknowns,
+    run_unknowns: RunUnknowns,
     initial: Starts,
     guess: Starts,
     max_passes: int | None = None,
@@ -229,7 +233,7 @@ def _join_blocks(
     allowed = max_passes or (1 if exact else len(guess) + 1)
 
     def simulate(starts: Starts) -> Pass:
-        return simulate_blocks(motor_on_grids, d_motor_on_grids, columns, tape, starts, own.load_offset)
+        return simulate_blocks(motor_on_grids, d_motor_on_grids, columns, tape, starts, run_unknowns.load_offset)
 
     def unjoined(joining: Joining) -> Bool[Array, ""]:
         return (joining.gap > MAX_RELATIVE_GAP) & (joining.passes < allowed)
@@ -317,9 +321,9 @@ def _newton_correction_with_derivatives(
             Float[Array, "states columns"],
         ],
     ) -> tuple[WithDerivatives, WithDerivatives]:
-        first, begin, passed_end, jacobian, start, own = block
+        first, begin, passed_end, jacobian, start, direct = block
         new, d_new = jax.tree.map(lambda a, b: jnp.where(first, a, b), begin, carry)
-        return (passed_end + jacobian @ (new - start), jacobian @ d_new + own), (new, d_new)
+        return (passed_end + jacobian @ (new - start), jacobian @ d_new + direct), (new, d_new)
 
     at_begin = (initial, jnp.moveaxis(d_initial, 0, -1))
     blocks = (jnp.asarray(tape.begins), at_begin, passed.end, by_start, starts, by_own)

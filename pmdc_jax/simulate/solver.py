@@ -110,7 +110,7 @@ def _required(matrix: Matrix | None) -> Matrix:
 
 
 def _step(motor: Motor, propagator: Propagator, acting: Input, state: State) -> tuple[State, State | None]:
-    teeth = motor.toothed
+    teeth = motor.gear
     if teeth is not None:
         touching = teeth.teeth(state).touch
         propagator = jax.tree.map(

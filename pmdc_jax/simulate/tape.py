@@ -89,7 +89,7 @@ class Tape(eqx.Module):
         from one sample to the next, and when the outputs are read; its `lead` in whole samples is not applied.
         """
         runs = [_Run(recording, timing) for recording in recordings]
-        rises = timing.first_order_hold or any(recording.resampled_from is not None for recording in recordings)
+        rises = timing.first_order_hold or not all(recording.has_even_clock for recording in recordings)
         averaged = any(r.averaging is not None or r.current_averaged for r in recordings)
         grids = list(dict.fromkeys(run.grid for run in runs))
         sample_times, drives, free, later = (np.array(each) for each in zip(*grids, strict=True))

@@ -21,15 +21,15 @@ from .signals import Screen, Signal
 # False-alarm probability: that anything is called missing from a motor that lacks nothing, or, once effects were
 # added, that anything more is in all later looks together
 FALSE_ALARM = 0.01
-# Model-form error: the share of the squares explained by effects that imperfect formulas of them may leave,
+# Model-form error: the largest share of the squares that effects explain which imperfect formulas of them may leave
 MODEL_FORM_SHARE = 0.1
-# and the same if the rest is a curve over an effect's own variable
+# The same if the rest is a curve over an effect's own variable
 OWN_MODEL_FORM_SHARE = 0.5
-# Shares of the gain of the clearest signal: from this one on a candidate is worth a trial,
+# Least share of the gain of the clearest signal with which a candidate is worth a trial
 TRIAL_SHARE = 0.3
-# from this one on a curve describes what is left,
+# Least share of the gain of the clearest signal with which a curve describes what is left
 CURVE_SHARE = 0.5
-# and from this one on what is left is clearly a candidate's effect
+# Least share of the gain of the clearest signal with which what is left is clearly a candidate's effect
 EFFECT_SHARE = 0.7
 # By simple effect, its fuller form if that has no regression column: only a refit can test it, such as backlash
 REFIT_ONLY = {simple: f.effect for simple, f in FULLER.items() if f.effect not in CONTAINS}

@@ -89,7 +89,7 @@ def varying_parameter(model: Model, assessment: Assessment) -> VaryingParameter 
 
 
 def _variations(model: Model, screen: Screen) -> list[_Variation]:
-    parameters = model.prepared.problem.parameters
+    parameters = model.problem.parameters
     if len(model.prepared.training) < 2 or model.is_exact:
         return []
     return [
@@ -124,14 +124,14 @@ def _own_in_every_run(model: Model, name: str) -> Block:
 def _fit(model: Model, variation: _Variation) -> FitByRun | None:
     """The model with a value of one parameter for every run, in full simulation from the first-order estimate; None if
     that estimate makes the runs that determine it worse: far from the common value, the first order may mislead."""
-    problem = model.prepared.problem
+    problem = model.problem
     place, tape = _place(model, variation.name), problem.tape
     coordinates = np.tile(variation.common, (tape.runs, 1))
     coordinates[:, place] = np.mean([*variation.own.values()])
     runs, difference = model.fit.unknowns.runs, 0.0
     before = _squares(model, np.asarray(model.fit.coordinates))[1]
     for run, own in variation.own.items():
-        of_tape = model.training[run]
+        of_tape = model.prepared.training_indices[run]
         coordinates[of_tape, place] = own
         fitted, squares = _squares(model, coordinates[of_tape])
         runs = jax.tree.map(lambda all_runs, new, k=of_tape: all_runs.at[k].set(new[k]), runs, fitted)
@@ -145,7 +145,7 @@ def _squares(
     model: Model, coordinates: Float[np.ndarray, " parameters"]
 ) -> tuple[RunUnknowns, Float[np.ndarray, " runs"]]:
     """The best own unknowns of every run for these coordinates, and the sums of squares with them."""
-    problem = replace(model.prepared.problem, noise=jnp.asarray(model.fit.noise))
+    problem = replace(model.problem, noise=jnp.asarray(model.fit.noise))
     unknowns = model.fit.unknowns._replace(coordinates=jnp.asarray(coordinates))
     fitted, evaluation = fit_run_unknowns(problem, unknowns)
     return fitted.runs, squares_of_runs(problem, evaluation)
@@ -160,7 +160,7 @@ def _estimates_by_run(model: Model, variation: _Variation, fit: FitByRun) -> dic
         Kb, Kt = (parameters.value(name, coordinates[0]) for name in ("Kb", "Kt"))
         coordinates = parameters.with_torques_scaled(coordinates, Kb / Kt)
         fixed.append(parameters.names.index("Kt"))
-    own = coordinates[model.training, place]
+    own = coordinates[model.prepared.training_indices, place]
     errors, reaches = errors_by_run(prepared.problem, fit, place, fixed)
     return {
         run.name: _estimate(variation.name, *of_run)
@@ -175,4 +175,4 @@ def _estimate(name: str, logarithm: float, error: float, reach: float) -> Estima
 
 
 def _place(model: Model, name: str) -> int:
-    return model.prepared.problem.parameters.names.index(name)
+    return model.problem.parameters.names.index(name)

@@ -21,8 +21,8 @@ from ...identify.fit.generalised_least_squares import residuals_of, series_of
 from ...identify.noise.noise_model import Series
 from ...identify.noise.sensor_noise import noise_of_sensor, white_noise
 from ...motor import Motor
+from ...recordings.noise import NORMAL_MEDIAN
 from ...recordings.recording import OVER_LAST
-from ...recordings.white_noise import MEDIAN
 from ...simulate.exponential import scalar_phi
 from ..model import Model
 
@@ -109,10 +109,10 @@ def electrical_misfit(model: Model) -> float:
     if model.is_exact:
         return 1.0
     series = residuals_of(model.prepared, model.fit)
-    size = float(model.prepared.problem.measured_rms[0])
+    size = float(model.problem.measured_rms[0])
     balances = [
         balance
-        for run, residual in zip(model.training, series, strict=True)
+        for run, residual in zip(model.prepared.training_indices, series, strict=True)
         if (balance := _balance(model, run, residual, size)) is not None
     ]
     if not balances:
@@ -154,7 +154,7 @@ def _typical_covariance(residuals: Float[np.ndarray, " samples"], lag: int) -> f
     """The covariance at a lag, of normal residuals, that rare large ones leave as it is: from the signs of pairs and
     the median size (quadrant correlation)."""
     agreement = np.mean(np.sign(residuals[lag:]) * np.sign(residuals[:-lag]))
-    return float(np.sin(np.pi / 2 * agreement) * (np.median(np.abs(residuals)) / MEDIAN) ** 2)
+    return float(np.sin(np.pi / 2 * agreement) * (np.median(np.abs(residuals)) / NORMAL_MEDIAN) ** 2)
 
 
 def _covariance_beyond_chance(
@@ -175,7 +175,7 @@ def _balance(model: Model, run: int, residual: Series, size: float) -> _Balance 
 
     **Arguments**: `size`, the root mean square of the current in all runs, A.
     """
-    prepared, tape = model.prepared, model.prepared.problem.tape
+    prepared, tape = model.prepared, model.problem.tape
     drive, known, residuals = tape.drive_of(run), residual.known, residual.values
     recorded = prepared.runs[run]
     seconds, outputs = residual.kind
@@ -214,7 +214,7 @@ def _balance(model: Model, run: int, residual: Series, size: float) -> _Balance 
         speed_noise * by_speed,
         prepared.input_noise.get(recorded.name, 0.0) * weights.sum(),
     )
-    noise, even_clock = float(np.linalg.norm(parts)), recorded.resampled_from is None
+    noise, even_clock = float(np.linalg.norm(parts)), recorded.has_even_clock
     return _Balance(steps(measured), reached, noise, even_clock)
 
 
@@ -227,7 +227,7 @@ def _shapes(current: Float[np.ndarray, " samples"], size: float) -> Float[np.nda
 
 def _voltage_between_readings(model: Model, run: int, length: int) -> Float[np.ndarray, "steps 2"]:
     """The voltage at the start and at the end of each step between the samples of a run, of this number, V."""
-    prepared, tape = model.prepared, model.prepared.problem.tape
+    prepared, tape = model.prepared, model.problem.tape
     ends = np.stack([tape.samples_of(run, tape.drive_at(end), length) for end in (0.0, 1.0)], 1)
     if (share := prepared.timing.reading) is not None:  # from one reading to the next two voltages act
         ends[:-1] = (1 - share) * ends[:-1] + share * ends[1:]

@@ -24,12 +24,12 @@ class Block(NamedTuple):
     per_run: bool = False
 
 
-def consecutive_blocks(orders: Iterable[tuple[int, bool]], first: int) -> list[Block]:
+def consecutive_blocks(widths: Iterable[tuple[int, bool]], first: int) -> list[Block]:
     """Blocks from pairs of a number of columns and `per_run`, one after another from the `first` column on."""
     blocks = []
-    for order, per_run in orders:
-        blocks.append(Block(tuple(range(first, first + order)), per_run))
-        first += order
+    for width, per_run in widths:
+        blocks.append(Block(tuple(range(first, first + width)), per_run))
+        first += width
     return blocks
 
 

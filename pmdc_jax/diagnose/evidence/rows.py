@@ -21,7 +21,7 @@ from ...runtime.compiled import compiled
 from ...simulate import Tape
 from ..hypotheses.change import Change, columns_at_once
 from ..model import Model, RunSeries, series_of_runs
-from ..response import Path, respond
+from ..response import Trajectory, respond
 from .quantisation import rounding_errors
 
 # Samples that are whitened at once, to limit the memory
@@ -51,10 +51,10 @@ class Rows(NamedTuple):
             yield whiten(run, Series(values, residual.known[part], residual.kind))
 
 
-def gather_rows(model: Model, bare: Motor, path: Path, changes: Iterable[Change], count: int) -> list[Rows]:
+def gather_rows(model: Model, bare: Motor, trajectory: Trajectory, changes: Iterable[Change], count: int) -> list[Rows]:
     """The rows of every training run, from `changes` with `count` columns in all, which the motor without effects,
     `bare`, propagates."""
-    tape, fits = model.prepared.problem.tape, series_of_runs(model)
+    tape, fits = model.problem.tape, series_of_runs(model)
     rows_of_runs = [
         Rows(
             fit, _late_readings(fit), np.empty((*fit.residual.values.shape, count), np.float32), rounding_errors(fit, k)
@@ -63,8 +63,8 @@ def gather_rows(model: Model, bare: Motor, path: Path, changes: Iterable[Change]
     ]
     first = 0
     for change, width in _batches(changes, columns_at_once(tape)):
-        response = _output_change(bare, tape, path, change)
-        for run, rows in zip(model.training, rows_of_runs, strict=True):
+        response = _output_change(bare, tape, trajectory, change)
+        for run, rows in zip(model.prepared.training_indices, rows_of_runs, strict=True):
             in_time = series_of(tape, run, response).values
             rows.columns[..., first : first + width] = in_time[..., :width]
         first += width
@@ -79,22 +79,22 @@ def _late_readings(fit: RunSeries) -> Float[np.ndarray, "samples outputs 2"]:
 
 
 def _output_change(
-    bare: Motor, tape: Tape, path: Path, change: Change
+    bare: Motor, tape: Tape, trajectory: Trajectory, change: Change
 ) -> Float32[np.ndarray, "blocks 2 samples columns"]:
     """What a change makes of the recorded outputs of the motor without effects; of a setting that cannot be simulated,
     zero."""
     if change.by_sensor:
         is_finite = np.isfinite(change.values).all((0, 1, 2))
         return np.where(is_finite, change.values, 0).transpose(2, 1, 0, 3)
-    return np.asarray(_response(bare, tape, path, change.values))
+    return np.asarray(_response(bare, tape, trajectory, change.values))
 
 
 @compiled
 def _response(
-    bare: Motor, tape: Tape, path: Path, increments: Float32[Array | np.ndarray, "samples 2 blocks columns"]
+    bare: Motor, tape: Tape, trajectory: Trajectory, increments: Float32[Array | np.ndarray, "samples 2 blocks columns"]
 ) -> Float32[Array, "blocks 2 samples columns"]:
     """The response to state increments of the motor without effects."""
-    response = respond(bare, tape, path, increments.astype(jnp.result_type(float)))
+    response = respond(bare, tape, trajectory, increments.astype(jnp.result_type(float)))
     is_finite = jnp.all(jnp.isfinite(response), (0, 1, 2))
     return jnp.where(is_finite, response, 0.0).astype(jnp.float32).transpose(2, 1, 0, 3)
 

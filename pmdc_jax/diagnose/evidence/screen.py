@@ -29,16 +29,16 @@ def screen(model: Model, library: Library) -> Screen:
     The whitening filter is fitted to what the clearest candidate or curve leaves of the residuals. One fitted to the
     residuals themselves would absorb what is missing as noise, above all a constant offset, and hide it.
     """
-    tape, path = model.prepared.problem.tape, model.path
-    curves, changes_of_curves = curves_along(library, tape, path)
-    orders = [(c.order, c.own_phase) for c in library.candidates]
-    orders += [(c.order, c.per_run) for c in curves]
-    count = sum(order for order, _ in orders)
-    changes = chain(library.changes(tape, path), changes_of_curves)
-    rows = gather_rows(model, library.bare, path, changes, count)
+    tape, trajectory = model.problem.tape, model.trajectory
+    curves, changes_of_curves = curves_along(library, tape, trajectory)
+    widths = [(c.width, c.own_phase) for c in library.candidates]
+    widths += [(c.width, c.per_run) for c in curves]
+    count = sum(width for width, _ in widths)
+    changes = chain(library.changes(tape, trajectory), changes_of_curves)
+    rows = gather_rows(model, library.bare, trajectory, changes, count)
     scaling = scaling_whitener([run.fit.residual for run in rows])
     unfiltered = _evidence(rows, scaling)
-    blocks = consecutive_blocks(orders, unfiltered.first_column)
+    blocks = consecutive_blocks(widths, unfiltered.first_column)
     plain = Screen(
         evidence=unfiltered,
         white=scaling,
@@ -52,7 +52,7 @@ def screen(model: Model, library: Library) -> Screen:
     )
     white = fit_whitener(_without_clearest(plain, rows))
     evidence = _evidence(rows, white)
-    is_uneven = any(run.resampled_from is not None for run in model.prepared.training)
+    is_uneven = not all(run.has_even_clock for run in model.prepared.training)
     least_gain = UNEVEN_SHARE * evidence.regress().squares if is_uneven else 0.0
     return plain._replace(evidence=evidence, white=white, least_gain=least_gain)
 

@@ -47,7 +47,7 @@ class Candidate(NamedTuple):
     full_simulation: bool = False
 
     @property
-    def order(self) -> int:
+    def width(self) -> int:
         """How many coefficients it has (in one run, with `own_phase`)."""
         return len(self.columns)
 

@@ -1,4 +1,4 @@
-"""What candidates and curves change along a path, some of them at once."""
+"""What candidates and curves change along a trajectory, some of them at once."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ MAX_NUMBERS = 2**23
 
 
 class Change(NamedTuple):
-    """What a few candidates or curves change along a path, in current and speed: the state at the end of each sample,
-    or, by a sensor, what is recorded."""
+    """What a few candidates or curves change along a trajectory, in current and speed: the state at the end of each
+    sample, or, by a sensor, what is recorded."""
 
     values: Float32[np.ndarray, "samples 2 blocks columns"]
     by_sensor: bool = False

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...simulate import Tape
-from ..response import Path, input_gains
+from ..response import Trajectory, input_gains
 from .change import Change
 from .library import Library
 
@@ -42,7 +42,7 @@ class Curve(NamedTuple):
     is_noise: bool = False
 
     @property
-    def order(self) -> int:
+    def width(self) -> int:
         """How many coefficients it has (in one run, with `per_run`)."""
         return len(self.knots) if self.shapes is None else self.shapes.shape[1]
 
@@ -75,11 +75,11 @@ class Curve(NamedTuple):
         return errors if self.shapes is None else np.sqrt(self.shapes**2 @ errors**2)
 
 
-def curves_along(library: Library, tape: Tape, path: Path) -> tuple[list[Curve], Iterator[Change]]:
+def curves_along(library: Library, tape: Tape, trajectory: Trajectory) -> tuple[list[Curve], Iterator[Change]]:
     """The curves over all variables of all equations, the sinusoids of the angle, and what each changes."""
-    terms = [*_equation_curves(library, tape, path), *_angle_waves(library, tape, path)]
+    terms = [*_equation_curves(library, tape, trajectory), *_angle_waves(library, tape, trajectory)]
     if library.measures_current:
-        terms.append(_late_current(tape, path))
+        terms.append(_late_current(tape, trajectory))
     return [curve for curve, _ in terms], (change() for _, change in terms)
 
 
@@ -87,11 +87,11 @@ def curves_along(library: Library, tape: Tape, path: Path) -> tuple[list[Curve],
 Term = tuple[Curve, Callable[[], Change]]
 
 
-def _equation_curves(library: Library, tape: Tape, path: Path) -> Iterator[Term]:
+def _equation_curves(library: Library, tape: Tape, trajectory: Trajectory) -> Iterator[Term]:
     """The curves of each equation over its variables (`CURVE_VARIABLES`)."""
     volt, torque = (np.asarray(gain) for gain in input_gains(library.bare, tape))
     value = np.asarray(tape.value).T
-    known = {"speed": np.asarray(path.speed), "current": np.asarray(path.current), "voltage": value}
+    known = {"speed": np.asarray(trajectory.speed), "current": np.asarray(trajectory.current), "voltage": value}
     known["time"] = _share_of_run(tape)
     weight = np.any(np.asarray(tape.weight), axis=1).T
     voltage_driven = bool(np.any(np.asarray(tape.drive.voltage) > 0))
@@ -115,10 +115,10 @@ def _equation_curves(library: Library, tape: Tape, path: Path) -> Iterator[Term]
                 yield reversing, partial(_change_by_input, gain, turning)
 
 
-def _angle_waves(library: Library, tape: Tape, path: Path) -> Iterator[Term]:
+def _angle_waves(library: Library, tape: Tape, trajectory: Trajectory) -> Iterator[Term]:
     """Sinusoids of the angle: a torque behind a gear, and a ripple of the speed sensor in proportion to the speed, such
     as of a tachometer or an eccentric encoder."""
-    angle, speed = np.asarray(path.angle), np.asarray(path.speed)
+    angle, speed = np.asarray(trajectory.angle), np.asarray(trajectory.speed)
     torque = np.asarray(input_gains(library.bare, tape)[1])
     for periods in PERIODS_BEHIND_GEAR:
         wave = partial(_wave, periods * angle)
@@ -128,9 +128,9 @@ def _angle_waves(library: Library, tape: Tape, path: Path) -> Iterator[Term]:
         yield _wave_curve("sensor", "", periods), partial(_sensor_ripple, speed, periods * angle)
 
 
-def _late_current(tape: Tape, path: Path) -> Term:
+def _late_current(tape: Tape, trajectory: Trajectory) -> Term:
     """A current that is read late, as behind a filter: an error in proportion to its rate of change."""
-    current = np.asarray(path.current).T
+    current = np.asarray(trajectory.current).T
     before = np.append(current.flat[0], current.flat[:-1]).reshape(current.shape)
     before[:, 0] = np.where(tape.begins, current[:, 0], before[:, 0])
     rate = ((current - before) / np.asarray(tape.sample_time)[tape.grid][:, None]).T

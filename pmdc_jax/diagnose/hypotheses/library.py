@@ -1,4 +1,4 @@
-"""The candidates that the recordings can show, and what each changes along a path, to first order."""
+"""The candidates that the recordings can show, and what each changes along a trajectory, to first order."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ...runtime.compiled import quickly_compiled
 from ...runtime.threads import run_ahead
 from ...simulate import Tape, free_run
 from ..model import Model
-from ..response import Outputs, Path, sensor_changes, state_increments
+from ..response import Outputs, Trajectory, sensor_changes, state_increments
 from .candidates import Candidate, Scales
 from .change import Change, columns_at_once
 from .trials import all_candidates
@@ -40,8 +40,8 @@ class Library:
         """`base` is the motor without effects, as fitted."""
         self.bare = jax.tree.map(jnp.asarray, base.motor)
         self.scales = _scales(base)
-        tape = base.prepared.problem.tape
-        self.measures_current = bool(np.any(np.asarray(tape.weight)[base.prepared.problem.fitted_blocks, 0]))
+        tape = base.problem.tape
+        self.measures_current = bool(np.any(np.asarray(tape.weight)[base.problem.fitted_blocks, 0]))
         has_current = self.measures_current or bool(np.any(np.asarray(tape.drive.current) > 0))
         observable = {e for e, effect in EFFECTS.items() if has_current or not effect.needs_current}
         self.candidates = [c for c in all_candidates(self.scales) if c.effect in observable]
@@ -54,11 +54,11 @@ class Library:
         self._simulated: dict[int, np.ndarray] = {}
         self._base = base
 
-    def changes(self, tape: Tape, path: Path) -> Iterator[Change]:
-        """What the candidates change along a path, in their order; a `Change` has some candidates of one effect."""
-        return run_ahead(self._change_calls(tape, path))
+    def changes(self, tape: Tape, trajectory: Trajectory) -> Iterator[Change]:
+        """What the candidates change along a trajectory, in their order; a `Change` has some of one effect."""
+        return run_ahead(self._change_calls(tape, trajectory))
 
-    def _change_calls(self, tape: Tape, path: Path) -> Iterator[Callable[[], Change]]:
+    def _change_calls(self, tape: Tape, trajectory: Trajectory) -> Iterator[Callable[[], Change]]:
         """Functions that compute the changes, each of as many columns as are simulated together."""
         for name in EFFECTS:
             shapes = [c for c in self.candidates if c.effect == name]
@@ -70,7 +70,7 @@ class Library:
                 parts = -(-len(settings) // columns_at_once(tape))
                 for part in np.array_split(np.arange(len(settings)), parts):
                     values = {f: np.array([settings[k][f] for k in part]) for f in settings[0]}
-                    yield partial(_small_change, EFFECTS[name], values, units[part], self.bare, tape, path)
+                    yield partial(_small_change, EFFECTS[name], values, units[part], self.bare, tape, trajectory)
 
     def _simulated_change(self, shapes: Sequence[Candidate]) -> Change:
         """What an effect at finite size changes in the records, by full simulations."""
@@ -126,21 +126,21 @@ def _change_per_unit(
     units: Float[Array | np.ndarray, " columns"],
     bare: Motor,
     tape: Tape,
-    path: Path,
+    trajectory: Trajectory,
 ) -> Float32[Array, "samples 2 blocks columns"]:
     """The state increments, or changes by sensors, of settings of one effect, each divided by its unit."""
     change = sensor_changes if effect.equation == "sensor" else state_increments
 
     def per_unit(values: Mapping[str, Array | np.ndarray], unit: Array | np.ndarray) -> Outputs:
-        return change(bare.with_effects([effect(**values)]), bare, tape, path) / unit
+        return change(bare.with_effects([effect(**values)]), bare, tape, trajectory) / unit
 
     return jax.vmap(per_unit, out_axes=-1)(settings, units).astype(jnp.float32)
 
 
 def _scales(base: Model) -> Scales:
     """The typical sizes in the fitted runs, mostly 95 % quantiles of magnitudes."""
-    tape, motor = base.prepared.problem.tape, base.motor
-    fitted = base.prepared.problem.fitted_blocks
+    tape, motor = base.problem.tape, base.motor
+    fitted = base.problem.fitted_blocks
     observed = np.asarray(tape.weight)[fitted].any(1)
     simulated = np.abs(np.asarray(base.fit.evaluation.simulated)[fitted])
     current, speed = (float(np.quantile(simulated[:, c][observed], 0.95)) + 1e-9 for c in range(2))
@@ -156,6 +156,6 @@ def _scales(base: Model) -> Scales:
         torque=value if torque_driven else float(motor.Kt) * current,
         inertia=float(motor.J),
         sample_time=float(np.min(np.asarray(tape.sample_time))),
-        duration=float(max(run.time[-1] - run.time[0] for run in base.prepared.training)),
+        duration=max(run.duration for run in base.prepared.training),
         travel=base.travel,
     )

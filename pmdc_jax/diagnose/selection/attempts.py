@@ -103,14 +103,14 @@ def _of_likeliest_timing(prepared: Prepared, search: str, seed: int, report: Rep
 def _named(solved: Solved, identifying: float, report: ReportProgress) -> Attempt:
     """The effects named beside the motor without effects that was identified."""
     report("gathering evidence", solved.fitted.fit.fitness)
-    selection = StepwiseSelection(model_of((), *solved.fitted), solved, report)
-    return Attempt(solved, selection, selection.name(), identifying)
+    selection = StepwiseSelection(model_of(solved.fitted), solved, report)
+    return Attempt(solved, selection, selection.select(), identifying)
 
 
 def _with_effects_of(model: Model, prepared: Prepared, white: Whitener) -> Model:
     """The effects of a model fitted to runs with another timing, as the model was: to whitened residuals."""
     prepared = prepared.with_effects(model.prepared.forms_of(model.effects))
-    return refit_from(model.effects, prepared, model.fit.optimum, white)
+    return refit_from(prepared, model.fit.optimum, white)
 
 
 def _without_hum_of(quiet: Prepared, solved: Solved) -> Solved:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...identify.fit.gauss_newton import TRIAL_TOLERANCE
-from ...identify.fit.generalised_least_squares import fit_whitened, residuals_of, sum_of_squares
+from ...identify.fit.gauss_newton import TRIAL_TOLERANCE, squares_of_outputs
+from ...identify.fit.generalised_least_squares import fit_whitened, residuals_of
 from ...identify.noise.noise_model import Whitener, fit_whitener
 from ...identify.prepare import Prepared
 from ..hypotheses.effect_relations import is_simpler_form
@@ -50,29 +50,28 @@ class Comparison:
         fitted, least = [], np.inf
         for model in sorted(models, key=lambda m: m.fit.fitness):
             if model.fit.fitness < DECISIVE_RATIO * least_unfiltered:
-                useful = _useful_squares(model.prepared, least, margin)
-                fitted.append(self.fitted(model, white, useful))
+                largest = _largest_squares(model.prepared, least, margin)
+                fitted.append(self.fitted(model, white, largest))
                 least = min(least, fitted[-1].criterion)
             else:
                 fitted.append(Fitted(model, np.inf, np.inf))
         return sorted(fitted, key=lambda f: f.criterion)
 
-    def fitted(self, model: Model, white: Whitener, useful: float = np.inf) -> Fitted:
-        """A model fitted to its residuals whitened by a filter; `useful`, the largest sum of squares that is of any
-        use, as of `polish`."""
+    def fitted(self, model: Model, white: Whitener, give_up_above: float = np.inf) -> Fitted:
+        """A model fitted to its residuals whitened by a filter; `give_up_above`, a sum of squares, as of `polish`."""
         key = model, white
         if key in self._fitted:
             return self._fitted[key]
-        prepared, polished = fit_whitened(model.prepared, model.fit, white, TRIAL_TOLERANCE, useful)
-        squares = sum_of_squares(prepared, polished)
+        prepared, polished = fit_whitened(model.prepared, model.fit, white, TRIAL_TOLERANCE, give_up_above)
+        squares = float(squares_of_outputs(prepared.problem, polished.evaluation).sum())
         fitted = Fitted(model, squares, squares + _penalty(prepared))
-        if squares <= useful:  # not given up
+        if squares <= give_up_above:
             self._fitted[key] = fitted
         return fitted
 
-    def useful_squares(self, smaller: Prepared, model: Model, white: Whitener) -> float:
+    def largest_squares(self, smaller: Prepared, model: Model, white: Whitener) -> float:
         """The largest sum of squares with which a smaller model may still compete with a model."""
-        return _useful_squares(smaller, self.fitted(model, white).criterion, BIC_MARGIN)
+        return _largest_squares(smaller, self.fitted(model, white).criterion, BIC_MARGIN)
 
     def filter_of(self, model: Model) -> Whitener:
         """The filter that whitens the residuals of a model."""
@@ -87,7 +86,7 @@ def _penalty(prepared: Prepared) -> float:
     return float(len(prepared.problem.parameters.names) * np.log(samples))
 
 
-def _useful_squares(prepared: Prepared, least: float, margin: float) -> float:
+def _largest_squares(prepared: Prepared, least: float, margin: float) -> float:
     """The largest sum of squares with which a fit may still compete with the least criterion, within a margin."""
     return least + margin + HOPELESS_EXCESS - _penalty(prepared)
 

@@ -83,7 +83,7 @@ class StepwiseSelection:
         self.proposals = Proposals(self.refits, self.assess, self.superseded)
         self.elimination = BackwardElimination(self.refits, self.comparison, self.assess, self._is_new)
 
-    def name(self) -> Naming:
+    def select(self) -> Naming:
         """Add effects while the evidence calls for them; then try other effects in place of those found."""
         current = self.base
         self.superseded.add(current)
@@ -125,7 +125,7 @@ class StepwiseSelection:
             refined = refine(model.fitted)
             if refined.prepared is not model.prepared:
                 self.superseded.add(model)
-                model = self.refits.replace(model_of(model.effects, *refined))
+                model = self.refits.replace(model_of(refined))
         return model
 
     def _without_needless(self, model: Model) -> Model:
@@ -224,7 +224,7 @@ class StepwiseSelection:
             return named
         gain = plain.varies.negative_log_likelihood - named.varies.negative_log_likelihood
         more = len(named.chosen.fit.coordinates) - len(self.base.fit.coordinates)
-        limit = more * np.log(self.base.prepared.problem.most_samples) + BIC_MARGIN
+        limit = more * np.log(self.base.problem.most_samples) + BIC_MARGIN
         return named if 2 * gain > limit else plain
 
     def _naming(self, current: Model) -> Naming:

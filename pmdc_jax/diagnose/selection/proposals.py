@@ -103,7 +103,7 @@ class Proposals:
         of `DECISIVE_RATIO`: a whitening filter absorbs as noise what lasts as long as a short run."""
         assessment, decisive = self.assess(current), current.fit.fitness / DECISIVE_RATIO
         full = len(current.effects) == MAX_EFFECTS
-        if full or assessment.p_value >= FALSE_ALARM or decisive < current.prepared.problem.outputs:
+        if full or assessment.p_value >= FALSE_ALARM or decisive < current.problem.perfect_fitness:
             return []
         unfiltered = assessment.screen._replace(evidence=assessment.screen.unfiltered)
         least = MIN_UNFILTERED_SHARE * assessment.screen.unfiltered.regress().squares
@@ -179,11 +179,11 @@ class Proposals:
         possible = [model for model in tried if model is not None and model.is_possible]
         if possible:
             nearest = min(possible, key=lambda m: m.fit.fitness)
-            suspects, noise = nearest.effects, POOR_MISFIT * current.prepared.problem.outputs
+            suspects, noise = nearest.effects, POOR_MISFIT * current.problem.perfect_fitness
         else:
             by_gain = sorted(self.assess(current).candidate_signals, key=lambda s: -s.gain)
             suspects = tuple(dict.fromkeys(s.effect for s in by_gain))[:SHORTLIST]
-            nearest, noise = current, current.prepared.problem.outputs
+            nearest, noise = current, current.problem.perfect_fitness
         sticks = any(EFFECTS[effect].holds == "speed" for effect in suspects)
         decisive = nearest.fit.fitness / DECISIVE_RATIO
         if not sticks or decisive < noise:  # not even a perfect fit would cut the misfit so far

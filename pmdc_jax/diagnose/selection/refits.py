@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import jax.numpy as jnp
 import numpy as np
 
+from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.fit.gauss_newton import TRIAL_TOLERANCE
 from ...identify.fit.generalised_least_squares import residuals_of, with_whitening
 from ...identify.fit.polish import fit_at, polish
@@ -90,7 +91,7 @@ class Refits:
             of_trial = self.starts.of_trial(current, effects)
             if of_trial:
                 return self._best_of_starts(effects, [start, *of_trial], found.white)
-            return self._refit_from_signal(effects, start, current, signal, found.white)
+            return self._refit_from_signal(start, current, signal, found.white)
 
         return effects, refit
 
@@ -117,18 +118,18 @@ class Refits:
                 starts = [self.starts.from_model(current, effects, values)]
             if old in FULLER and FULLER[old].effect == new:
                 starts = [self.starts.from_simple_form(current, old, effects), *starts]
-                max_misfit = MAX_FULLER_MISFIT * _misfit(current)
+                max_misfit = MAX_FULLER_MISFIT * current.fit.fitness
         return effects, lambda: self._best_of_starts(effects, starts, white, max_misfit)
 
     def with_global_search(self, current: Model, effect: str) -> Model:
         """The current model with one more effect, by a new global search; or the stored fit of the set, if better."""
         effects = (*current.effects, effect)
-        self.report(f"searching with {_joined(effects)}", _misfit(current))
+        self.report(f"searching with {_joined(effects)}", current.fit.fitness)
 
         def search() -> Model:
             prepared = current.prepared.with_effects(current.prepared.forms_of(effects))
             method, seed = self.solved.search.method, self.solved.seed
-            return model_of(effects, *search_and_refine(prepared, method, seed, searches=1).fitted)
+            return model_of(search_and_refine(prepared, method, seed, searches=1).fitted)
 
         if (key := frozenset(effects)) in self.models:
             return self._stored_or_better(key, current, search)
@@ -136,9 +137,9 @@ class Refits:
         assert model is not None
         return model
 
-    def with_fuller_form_held(self, current: Model, white: Whitener, effect: str, useful: float) -> Model:
+    def with_fuller_form_held(self, current: Model, white: Whitener, effect: str, give_up_above: float) -> Model:
         """The current model with a fuller form of an effect, whose extra parameters are held where they clearly act;
-        `useful`, as of `refit_from`."""
+        `give_up_above`, as of `refit_from`."""
         fuller = FULLER[effect]
         effects = (*(e for e in current.effects if e != effect), fuller.effect)
         prepared, start = self.starts.from_simple_form(current, effect, effects)
@@ -148,7 +149,7 @@ class Refits:
             fixed.add("Kt")
         free = jnp.asarray([name not in fixed for name in prepared.problem.parameters.names])
         prepared = prepared.with_problem(free=free)
-        return refit_from(effects, prepared, start, white, useful)
+        return refit_from(prepared, start, white, give_up_above)
 
     def replace(self, model: Model) -> Model:
         """Store a model in place of the fit of its effects, and return it."""
@@ -173,8 +174,8 @@ class Refits:
         prepared, start = self.starts.from_model(model, rest, {})
 
         def refit() -> Model:
-            useful = self.comparison.useful_squares(prepared, model, white)
-            return refit_from(rest, prepared, start, white, useful)
+            largest = self.comparison.largest_squares(prepared, model, white)
+            return refit_from(prepared, start, white, largest)
 
         smaller = self._stored_or_fitted(rest, model, refit)
         assert smaller is not None
@@ -182,7 +183,7 @@ class Refits:
         if (key, model) not in self.refitted_from:
             self.refitted_from.add((key, model))
             at_start = fit_at(prepared.problem, start).fitness
-            if at_start < (1 - MIN_IMPROVEMENT) * _misfit(smaller):
+            if at_start < (1 - MIN_IMPROVEMENT) * smaller.fit.fitness:
                 return self._stored_or_better(key, model, refit)
         return smaller
 
@@ -199,7 +200,7 @@ class Refits:
     def _stored_or_better(self, key: frozenset[str], current: Model, refit: Refit) -> Model:
         """The better of the stored fit of a set and a new one from the current model, which is then stored."""
         again = self._fitted(key, current, refit)
-        if again and _misfit(again) < (1 - MIN_IMPROVEMENT) * _misfit(self.models[key]):
+        if again and again.fit.fitness < (1 - MIN_IMPROVEMENT) * self.models[key].fit.fitness:
             self.models[key] = again
         return self.models[key]
 
@@ -212,29 +213,27 @@ class Refits:
         """Report which sets are fitted now; not in another thread, where nobody may expect to be called."""
         new = [_joined(effects) for effects in sets if frozenset(effects) not in self.models]
         if new:
-            self.report(f"trying {', '.join(new)}", _misfit(current))
+            self.report(f"trying {', '.join(new)}", current.fit.fitness)
 
     def _realises_gain(self, model: Model, current: Model, signal: Signal, white: Whitener) -> bool:
         """Whether a refit realises more than `MIN_REALISED_SHARE` of the gain that the evidence promised."""
         before, after = (self.comparison.fitted(m, white).squares for m in (current, model))
         return bool(before - after > MIN_REALISED_SHARE * signal.gain)
 
-    def _refit_from_signal(
-        self, effects: tuple[str, ...], start: Start, current: Model, signal: Signal, white: Whitener
-    ) -> Model:
+    def _refit_from_signal(self, start: Start, current: Model, signal: Signal, white: Whitener) -> Model:
         """A refit from where the evidence points; if that does not realise the promised gain, plain least squares, too.
 
         The plain fit is returned if it leaves far less unfiltered misfit: the filter had taken the missing effect for
         noise. Otherwise a second filtered refit starts from it, and the better of the two filtered ones is returned.
         """
         prepared, point = start
-        model = refit_from(effects, prepared, point, white)
+        model = refit_from(prepared, point, white)
         if self._realises_gain(model, current, signal, white):
             return model
         plain = polish(prepared.problem, point, tolerance=TRIAL_TOLERANCE)
-        if plain.fitness < MAX_PLAIN_MISFIT * _misfit(model):
-            return model_of(effects, prepared, plain)
-        from_plain = refit_from(effects, prepared, plain.optimum, white)
+        if plain.fitness < MAX_PLAIN_MISFIT * model.fit.fitness:
+            return model_of(FittedRuns(prepared, plain))
+        from_plain = refit_from(prepared, plain.optimum, white)
         return min((model, from_plain), key=lambda m: self.comparison.fitted(m, white).squares)
 
     def _best_of_starts(
@@ -252,23 +251,18 @@ class Refits:
         best = _best_short_refit(starts)
         start = best._replace(unknowns=best_backlash_start(prepared.problem, best.unknowns, runs))
         if factors and best.fitness < max_misfit:
-            return _refit_with_population(effects, prepared, start, factors, seed)
-        return refit_from(effects, prepared, start, white)
+            return _refit_with_population(prepared, start, factors, seed)
+        return refit_from(prepared, start, white)
 
 
 def _joined(effects: Sequence[str]) -> str:
     return " + ".join(sorted(effects))
 
 
-def _misfit(model: Model) -> float:
-    """The unfiltered misfit of a model, as in `Optimum.fitness`."""
-    return model.fit.fitness
-
-
 def _best_short_refit(starts: Sequence[Start]) -> Optimum:
     """The best of short refits, made until the best reaches the noise (`POOR_FIT`) or another found the same optimum
     (`SAME_OPTIMUM_RATIO`)."""
-    noise = POOR_FIT * starts[0].prepared.problem.outputs
+    noise = POOR_FIT * starts[0].prepared.problem.perfect_fitness
 
     def is_enough(ends: list[Optimum]) -> bool:
         least, *others = sorted(end.fitness for end in ends)
@@ -283,9 +277,7 @@ def _short_refit(start: Start) -> Optimum:
     return polish(start.prepared.problem, start.point, SHORT_REFIT_STEPS).optimum
 
 
-def _refit_with_population(
-    effects: tuple[str, ...], prepared: Prepared, start: Optimum, factors: Mapping[str, float], seed: int
-) -> Model:
+def _refit_with_population(prepared: Prepared, start: Optimum, factors: Mapping[str, float], seed: int) -> Model:
     """A refit; or a second one from the best of a population around where the first ended, if that point is better and
     so is the refit, by the whitening filter of the residuals at the start."""
     white = fit_whitener(residuals_of(prepared, fit_at(prepared.problem, start)))
@@ -294,12 +286,12 @@ def _refit_with_population(
     def whitened_misfit(model: Model) -> float:
         return fit_at(whitened, model.fit.optimum).fitness
 
-    model = refit_from(effects, prepared, start, white)
+    model = refit_from(prepared, start, white)
     nearer = {name: np.sqrt(factor) for name, factor in factors.items()}
     elsewhere = _best_around(prepared, model.fit.optimum, nearer, seed)
-    if elsewhere.fitness >= _misfit(model):
+    if elsewhere.fitness >= model.fit.fitness:
         return model
-    return min((model, refit_from(effects, prepared, elsewhere, white)), key=whitened_misfit)
+    return min((model, refit_from(prepared, elsewhere, white)), key=whitened_misfit)
 
 
 def _best_around(prepared: Prepared, start: Optimum, factors: Mapping[str, float], seed: int) -> Optimum:
@@ -310,6 +302,6 @@ def _best_around(prepared: Prepared, start: Optimum, factors: Mapping[str, float
 
 def _parameters_in_unseen_directions(model: Model) -> set[str]:
     """The parameters with a part in any direction that the runs do not determine."""
-    problem = model.prepared.problem
+    problem = model.problem
     unseen = information_of(problem, model.fit).unseen
     return {name for d in unseen for name in moved_by(d, problem.parameters)}

@@ -42,9 +42,9 @@ class Starts:
         """The start at the regression coefficients of a signal; None if physics forbids them."""
         candidate, fit = signal.candidate, screen.evidence.regress([signal.block])
         assert candidate is not None
-        coefficients, angles = fit.coefficients[0], np.zeros(current.prepared.problem.tape.runs)
+        coefficients, angles = fit.coefficients[0], np.zeros(current.problem.tape.runs)
         if candidate.own_phase:
-            coefficients, angles[current.training] = _in_common_phase(current, candidate, coefficients)
+            coefficients, angles[current.prepared.training_indices] = _in_common_phase(current, candidate, coefficients)
         start_values = candidate.build(coefficients, current.coulomb_torque)
         if start_values is None:
             return None
@@ -102,20 +102,19 @@ class Starts:
     ) -> list[float]:
         """Search coordinates of some parameters: those of the current model where its runs determine them or no start
         value is known, as of an effect from a global search; else start values, given or the first of the effect."""
-        names, fitted = current.prepared.problem.parameters.names, current.fit.unknowns.coordinates
+        names, fitted = current.problem.parameters.names, current.fit.unknowns.coordinates
         # the regression may change a parameter that no run determines by any amount
         near = np.asarray(fitted) + np.clip(changes, -1.0, 1.0)
         by_name = dict(zip(names, near, strict=True))
         coordinates, undetermined = [], current.undetermined
-        for name, log in zip(parameters.names, parameters.logarithmic, strict=True):
+        for k, name in enumerate(parameters.names):
             effect, _, field = name.partition(".")
             start = values.get(effect, self.first_values.get(effect))
             if name in by_name and (start is None or name not in undetermined):
                 coordinates.append(by_name[name])
             else:
                 assert start is not None
-                value = start[field]
-                coordinates.append(np.log(max(value, 1e-300)) if log else value)
+                coordinates.append(parameters.coordinate(k, start[field]))
         return coordinates
 
 
@@ -148,8 +147,8 @@ def _permitted_turns(model: Model, effect: str) -> list[np.ndarray | None]:
     periodic = [e for e in model.motor.effects if "angle" in e.states and e.name != effect]
     count = round(2 * np.pi / float(periodic[0].repeats_after()["angle"])) if periodic else 0
     whole_periods = 2 * np.pi * np.arange(count) / count if count else None
-    turnable = np.asarray(model.prepared.problem.angle_unknown)
-    return [whole_periods if turnable[run] else np.zeros(1) for run in model.training]
+    turnable = np.asarray(model.problem.angle_unknown)
+    return [whole_periods if turnable[run] else np.zeros(1) for run in model.prepared.training_indices]
 
 
 def common_phase(

@@ -7,37 +7,38 @@ two samples, or are linear from sample to sample, or if it is a mean over a samp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ...recordings.recording import Recording
 from ...simulate.exponential import scalar_phi
 from ..fit.polish import Fit
 from ..prepare import Prepared
 
-# A second voltage counts if its coefficient is so many standard errors from zero,
+# Least standard errors of the coefficient of a second voltage from zero
 MIN_Z = 10.0
-# if it explains this share of the squared residuals of the electrical equation,
+# Least share of the squared residuals of the electrical equation that a second voltage explains
 MIN_EXPLAINED = 0.05
-# and this share of what it explains together with a third voltage on the other side; a noisy voltage seems to have both
+# The same, of what it explains together with a third voltage on the other side: a noisy voltage seems to have both
 MIN_OF_THREE = 0.95
-# Largest coefficient of that third voltage, relative to the voltage's own
+# Largest coefficient of a third voltage, relative to the voltage's own
 MAX_OTHER_SIDE = 0.3
 # Share of a current that remains after a sample, at most, if it settles from one sample to the next
 MAX_REMAINING = 0.4
-# The same for a current that settles so soon that it does not show when the voltage acts
+# Share of a current that remains after a sample, at most, if it settles too soon to show when the voltage acts
 MAX_HIDDEN = 0.02
-# Least difference of the share of the later speed that counts, if it is larger than expected, and if it is smaller
-MIN_LATER = 0.02
-MIN_EARLIER = 0.1
+# Least excess over what is expected of the share of the later speed that counts, and least shortfall
+MIN_LATER, MIN_EARLIER = 0.02, 0.1
 # Range of the share of a current that remains after a sample
 REMAINING = (1e-9, 0.999)
 # Standard errors by which the share of the later voltage, and that of a current that remains, may be off
 SHARE_ERRORS = 4.0
-# How much the instant of reading may differ between those, in samples
+# How much the instant of reading may differ within these errors, in samples
 MAX_SPREAD = 0.05
+# A value less its error, the value, and the value plus its error
 SIDES = np.array([-1.0, 0.0, 1.0])
 # Standard deviations of its noise from which a current flows for certain
 MIN_FLOW = 4.0
@@ -45,9 +46,9 @@ MIN_FLOW = 4.0
 # voltage remains
 MIN_STEPS = 0.2
 
-# Columns of the electrical equation: the current, both speeds, the voltage of the sample before, of this and of the
-# next one, a constant, the direction of the current
-BEFORE, NOW, AFTER, COLUMNS = 3, 4, 5, 8
+# Columns of the electrical equation: the current, the speed at the start and at the end of the step, the voltage of the
+# sample before, of this and of the next one, a constant, the direction of the current
+CURRENT, SPEED, NEXT_SPEED, BEFORE, NOW, AFTER, COLUMNS = 0, 1, 2, 3, 4, 5, 8
 
 
 class ElectricalEquation(NamedTuple):
@@ -59,11 +60,12 @@ class ElectricalEquation(NamedTuple):
     instruments: Float[np.ndarray, "samples columns"]
     sample_time: float  # s
 
-    def solve(self, used: Int[np.ndarray, " used"]) -> Solution:
-        """The solution with the columns used.
+    def solve(self, without: Sequence[int] = ()) -> Solution:
+        """The solution with all columns, or without some.
 
         By instrumental variables, because noise of the currents would bias least squares; errors as of White (1980).
         """
+        used = np.delete(np.arange(COLUMNS), list(without))
         size = np.sqrt(np.mean(np.square(self.instruments[:, used]), axis=0)) + 1e-300
         Z, X = self.instruments[:, used] / size, self.columns[:, used] / size
         inverse = np.linalg.pinv(Z.T @ X, rcond=1e-10)
@@ -102,11 +104,11 @@ class TwoVoltages(NamedTuple):
 def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
     """How the currents depend on two voltages: these begin to act between two samples, or are straight between them, or
     the currents are means. None if they act at a sample, as far as the currents tell."""
-    by_three = equation.solve(np.arange(COLUMNS))
+    by_three = equation.solve()
     gains = by_three.coefficients
     own, other = (AFTER, BEFORE) if gains[AFTER] > gains[BEFORE] else (BEFORE, AFTER)
-    by_one = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))
-    by_two = equation.solve(np.delete(np.arange(COLUMNS), other))
+    by_one = equation.solve(without=(BEFORE, AFTER))
+    by_two = equation.solve(without=(other,))
     if by_one.mean_square - by_two.mean_square < MIN_OF_THREE * (by_one.mean_square - by_three.mean_square):
         # it explains much, or the two are collinear, as where a current settles within a sample
         if abs(gains[other]) > MAX_OTHER_SIDE * gains[own]:
@@ -119,7 +121,7 @@ def two_voltages(equation: ElectricalEquation) -> TwoVoltages | None:
     both = [later - 1, later]
     share = float(coefficients[later] / coefficients[both].sum())
     shares = share + SHARE_ERRORS * np.hypot(*errors[both]) / coefficients[both].sum() * SIDES
-    remains = coefficients[0] + SHARE_ERRORS * errors[0] * SIDES
+    remains = coefficients[CURRENT] + SHARE_ERRORS * errors[CURRENT] * SIDES
     lowest, remainder, highest = 1 - shares[::-1] * (1 - remains[1])
     readings = [_reading(s, r) for s in shares for r in remains]
     return TwoVoltages(
@@ -142,11 +144,11 @@ def settling(equation: ElectricalEquation, prepared: Prepared, fit: Fit) -> Sett
     """What the settling of the currents tells of the fit."""
     motor = prepared.problem.parameters(fit.coordinates)
     by_fit = np.exp(-float(motor.R / motor.L) * equation.sample_time)
-    solution = equation.solve(np.delete(np.arange(COLUMNS), [BEFORE, AFTER]))
-    remains, before, after = solution.coefficients[:3]  # of the current and of both speeds
+    solution = equation.solve(without=(BEFORE, AFTER))
+    remains, before, after = solution.coefficients[[CURRENT, SPEED, NEXT_SPEED]]
     # the errors of both are opposite, because the speeds are nearly the same
     share = after / (before + after)
-    error = SHARE_ERRORS * solution.errors[2] / abs(before + after)
+    error = SHARE_ERRORS * solution.errors[NEXT_SPEED] / abs(before + after)
     if by_fit > MAX_REMAINING or share - error > 1:
         return Settling(False, False)  # slow currents, or speeds that are not those at the samples
     # very soon settled, it tells its inductance too inaccurately to exclude that
@@ -210,4 +212,4 @@ def electrical_equation(prepared: Prepared, fit: Fit) -> ElectricalEquation | No
 
 def _is_usable(run: Recording) -> bool:
     measured = run.drive == "voltage" and run.current is not None and run.speed is not None
-    return measured and not run.held and run.resampled_from is None
+    return measured and not run.held and run.has_even_clock

@@ -25,7 +25,7 @@ def with_initial_temperatures(cold: FittedRuns) -> FittedRuns:
         return cold
     coolest = int(informative[0])
     warm = _with_cold_run(cold.prepared, cold.fit.optimum, informative, coolest)
-    rises = np.asarray(warm.fit.unknowns.runs.rise)
+    rises = np.asarray(warm.fit.unknowns.runs.resistance_rise)
     if (below := int(informative[np.argmin(rises[informative])])) != coolest:
         again = _with_cold_run(cold.prepared, _relative_to(warm, float(rises[below])), informative, below)
         warm = min(warm, again, key=lambda fitted: fitted.fit.cost)
@@ -58,6 +58,6 @@ def _relative_to(warm: FittedRuns, rise: float) -> Optimum:
     coordinates = np.array(fit.coordinates)
     coordinates[parameters.names.index("R")] += np.log1p(rise)
     runs = fit.unknowns.runs
-    rises = (1 + runs.rise) / (1 + rise) - 1
-    relative = fit.unknowns._replace(coordinates=jnp.asarray(coordinates), runs=runs._replace(rise=rises))
+    rises = (1 + runs.resistance_rise) / (1 + rise) - 1
+    relative = fit.unknowns._replace(coordinates=jnp.asarray(coordinates), runs=runs._replace(resistance_rise=rises))
     return fit.optimum._replace(unknowns=relative)

@@ -9,13 +9,11 @@ response to the rough part, or they do not.
 from __future__ import annotations
 
 import attrs
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...recordings.white_noise import noise_by_differences
-from ...simulate import Tape, uniform
+from ...recordings.noise import noise_by_differences
+from ...simulate import uniform
 from ..fit.fitted_runs import FittedRuns
 from ..fit.generalised_least_squares import series_of
 from ..fit.likelihood import negative_log_likelihood
@@ -24,7 +22,7 @@ from ..noise.noise_model import fit_whitener
 from ..prepare import Prepared
 
 # Noise below this share of the largest value is rounding
-MIN_RELATIVE_NOISE = 1e-7
+ROUNDING_NOISE = 1e-7
 # Half widths of the smoothing windows, samples
 HALF_WIDTHS = (1, 2, 3, 5, 8, 12, 18, 27, 40)
 # Windows behind (-1), around (0) and ahead of (1) a sample, each with the order of the polynomial fitted in it
@@ -32,12 +30,12 @@ WINDOWS = ((-1, 0), (0, 0), (1, 0), (-1, 1), (0, 2), (1, 1))
 # Half width, in standard errors, of the confidence intervals of the estimates by wider and wider windows, which must
 # intersect. For voltages of motors a larger value leaves less noise, but rounds corners: like a missing effect.
 CONFIDENCE_HALF_WIDTH = 1.25
-# A rough part is noise if the motor felt less than this share of it,
+# Largest share of a rough part that the motor felt if it is noise
 MAX_FELT_SHARE = 0.5
-# and so many standard errors less than all of it,
+# Least standard errors by which the motor felt less than all of a rough part that is noise
 MIN_Z_SCORE = 5.0
-# unless its removal raises the squared residuals of the run by this factor: the whitening filter then mistook its
-# effect for noise
+# Largest ratio of the squared residuals of a run without a rough part that is noise to those with it: above it, the
+# whitening filter has mistaken what the part does for noise
 MAX_SQUARES_RATIO = 1.1
 
 
@@ -69,9 +67,7 @@ def _with_drives(prepared: Prepared, drives: list[np.ndarray]) -> Prepared:
         uniform(attrs.evolve(run.recorded, **{run.drive: drive}))
         for run, drive in zip(prepared.runs, drives, strict=True)
     ]
-    driven = Tape.from_recordings(runs, timing=prepared.timing)
-    value, rise = jax.tree.map(jnp.asarray, (driven.value, driven.rise))
-    return prepared.with_tape(value=value, rise=rise)
+    return prepared.with_tape_of(runs, "value", "rise", timing=prepared.timing)
 
 
 def _felt_shares(prepared: Prepared, rough: Fit, smooth: Fit) -> list[float]:
@@ -111,7 +107,7 @@ def denoised(signal: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " sampl
     confidence intervals); Katkovnik, IEEE Transactions on Signal Processing 47 (1999) 2567.
     """
     noise = noise_by_differences(4, signal)  # by a median, since most of a signal is smooth
-    if not noise > MIN_RELATIVE_NOISE * np.max(np.abs(signal)):
+    if not noise > ROUNDING_NOISE * np.max(np.abs(signal)):
         return signal
     estimates, errors = zip(*(_estimate_by_widest(signal, noise, *window) for window in WINDOWS), strict=True)
     return np.average(estimates, axis=0, weights=1 / np.square(errors))

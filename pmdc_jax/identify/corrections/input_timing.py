@@ -19,9 +19,8 @@ from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
 from ...simulate import FIRST_ORDER_HOLD, RECORDED_EARLY, RECORDED_LATE, SMOOTH, Timing
-from ..fit.fitted_runs import FittedRuns
+from ..fit.fitted_runs import FittedRuns, refitted
 from ..fit.gauss_newton import TRIAL_TOLERANCE
-from ..fit.generalised_least_squares import training_indices
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
 from ..fit.polish import Fit, fit_at
 from ..prepare import Prepared
@@ -29,7 +28,7 @@ from ..problem import Problem, normal_matrix
 from .electrical_equation import ElectricalEquation, TwoVoltages, electrical_equation, settling, two_voltages
 from .reading_time import MARGIN, change_by_reading
 from .retiming import electrical_rate, with_timing
-from .speed_averaging import refitted, seems_averaged, with_averaging, without_averaging, without_ends
+from .speed_averaging import seems_averaged, with_averaging, without_averaging
 from .uneven_sampling import with_even_clock
 
 # Accuracy, in samples, with which a lead is searched
@@ -155,7 +154,7 @@ def _at_samples(fitted: FittedRuns) -> list[Timing]:
         simple = (FIRST_ORDER_HOLD, RECORDED_LATE, RECORDED_EARLY)
         likely = [t for t in simple if hidden or (t.ahead < 0) == (lead < 0)]
     # voltages that step at samples in some runs and are smooth in others seem early in these alone
-    even = all(run.resampled_from is None for run in prepared.runs)
+    even = all(run.has_even_clock for run in prepared.runs)
     if even and (FIRST_ORDER_HOLD in likely or largest > MIN_LEAD):
         likely.append(SMOOTH)
     return likely
@@ -231,7 +230,7 @@ def _lateness_of_current(problem: Problem, fit: Fit, *changes: Float[Array, "blo
 def negative_log_likelihood_within(fitted: FittedRuns) -> float:
     """Negative log-likelihood of the runs without their first and last samples: where a voltage acts later, the
     beginning of a run cannot be predicted."""
-    return negative_log_likelihood(fitted._replace(prepared=without_ends(fitted.prepared)))
+    return negative_log_likelihood(fitted._replace(prepared=fitted.prepared.without_ends()))
 
 
 def _apparent_leads(prepared: Prepared, fit: Fit) -> tuple[float, float]:
@@ -245,7 +244,7 @@ def _apparent_leads(prepared: Prepared, fit: Fit) -> tuple[float, float]:
     means = replace(means, tape=replace(means.tape, rise=None))
     change = fit_at(means, fit.optimum).evaluation.simulated - fit.evaluation.simulated
     (lead,), _ = _amplitudes(prepared.problem, fit, [change])
-    blocks = [prepared.problem.tape.blocks_of(run) for run in training_indices(prepared)]
+    blocks = [prepared.problem.tape.blocks_of(run) for run in prepared.training_indices]
     leads, errors = _amplitudes(prepared.problem, fit, [change * b[:, None, None] for b in blocks])
     return float(lead), float(np.max(leads[leads > MIN_LEAD_ERRORS * errors], initial=0.0))
 

@@ -10,16 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import attrs
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
 from ...motor import Motor
 from ...recordings.readings import reading_interval
-from ...recordings.recording import CHANNELS, Recording
-from ...simulate import Tape
+from ...recordings.recording import SIMULATED_OUTPUTS, Recording
 from ..fit.fitted_runs import FittedRuns
-from ..fit.generalised_least_squares import training_indices
 from ..noise.spectral_lines import common_line, spectrum
 
 # Frequencies of the mains in Hz, and how far they may be off
@@ -41,21 +38,20 @@ def without_mains_hum(fitted: FittedRuns) -> FittedRuns:
     residuals = [fitted.residuals(k) for k in range(len(prepared.runs))]
     runs, removed = list(prepared.runs), dict(prepared.mains_hum)
     for output, frequency in hums.items():
-        name = CHANNELS[output]
+        name = SIMULATED_OUTPUTS[output]
         for k, run in enumerate(runs):
             if getattr(run, name) is not None:
                 runs[k], amplitude = _without(run, name, residuals[k][:, output], frequency)
-                if k in training_indices(prepared):
+                if k in prepared.training_indices:
                     removed[name] = max(removed.get(name, 0.0), amplitude)
-    laid = Tape.from_recordings(runs)
-    quiet = prepared._replace(runs=runs, mains_hum=removed).with_tape(measured=jnp.asarray(laid.measured))
+    quiet = prepared.with_tape_of(runs, "measured")._replace(runs=runs, mains_hum=removed)
     return FittedRuns.polished(quiet, fit.optimum)
 
 
 def _hums(fitted: FittedRuns) -> Iterator[tuple[int, float]]:
     """The outputs that hum, 0 for the current and 1 for the speed, with the frequency in Hz."""
     prepared = fitted.prepared
-    both = [k for k in training_indices(prepared) if _shows_hum(prepared.runs[k])]
+    both = [k for k in prepared.training_indices if _shows_hum(prepared.runs[k])]
     if not both:
         return
     runs, residuals = [prepared.runs[k] for k in both], [np.nan_to_num(fitted.residuals(k)) for k in both]
@@ -128,7 +124,7 @@ def _without(
     coefficients = np.linalg.lstsq(waves(run.time)[known], residual[known])[0]
     record = run.recorded
     quiet = {name: getattr(run, name) - waves(run.time) @ coefficients}
-    if run.resampled_from is not None:
+    if not run.has_even_clock:
         clean = getattr(record, name) - waves(record.time) @ coefficients
         quiet["resampled_from"] = attrs.evolve(record, **{name: clean})
     return attrs.evolve(run, **quiet), float(np.hypot(coefficients[0], coefficients[len(orders)]))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import attrs
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ...recordings.recording import Recording
@@ -12,7 +10,6 @@ from ...simulate import Tape, Timing, uniform
 from ..fit.polish import Fit
 from ..prepare import Prepared
 from ..problem import Problem
-from .speed_averaging import without_ends
 
 
 def with_timing(prepared: Prepared, timing: Timing) -> Prepared:
@@ -22,12 +19,10 @@ def with_timing(prepared: Prepared, timing: Timing) -> Prepared:
         attrs.evolve(uniform(_retimed(run, k, tape, timing)), current_averaged=timing.current_mean)
         for k, run in enumerate(prepared.runs)
     ]
-    driven = Tape.from_recordings(runs, timing=timing)
-    names = ("value", "load", "rise", "reading", "averaging", "span")
-    retimed = jax.tree.map(jnp.asarray, {name: getattr(driven, name) for name in names})
-    acting = prepared.with_tape(**retimed)._replace(runs=runs, timing=timing)
+    fields = ("value", "load", "rise", "reading", "averaging", "span")
+    acting = prepared.with_tape_of(runs, *fields, timing=timing)._replace(runs=runs, timing=timing)
     # what acts during the first sample was not recorded: without outputs there, the initial state makes up for it
-    return without_ends(acting) if timing.ahead < 0 or timing.current_mean else acting
+    return acting.without_ends() if timing.ahead < 0 or timing.current_mean else acting
 
 
 def electrical_rate(problem: Problem, fit: Fit) -> float:
@@ -43,7 +38,7 @@ def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
     """
     if run.drive != "voltage":
         return run.recorded
-    even = run.resampled_from is None
+    even = run.has_even_clock
     voltage = tape.samples_of(k, tape.drive_at(0.0), len(run)) if even else run.recorded.voltage
     run, last = run.recorded, len(run.recorded) - 1
     rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)

@@ -7,44 +7,20 @@ instant, the fits to both decide. The simulation then reports the same mean.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import attrs
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from ...recordings.readings import reading_interval
-from ...recordings.recording import AROUND, OVER_BOTH, OVER_LAST, Averaging
-from ...recordings.resolution import quantum
+from ...recordings.recording import AROUND, OVER_LAST, Averaging
 from ...simulate import Tape
-from ..fit.fitted_runs import FittedRuns
-from ..fit.gauss_newton import TOLERANCE
+from ..fit.fitted_runs import FittedRuns, refitted
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
-from ..fit.polish import Fit
-from ..prepare import Prepared
+from ..prepare import SPEED, Prepared
+from .averaging_by_noise import averaging_of_counts, averaging_of_differences, in_counts
 
-# Most lines of an encoder
-MAX_LINES = 2e4
-# By how much a computed number of lines may differ from a whole one
-LINES_TOLERANCE = 0.02
-# Noise power in counts squared next to the Nyquist frequency: 1/12 for a speed rounded to counts, 1/3 for a mean over
-# the last sample
-COUNTED_AT_NYQUIST = 1 / 6
-# The same averaged over all high frequencies: 1/12 and 1/4
-COUNTED_IN_ALL = 1 / 7
-# Shortest run, in samples, of which these powers are estimated
+# Shortest run, in samples, that shows the noise of its speed
 MIN_SAMPLES = 200
-# Frequency bands as shares of the Nyquist frequency: around half of it, near it, next to it, and all that are high
-BANDS = ((0.4, 0.6), (0.9, 0.95), (0.98, 1.0), (0.4, 1.0))
-# How much smaller an inductance is tried, in natural logarithms
-L_REDUCTION = 3.0
-# The outputs in question: current and speed, or speed alone
-BOTH = slice(None)
-SPEED = slice(1, None)
-# Power next to the Nyquist frequency over that near it, at most, for a mean over two samples: in theory 1/40
-MAX_NYQUIST_RATIO = 1 / 8
 
 
 def seems_averaged(prepared: Prepared) -> bool:
@@ -66,7 +42,7 @@ def with_evident_averaging(prepared: Prepared) -> Prepared:
 
 def with_means(prepared: Prepared, averaging: Averaging) -> Prepared:
     """The runs with their recorded speeds treated as such means, without those at their ends."""
-    return _with_speeds_averaged(without_ends(prepared, SPEED), averaging)
+    return _with_speeds_averaged(prepared.without_ends(SPEED), averaging)
 
 
 def with_averaging(fitted: FittedRuns, beside_more: bool = False) -> FittedRuns:
@@ -86,7 +62,7 @@ def with_averaging(fitted: FittedRuns, beside_more: bool = False) -> FittedRuns:
     mean, min_gain, counted = _averaging_by_noise(prepared)
     if mean is None:
         return fitted
-    inner = without_ends(prepared, SPEED)
+    inner = prepared.without_ends(SPEED)
     instantaneous = FittedRuns(inner, fit)
     averaged = refitted(_with_speeds_averaged(inner, mean), fit)
     unlikeliness = negative_log_likelihood(averaged)
@@ -116,31 +92,15 @@ def without_averaging(prepared: Prepared) -> Prepared:
     return _with_speeds_averaged(prepared, None) if prepared.averaging else prepared
 
 
-def without_ends(prepared: Prepared, outputs: slice = BOTH) -> Prepared:
-    """The runs without the first and the last sample of some outputs: there a mean, or a voltage that acts at another
-    time, depends on what was not recorded."""
-    tape = prepared.problem.tape
-    weight = np.array(tape.weight)
-    for k, run in enumerate(prepared.runs):
-        first = int(np.argmax(tape.blocks_of(k)))
-        interval = 1 if run.speed is None else _interval(run.speed)
-        for sample in (*range(interval), *range(len(run) - interval, len(run))):
-            block, at = divmod(sample, weight.shape[2])
-            weight[first + block, outputs, at] = 0.0
-    return prepared.with_tape(weight=jnp.asarray(weight))
-
-
 def _with_speeds_averaged(prepared: Prepared, averaging: Averaging | None) -> Prepared:
     """The runs with their recorded speeds treated as such means, or as instantaneous for None."""
     runs = [
         attrs.evolve(run, averaging=averaging) if run.speed is not None and not is_differentiated else run
         for run, is_differentiated in zip(prepared.runs, prepared.differentiated, strict=True)
     ]
-    laid = jax.tree.map(jnp.asarray, Tape.from_recordings(runs, follow=True))
     # the grids are those of each averaging
-    names = ("averaging", "span", "later", "turn", "sample_time", "drive", "grid")
-    averaged = prepared.with_tape(**{name: getattr(laid, name) for name in names})
-    return averaged._replace(runs=runs, averaging=averaging)
+    fields = ("averaging", "span", "later", "turn", "sample_time", "drive", "grid")
+    return prepared.with_tape_of(runs, *fields, follow=True)._replace(runs=runs, averaging=averaging)
 
 
 def _shifted_earlier(prepared: Prepared) -> Prepared:
@@ -154,29 +114,7 @@ def _shifted_earlier(prepared: Prepared) -> Prepared:
     laid = Tape.from_recordings(runs)
     weight = np.stack([prepared.problem.tape.weight[:, 0], laid.weight[:, 1]], 1)
     moved = prepared.with_tape(measured=jnp.asarray(laid.measured), weight=jnp.asarray(weight))
-    return without_ends(moved, SPEED)
-
-
-def refitted(prepared: Prepared, fit: Fit, inductance: float | None = None, tolerance: float = TOLERANCE) -> FittedRuns:
-    """The runs, and the best fit to them that starts from `fit`, or from there with a smaller inductance: a large one
-    may have compensated part of a sample of delay.
-
-    **Arguments**: `inductance`, H, if it is known about which, to start from; `tolerance`, as of `polish`.
-    """
-    parameters = prepared.problem.parameters
-    starts = [fit.optimum]
-    if "L" in parameters.names:
-        L = parameters.names.index("L")
-        along_L = np.eye(len(parameters.names))[L]
-        if inductance is not None:
-            change = np.log(inductance) - float(fit.coordinates[L])
-            starts = [fit.optimum.moved(parameters, change * along_L)]
-        elif prepared.averaging == OVER_LAST or prepared.timing.current_mean:
-            smaller = fit.optimum.moved(parameters, -L_REDUCTION * along_L)
-            if smaller.unknowns.coordinates[L] < fit.coordinates[L]:  # not at its bound
-                starts.append(smaller)
-    ends = [FittedRuns.polished(prepared, start, tolerance) for start in starts]
-    return min(ends, key=lambda end: end.fit.cost)
+    return moved.without_ends(SPEED)
 
 
 def _averaging_by_noise(prepared: Prepared) -> tuple[Averaging | None, float, bool]:
@@ -190,54 +128,13 @@ def _averaging_by_noise(prepared: Prepared) -> tuple[Averaging | None, float, bo
         # with or without counts, only the fit tells
         return OVER_LAST, MIN_LOG_LIKELIHOOD_GAIN, False
     speeds = _speeds(prepared)
-    counts = _in_counts(speeds)
+    counts = in_counts(speeds)
     mean, min_gain = averaging_of_counts(counts) if counts else averaging_of_differences([s for s, _ in speeds])
     if mean is None and speeds and not counts and prepared.timing.current_mean:
         mean = OVER_LAST
     if mean == OVER_LAST and not prepared.problem.samples[0] > 0:
         mean = None
     return mean, min_gain, bool(counts)
-
-
-def averaging_of_counts(counts: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
-    """The mean that speeds in counts per sample are, None if none, and the gain in log-likelihood that it must bring;
-    if negative, the loss that is accepted.
-
-    Angles rounded to counts have white noise of 1/12 count squared. In differences over one sample its power is four
-    times that at the Nyquist frequency and twice that at half of it; in differences over two samples, in half counts,
-    zero and four times. While the rotor turns steadily the rounding error is not noise but a beat at some frequency:
-    only its total power is known then, and the fit must decide.
-    """
-    middle, high, highest, in_all = _band_powers(counts)
-    if highest > COUNTED_AT_NYQUIST:
-        clearly = highest > np.sqrt(2.0) * max(middle, COUNTED_AT_NYQUIST)
-        return OVER_LAST, -np.inf if clearly else -MIN_LOG_LIKELIHOOD_GAIN
-    if in_all > COUNTED_IN_ALL and not highest < MAX_NYQUIST_RATIO * high:
-        return OVER_LAST, MIN_LOG_LIKELIHOOD_GAIN
-    return OVER_BOTH if highest < MAX_NYQUIST_RATIO * high else None, -MIN_LOG_LIKELIHOOD_GAIN
-
-
-def averaging_of_differences(speeds: Sequence[np.ndarray]) -> tuple[Averaging | None, float]:
-    """The same for speeds that are no counts: differences over two samples have no power at the Nyquist frequency, any
-    other signal with noise or steps has as much there as near it."""
-    _, high, highest, _ = _band_powers(speeds) if speeds else (0.0, 0.0, 0.0, 0.0)
-    return OVER_BOTH if highest < MAX_NYQUIST_RATIO * high else None, MIN_LOG_LIKELIHOOD_GAIN
-
-
-def _band_powers(signals: Sequence[np.ndarray]) -> Float[np.ndarray, "bands"]:
-    """Mean power of the signals in each of the `BANDS`, scaled as the variance of white noise with that power.
-
-    Computed from second differences, since the much stronger low frequencies would leak into the high ones.
-    """
-    powers = []
-    for signal in signals:
-        bends = np.diff(signal, 2)
-        window = np.hanning(len(bends) + 1)[:-1]
-        power = np.abs(np.fft.rfft((bends - bends.mean()) * window)) ** 2 / (window @ window)
-        share = np.fft.rfftfreq(len(bends), 0.5)[1:]
-        white = power[1:] / (2 * np.sin(np.pi * share / 2)) ** 4
-        powers.append([white[(low < share) & (share < high)].mean() for low, high in BANDS])
-    return np.mean(powers, axis=0)
 
 
 def _is_slow(prepared: Prepared) -> bool:
@@ -260,22 +157,3 @@ def _speeds(prepared: Prepared) -> list[tuple[np.ndarray, float]]:
     ]
     known = [(speed[~np.isnan(speed)], time[~np.isnan(speed)]) for speed, time in recorded]
     return [(speed, float(np.median(np.diff(time)))) for speed, time in known if len(speed) >= MIN_SAMPLES]
-
-
-def _in_counts(speeds: Sequence[tuple[np.ndarray, float]]) -> list[np.ndarray]:
-    """The speeds in counts per sample of an encoder with a whole number of lines; empty if they are no such counts."""
-    counts = []
-    for speed, sample_time in speeds:
-        # a speed may jump by many counts from sample to sample, but its sorted values lie closer together
-        step = quantum(np.diff(speed)) or quantum(np.diff(np.unique(speed)))
-        lines = 2 * np.pi / step / sample_time if step else np.inf
-        if lines > MAX_LINES:
-            return []
-        in_counts = speed / step
-        # the tolerance grows with the error of a count where speeds were written with few digits
-        rounded = np.quantile(np.abs(in_counts - np.round(in_counts)), 0.95)
-        whole = LINES_TOLERANCE + lines * rounded / np.max(np.abs(in_counts))
-        if abs(lines - round(lines)) > whole:
-            return []
-        counts.append(in_counts)
-    return counts

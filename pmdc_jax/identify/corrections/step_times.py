@@ -120,7 +120,7 @@ def _refitted_smooth(prepared: Prepared, first_order: _Placed) -> _Placed:
 def steps_of(run: Recording) -> VoltageSteps:
     """The voltage steps of a run that stand out, placed at samples."""
     at, height = np.zeros(0, int), np.zeros(0)
-    if run.drive == "voltage" and run.voltage is not None and run.resampled_from is None and len(run) > 3:
+    if run.drive == "voltage" and run.voltage is not None and run.has_even_clock and len(run) > 3:
         jumps = jumps_of(run.voltage, MIN_STEP_RATIO, MIN_STEP_SHARE)
         if len(jumps) <= len(run) / MIN_SAMPLES_PER_STEP:
             at, height = jumps, np.diff(run.voltage)[jumps - 1]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...recordings.clock import GAP
-from ...recordings.recording import CHANNELS, Recording
+from ...recordings.recording import SIMULATED_OUTPUTS, Recording
 from ...simulate import Tape
 from ...simulate.uneven import simulated_at_stamps
 from ..fit.fitted_runs import FittedRuns
@@ -32,7 +32,7 @@ MAX_STEP_RATIO = 0.9
 def with_even_clock(fitted: FittedRuns) -> FittedRuns:
     """The runs with every sample of an uneven clock shifted to the nearest even sample along the simulated motion, and
     the fit to them; both unchanged where all clocks are even."""
-    uneven = any(run.resampled_from is not None for run in fitted.prepared.runs)
+    uneven = not all(run.has_even_clock for run in fitted.prepared.runs)
     last = None
     for _ in range(MAX_REFITS if uneven else 0):
         before, fitted = fitted, FittedRuns.polished(_shifted(*fitted), fitted.fit.optimum)
@@ -67,7 +67,7 @@ def _shifted(prepared: Prepared, fit: Fit) -> Prepared:
     motor = prepared.problem.parameters(fit.coordinates)
     runs = []
     for k, run in enumerate(prepared.runs):
-        if run.resampled_from is not None:
+        if not run.has_even_clock:
             now = tape.samples_of(k, simulated, len(run))
             then = simulated_at_stamps(motor, tape.drive_of(k), run, now, prepared.timing.first_order_hold)
             run = _nearest_samples(run, now, then)
@@ -89,7 +89,7 @@ def _nearest_samples(run: Recording, now: np.ndarray, then: np.ndarray) -> Recor
     near = np.abs(record.time[nearest] - run.time) <= GAP / 2 * run.sample_time
     outputs = {
         name: np.where(near, signal[nearest] + now[:, c] - then[nearest, c], np.nan)
-        for c, name in enumerate(CHANNELS)
+        for c, name in enumerate(SIMULATED_OUTPUTS)
         if getattr(run, name) is not None and (signal := getattr(record, name)) is not None
     }
     return attrs.evolve(run, **outputs)

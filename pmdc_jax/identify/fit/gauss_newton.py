@@ -14,9 +14,9 @@ from ..problem import Evaluation, Problem
 TOLERANCE = 2e-3
 # ... in fits that are only compared: far less than the differences that decide
 TRIAL_TOLERANCE = 0.5
-# Curvature added to every coordinate in a step, as a prior that knows each to within a factor of e, and to the initial
-# state, as one that knows it to within what was measured: negligible for what the data determine, while what they do
-# not determine, such as a current that has settled before it is read, stays where it is
+# Curvature added to every coordinate in a step, as a prior that knows each to within a factor of e or its scale, and to
+# the initial state, as one that knows it to within what was measured: negligible for what the data determine, while
+# what they do not determine, such as a current that has settled before it is read, stays where it is
 RIDGE = 1.0
 
 

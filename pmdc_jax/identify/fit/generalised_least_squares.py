@@ -52,25 +52,20 @@ def _is_exact(fitted: FittedRuns) -> bool:
 def _is_sparse(prepared: Prepared) -> bool:
     """Whether a training run has a sensor slower than the log."""
     tape = prepared.problem.tape
-    return any(reading_interval(_known(tape, run)) > 1 for run in training_indices(prepared))
+    return any(reading_interval(_known(tape, run)) > 1 for run in prepared.training_indices)
 
 
 def fit_whitened(
-    prepared: Prepared, start: Fit, white: Whitener, tolerance: float = TOLERANCE, useful: float = np.inf
+    prepared: Prepared, start: Fit, white: Whitener, tolerance: float = TOLERANCE, give_up_above: float = np.inf
 ) -> FittedRuns:
     """The problem with whitened residuals, and its solution started from a plain fit nearby.
 
-    **Arguments**: `tolerance` and `useful` as of `polish`.
+    **Arguments**: `tolerance` and `give_up_above` as of `polish`.
     """
     prepared = with_whitening(prepared, white)
-    known = reweighted(prepared.problem, start)
-    return FittedRuns(prepared, polish(prepared.problem, start.optimum, MAX_STEPS, tolerance, known, useful))
-
-
-def sum_of_squares(prepared: Prepared, polished: Fit) -> float:
-    """The sum of squared residuals of a fit over the training runs."""
-    residuals = np.asarray(polished.evaluation.residuals)
-    return float(np.square(residuals[prepared.problem.fitted_blocks]).sum())
+    at_start = reweighted(prepared.problem, start)
+    fit = polish(prepared.problem, start.optimum, MAX_STEPS, tolerance, at_start, give_up_above)
+    return FittedRuns(prepared, fit)
 
 
 def with_whitening(prepared: Prepared, white: Whitener) -> Prepared:
@@ -79,7 +74,7 @@ def with_whitening(prepared: Prepared, white: Whitener) -> Prepared:
     filters = [np.zeros((0, 2, 2))] * tape.runs
     # hold-out runs have no filter, only the scale of the noise
     scales = [np.diag(1 / noise)] * tape.runs
-    for run, A, S in zip(training_indices(prepared), white.filters, white.scales, strict=True):
+    for run, A, S in zip(prepared.training_indices, white.filters, white.scales, strict=True):
         both = np.ix_(*2 * [_measured_outputs(tape, run)])
         # from one reading to the next of a sensor slower than the log
         interval = reading_interval(_known(tape, run))
@@ -89,15 +84,10 @@ def with_whitening(prepared: Prepared, white: Whitener) -> Prepared:
     return prepared.with_problem(whitening=whitening)
 
 
-def training_indices(prepared: Prepared) -> list[int]:
-    """Indices of the training runs."""
-    return [run for run, role in enumerate(prepared.roles) if role == "train"]
-
-
 def residuals_of(prepared: Prepared, fit: Fit) -> list[Series]:
     """Measured minus simulated outputs, A and rad/s, of each training run in the order of time."""
     signal = -np.asarray(fit.evaluation.residuals) * fit.noise[:, None]
-    return [series_of(prepared.problem.tape, run, signal) for run in training_indices(prepared)]
+    return [series_of(prepared.problem.tape, run, signal) for run in prepared.training_indices]
 
 
 def series_of(tape: Tape, run: int, signal: np.ndarray) -> Series:

@@ -9,7 +9,7 @@ from ..noise.sensor_noise import ratio_to_noise
 from ..prepare import Prepared
 from ..problem import Evaluation
 from .fitted_runs import FittedRuns
-from .generalised_least_squares import series_of, training_indices
+from .generalised_least_squares import series_of
 
 # Root mean square of residuals, over the white noise of the sensor, up to which they are nothing but that noise
 MAX_NOISE_RATIO = 1.3
@@ -30,7 +30,7 @@ def negative_log_likelihood_of(prepared: Prepared, evaluation: Evaluation) -> fl
     **Source**: Ljung, "System Identification", 2nd edition, section 7.4.
     """
     tape, simulated, total = prepared.problem.tape, np.asarray(evaluation.simulated), 0.0
-    for run in training_indices(prepared):
+    for run in prepared.training_indices:
         measured = series_of(tape, run, np.asarray(tape.measured))
         expected = series_of(tape, run, simulated).values
         if not np.isfinite(expected).all():
@@ -45,7 +45,7 @@ def negative_log_likelihood_of(prepared: Prepared, evaluation: Evaluation) -> fl
 
 def leaves_only_noise(fitted: FittedRuns) -> bool:
     """Whether a fit leaves nothing of the training runs but the white noise of the sensors."""
-    prepared, training = fitted.prepared, training_indices(fitted.prepared)
+    prepared, training = fitted.prepared, fitted.prepared.training_indices
     tape = prepared.problem.tape
     measured = [tape.samples_of(k, np.asarray(tape.measured), len(prepared.runs[k])) for k in training]
     pairs = list(zip(measured, map(fitted.residuals, training), strict=True))

@@ -34,7 +34,7 @@ MAX_STEPS = 20
 # A step that raises the cost, by more than rounding does, is divided by this until a share so small is left of it that
 # the direction itself must be wrong
 MAX_ROUNDING, SHORTENING, MIN_STEP_SHARE = 1e-9, 4, 1e-3
-# From this evaluation on a polish is given up where it would not be useful even if the squares fell so many times
+# From this evaluation on a polish is given up where it would be of no use even if the squares fell so many times
 # further than the next step is predicted to reduce them
 FIRST_TO_GIVE_UP, OPTIMISM = 3, 3.0
 
@@ -59,7 +59,8 @@ class Fit(NamedTuple):
 
     @property
     def fitness(self) -> float:
-        """Mean square of the residuals in noise variances; infinite where the simulation fails."""
+        """The squared residuals in noise variances over `Problem.most_samples`: for a perfect model
+        `Problem.perfect_fitness`, and infinite where the simulation fails."""
         return self.optimum.fitness
 
     @property
@@ -73,20 +74,22 @@ def polish(
     start: Optimum,
     steps: int = MAX_STEPS,
     tolerance: float = TOLERANCE,
-    known: Evaluation | None = None,
-    useful: float = np.inf,
+    at_start: Evaluation | None = None,
+    give_up_above: float = np.inf,
 ) -> Fit:
     """Gauss-Newton iterations in which each output is weighted by the standard deviation of its own residuals.
 
-    It ends where no step within the bounds is predicted to lower the sum of squares by more than `tolerance`, in noise
-    variances, or by little more where the last one did not, or none is found that lowers it. A coordinate held at a
-    bound is released where the gradient points back inside. `known` is the evaluation at the start, if there is one
-    already. The fit is given up where its sum of whitened squares will hardly fall to `useful`, the largest that is of
-    any use.
+    It ends where no step within the bounds is predicted to lower the squares by more than `tolerance`, or by little
+    more where the last one did not, or where none lowers them. A coordinate at a bound is released where the gradient
+    points back inside.
+
+    **Arguments**: `start`; `steps`, at most; `tolerance`, in noise variances; `at_start`, the evaluation there, if
+    known; `give_up_above`, the sum of whitened squares from which on the fit is of no use: it is given up once it will
+    hardly fall so far.
     """
     ridge = ridge_of(problem)
     fixed, held = set(start.at_bound), None  # at a bound now, and as the last step was made
-    best = trial = _evaluate_weighted(problem, start.unknowns, known, start.starts)
+    best = trial = _evaluate_weighted(problem, start.unknowns, at_start, start.starts)
     step, share, gain = np.zeros(len(flatten(start.unknowns))), 1.0, np.inf
     costs = [best.cost]
     for _ in range(steps):
@@ -105,7 +108,7 @@ def polish(
             if fell <= tolerance and predicted <= MAX_PREDICTED * tolerance and fixed == held:
                 break
             held = frozenset(fixed)
-            if len(costs) >= FIRST_TO_GIVE_UP and best.matrix[-1, -1] - OPTIMISM * gain > useful:
+            if len(costs) >= FIRST_TO_GIVE_UP and best.matrix[-1, -1] - OPTIMISM * gain > give_up_above:
                 break
         elif share > MIN_STEP_SHARE:
             share /= SHORTENING  # the last step was too long

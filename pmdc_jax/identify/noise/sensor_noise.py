@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ...recordings.noise import noise_by_differences
 from ...recordings.resolution import quantum
-from ...recordings.white_noise import noise_by_differences
 
 # Least noise of an output, as a share of its root mean square: a simulation without noise needs some scale, too
 MIN_RELATIVE_NOISE = 1e-5

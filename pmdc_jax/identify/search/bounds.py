@@ -46,31 +46,43 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
     }
 
 
-def effect_bounds(
-    effects: Sequence[type[AbstractEffect]], recordings: Sequence[Recording]
-) -> dict[str, tuple[float, float]]:
-    """Search bounds of effect parameters by unit: three decades up to about the torque, speed, voltage or current of
-    the recordings, and time constants that their length and sampling can show. Parameters in other units, or in that
-    of a signal that was not recorded, keep the range of their table."""
+def effect_magnitudes(recordings: Sequence[Recording]) -> dict[str, float]:
+    """By unit, about the largest magnitude of an effect's parameter that is to be expected: the torque, speed, voltage
+    or current of the recordings. Without units of signals that were not recorded."""
     R, Kb, _ = _crude_armature(recordings)
     typical = _typical_magnitudes(recordings, R, Kb)
     volts, amperes = (_largest_rms(recordings, name) for name in ("voltage", "current"))
-    scales = {"N m": 3 * typical.torque, "N m s^2/rad^2": 3 * typical.torque / typical.speed**2, "rad/s": typical.speed}
+    largest = {
+        "N m": 3 * typical.torque,
+        "N m s^2/rad^2": 3 * typical.torque / typical.speed**2,
+        "rad/s": typical.speed,
+    }
     if volts:
-        scales["V"] = volts
+        largest["V"] = volts
     if amperes:
-        scales |= {"A": amperes, "1/A^2": 10 / amperes**2}
+        largest |= {"A": amperes, "1/A^2": 10 / amperes**2}
     if volts and amperes:
-        scales["1/W"] = 1 / (volts * amperes)
+        largest["1/W"] = 1 / (volts * amperes)
+    return largest
+
+
+def effect_bounds(
+    effects: Sequence[type[AbstractEffect]], recordings: Sequence[Recording]
+) -> dict[str, tuple[float, float]]:
+    """Search bounds of effect parameters by unit: three decades up to the `effect_magnitudes`, and time constants that
+    length and sampling of the recordings can show. Parameters in other units keep the range of their table."""
+    largest = effect_magnitudes(recordings)
+    shortest = min(run.sample_time for run in recordings) / 5
+    longest = 3 * max(run.duration for run in recordings)
     bounds = {}
     for effect in effects:
         for field, allowed in effect.ranges.items():
             low, high = allowed.lower, allowed.upper
-            if allowed.unit in scales:
-                high = min(high, scales[allowed.unit])
+            if allowed.unit in largest:
+                high = min(high, largest[allowed.unit])
                 low = max(low, high / DYNAMIC_RANGE if allowed.scale == "log" else -high)
             elif allowed.unit == "s":
-                low, high = max(low, typical.sample_time / 5), min(high, 3 * typical.duration)
+                low, high = max(low, shortest), min(high, longest)
             # the range is empty if the signal of this unit is too small for the effect
             bounds[f"{effect.name}.{field}"] = (low, high) if low < high else (allowed.lower, allowed.upper)
     return bounds

@@ -58,8 +58,8 @@ INITIAL_CANDIDATES = 256
 # ... with this standard deviation in the unit cube: the best of that many is not far from the optimum.
 INITIAL_SPREAD = 0.15
 
-# The search may stop after some generations, once the best tenth of the population agree this well, in natural
-# logarithms.
+# The search may stop after some generations, once the best tenth of the population agree this well in every coordinate,
+# most of which are natural logarithms.
 MIN_GENERATIONS, AGREEMENT = 10, 0.1
 # Most candidates that are kept
 MAX_CANDIDATES = 2000
@@ -101,8 +101,9 @@ def global_search(
     """Search the bounds of `parameters` for motors that reproduce the tape.
 
     The fitness is the paper's equation (10), F1 + a F2 (mean square speed error plus a times mean square current
-    error), divided by the noise variance of the speed. With a the ratio of the noise variances of speed and current, a
-    perfect model has fitness 2, or 1 with a single output. Failed simulations count as infinitely bad.
+    error, both over the samples of the output that has more), divided by the noise variance of the speed. With a the
+    ratio of the noise variances of speed and current, a perfect model has fitness 2, or 1 with a single output. Failed
+    simulations count as infinitely bad.
 
     **Arguments**: `noise`, standard deviations of current (A) and speed (rad/s); `method`, a key of `METHODS`;
     `population` and `generations`, by default the method's own; `progress`, called in every generation.
@@ -209,7 +210,7 @@ class _Fitness:
         self.low, self.high = np.asarray(parameters.lower), np.asarray(parameters.upper)
         # transferred to the device once instead of in every generation
         self.tape: Tape = jax.tree.map(jnp.asarray, tape)
-        self.samples = np.maximum(np.asarray(tape.weight).sum((0, 2)), 1.0)
+        self.most_samples = max(float(np.asarray(tape.weight).sum((0, 2)).max()), 1.0)
 
     def scattered(self, cube: np.ndarray, size: int) -> np.ndarray:
         """The fitness of many candidates, in populations of about `size`, for which the simulation is compiled."""
@@ -219,7 +220,7 @@ class _Fitness:
     def __call__(self, cube: np.ndarray) -> np.ndarray:
         motors = _motors(self.parameters, self.low + (self.high - self.low) * cube)
         errors = np.stack([np.asarray(e) for e in squared_errors(motors, self.tape)])
-        mean_squares = errors / (self.samples * self.noise**2)[:, None]
+        mean_squares = errors / self.noise[:, None] ** 2 / self.most_samples
         return np.minimum(mean_squares.sum(0), 1e300)
 
 

@@ -15,7 +15,8 @@ from ..fit.polish import Fit
 from ..problem import Problem
 
 Z_95 = NormalDist().inv_cdf(0.975)  # of a 95 % interval, in standard errors
-# A direction with at least this standard error, of a logarithm, counts as unseen
+# A direction with at least this standard error counts as unseen: of a logarithm, or of a linear coordinate, whose unit
+# is about the largest value that is to be expected
 MIN_UNSEEN_STDERR = 0.5
 # Stretches into which a run is summed for its long-run variance. Measured on white and on three kinds of slow noise,
 # 60 x 6 runs of 5,000 samples each: 2,000 and 500 miss slow noise (standard errors down to a fifth), 50 scatters.
@@ -26,7 +27,7 @@ JACKKNIFE_PARTS = 10
 MAX_PART_SHARE = 0.9
 # Probability that white noise alone makes the parts disagree so much that the intervals follow them
 SIGNIFICANCE = 0.05
-# Largest standard error of a logarithm along an unseen direction: a factor of twenty
+# Largest standard error along an unseen direction: of a logarithm, a factor of twenty
 MAX_UNSEEN_STDERR = 3.0
 
 

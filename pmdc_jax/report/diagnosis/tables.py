@@ -55,7 +55,7 @@ def effect_rows(diagnosis: Diagnosis) -> list[EffectRow]:
         about = {
             "effect": EFFECTS[effect.name].label,
             "equation": effect.equation,
-            "formula": formula_text(effect.name),
+            "formula": formula_text(effect.name, effect.parameters),
             "chance": p_value_words(effect.p_value),
         }
         for field, estimate in effect.parameters.items():

@@ -7,6 +7,7 @@ from typing import Any
 from attrs import asdict, filters
 
 from ...identify.identification import Identification, RunFit, Search
+from ...motor_file import COVARIANCE_OF
 from ..json import plain
 from .sentences import summary
 
@@ -23,8 +24,9 @@ def identification_json(identification: Identification) -> dict[str, Any]:
             "seed": identification.seed,
             "seconds": identification.seconds,
             "search": _search(identification.search),
-            "covariance_of_logarithms": {
-                "parameters": identification.covariance_names,
+            "covariance": {
+                "of": COVARIANCE_OF,
+                "names": identification.covariance_names,
                 "matrix": identification.covariance,
             },
             "findings": [asdict(one, filter=filters.exclude("modelled_by")) for one in identification.findings],

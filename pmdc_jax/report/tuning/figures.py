@@ -113,7 +113,7 @@ def robust_figure(tuning: Tuning) -> go.Figure:
     """Overshoot against settling time of every drawn motor that settles: a panel for each controller, because their
     clouds may be small and far apart."""
     names, clouds = [], []
-    for one in tuning.candidates:
+    for one in (tuning.tuned, tuning.textbook):
         if one.robust is not None:
             settles = np.isfinite(one.robust.settling)
             names.append(one.name)

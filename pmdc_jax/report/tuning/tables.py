@@ -40,10 +40,10 @@ def gain_rows(tuning: Tuning) -> list[tuple[str, str, str]]:
 
 
 def comparison(tuning: Tuning) -> list[tuple[str, ...]]:
-    """A row for each candidate (tuned, and textbook rule if any), and one for the physical limit."""
+    """A row for each candidate (tuned, and by a textbook rule), and one for the physical limit."""
     fastest = tuning.fastest_possible_settling
     last = ("fastest possible", significant(1e3 * fastest, 4), "1", *(UNKNOWN,) * 4)
-    return [*(_candidate_row(one, fastest) for one in tuning.candidates), last]
+    return [*(_candidate_row(one, fastest) for one in (tuning.tuned, tuning.textbook)), last]
 
 
 def _candidate_row(one: EvaluatedController, fastest: float) -> tuple[str, ...]:

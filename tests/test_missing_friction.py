@@ -12,8 +12,8 @@ from scipy.signal import lsim
 from benchmarks import virtual_bench as vb
 from experiments.bench import recording
 from pmdc_jax import Motor, identify
-from pmdc_jax.identify.friction_test import MissingFriction, _load_filter, _load_response, friction_messages
 from pmdc_jax.identify.identification import Identification
+from pmdc_jax.identify.missing_friction import MissingFriction, _load_filter, _load_response, friction_messages
 from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate import Tape
 

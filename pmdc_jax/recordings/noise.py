@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 # Median absolute value of a normal variable of unit variance
-MEDIAN = 0.6745
+NORMAL_MEDIAN = 0.6745
 
 
 def noise_by_differences(order: int, *signals: Float[np.ndarray, " _"]) -> float:
@@ -23,4 +23,4 @@ def noise_by_differences(order: int, *signals: Float[np.ndarray, " _"]) -> float
     """
     differences = np.concatenate([np.diff(signal, order) for signal in signals] or [np.empty(0)])
     sizes = np.abs(differences[np.isfinite(differences)])
-    return float(np.median(sizes) / (MEDIAN * np.sqrt(comb(2 * order, order)))) if len(sizes) else 0.0
+    return float(np.median(sizes) / (NORMAL_MEDIAN * np.sqrt(comb(2 * order, order)))) if len(sizes) else 0.0

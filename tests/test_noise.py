@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pmdc_jax.recordings.white_noise import noise_by_differences
+from pmdc_jax.recordings.noise import noise_by_differences
 
 
 @pytest.mark.parametrize("order", [2, 3, 4])

@@ -18,7 +18,7 @@ from scipy.signal import cont2discrete, lfilter, ss2tf
 from ..motor import Motor
 from ..recordings.recording import OVER_LAST
 from ..simulate import UNKNOWNS_PER_RUN, Tape
-from .fit.generalised_least_squares import residuals_of, series_of, series_of_samples, training_indices
+from .fit.generalised_least_squares import residuals_of, series_of, series_of_samples
 from .fit.polish import Fit
 from .identification import Identification
 from .noise.noise_model import Series, Whitener, fit_whitener, scaling_whitener
@@ -89,11 +89,11 @@ def _regression_columns(prepared: Prepared, fit: Fit) -> list[Series]:
     the residual."""
     problem, tape = prepared.problem, prepared.problem.tape
     motor, count = problem.parameters(fit.coordinates), len(problem.free)
-    of_grid = {tape.grid_of(run): run for run in training_indices(prepared)}
+    of_grid = {tape.grid_of(run): run for run in prepared.training_indices}
     filters = {grid: _load_filter(motor, tape, run) for grid, run in of_grid.items()}
     J = np.asarray(fit.evaluation.jacobian) * fit.noise[:, None, None]
     rows = []
-    for run, residual in zip(training_indices(prepared), residuals_of(prepared, fit), strict=True):
+    for run, residual in zip(prepared.training_indices, residuals_of(prepared, fit), strict=True):
         speed = np.asarray(fit.evaluation.simulated)[tape.blocks_of(run), 1].ravel()
         friction = _load_response(filters[tape.grid_of(run)], np.sign(speed))
         if (averaging := prepared.runs[run].averaging) is not None:
