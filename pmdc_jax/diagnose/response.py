@@ -54,9 +54,9 @@ def trajectory_of(
     current.
     """
     current, speed = simulated[:, 0].T, simulated[:, 1].T
-    drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid], tape.drive)
+    drive = tape.block_drive
     current = drive.voltage * current + drive.current * jnp.asarray(tape.value).T
-    step = jnp.asarray(tape.sample_time)[tape.grid][:, None]
+    step = tape.block_sample_time[:, None]
     # the turn in a sample is its mean speed times its length
     next_speed = jnp.append(simulated[:, 1].reshape(-1)[1:], 0.0).reshape(tape.turn.shape)
     turn = jnp.where(jnp.isnan(tape.turn), (simulated[:, 1] + next_speed) / 2 * step, tape.turn)
@@ -103,7 +103,7 @@ def input_gains(motor: Motor, tape: Tape) -> tuple[Outputs, Outputs]:
     """The change of current and speed within one sample by 1 V, and by a torque of 1 N m that opposes motion."""
     propagator, _ = _propagator_and_inputs(motor, tape)
     ones = jnp.ones((tape.value.shape[1], 1, 1))
-    voltage = jnp.asarray(tape.drive.voltage)[tape.grid]
+    voltage = tape.block_drive.voltage
     return ones * propagator.inputs[:, 0, 0] * voltage, ones * propagator.inputs[:, 1, 0]
 
 
@@ -117,7 +117,7 @@ def respond(
     """
     propagator, _ = _propagator_and_inputs(motor, tape)
     transition = propagator.transition[:, :, 0]
-    slowing = jnp.exp(-motor.f / motor.J * jnp.asarray(tape.sample_time)[tape.grid])
+    slowing = jnp.exp(-motor.f / motor.J * tape.block_sample_time)
 
     def step(
         x: Columns,

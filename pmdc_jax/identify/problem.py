@@ -113,7 +113,7 @@ class Problem(eqx.Module):
         """Which coordinates and which of its own unknowns each run can determine."""
         tape = self.tape
         first = jnp.argmax(jnp.asarray(tape.run)[None, :] == jnp.arange(tape.runs)[:, None], axis=1)
-        drive = jax.tree.map(lambda share: jnp.asarray(share)[tape.grid][first] > 0, tape.drive)
+        drive = jax.tree.map(lambda share: share[first] > 0, tape.block_drive)
         angle = self.angle_unknown & self.depends_on_angle
         load = jnp.asarray(tape.load_unknown)
         twist = self.has_spring & drive.free

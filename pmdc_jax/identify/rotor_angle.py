@@ -43,7 +43,7 @@ def with_rotor_angle(problem: Problem, fit: Fit) -> Problem:
     tape, simulated = problem.tape, np.asarray(fit.evaluation.simulated)
     rotor = np.asarray(rotor_outputs(problem, fit))
     turn, run = np.array(tape.turn), np.asarray(tape.run)
-    sample_time = np.asarray(tape.sample_time)[np.asarray(tape.grid)]
+    sample_time = np.asarray(tape.block_sample_time)
     for index in range(tape.runs):
         mine = (run == index) & ~np.isnan(turn).all(1)
         measured, weight = (np.asarray(x)[mine, 1].reshape(-1) for x in (tape.measured, tape.weight))

@@ -80,7 +80,7 @@ def reported(
     last, share = before, None
     delayed = delay is not None or tape.later is not None
     if delayed or reading is not None:
-        sample_time = jnp.repeat(jnp.asarray(tape.sample_time)[tape.grid], BLOCK)
+        sample_time = jnp.repeat(tape.block_sample_time, BLOCK)
         later = None if tape.later is None else jnp.repeat(jnp.asarray(tape.later)[tape.grid], BLOCK)
         behind = samples_behind(delay, sample_time, reading, later)
         last = before - jnp.floor(behind).astype(int)

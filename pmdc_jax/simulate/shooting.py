@@ -187,7 +187,7 @@ def _guessed_starts(motor: Motor, run_unknowns: RunUnknowns, tape: Tape, initial
     from the measured speed."""
     known = (tape.weight > 0).any(-1).T
     current, speed = jnp.where(known, tape.measured[:, :, 0].T, initial[:, :2].T)
-    length = jnp.asarray(tape.sample_time)[tape.grid]
+    length = tape.block_sample_time
     by_speed = tape.measured[:, 1] * tape.weight[:, 1] * length[:, None]
     turned = jnp.cumsum(jnp.where(jnp.isnan(tape.turn), by_speed, tape.turn).sum(-1))
     before = jnp.append(0.0, turned)

@@ -77,31 +77,52 @@ def contact_correction(
     first, slope = jax.jvp(overlap_and_compression, (before,), (rate,))
     last, slope = overlap_and_compression(after), slope * step
     quadratic = last - first - slope
-    # teeth touch once overlap and compression have both risen through zero, and part once compression falls through it
-    # (if only overlap has fallen, compression has done so and risen again: such a graze is taken to part at the start)
-    direction = jnp.where(touched, -1.0, 1.0)
-    crosses = (direction * first < 0) & (direction * last > 0)
-    root = jnp.sqrt(jnp.where(crosses, slope**2 - 4 * quadratic * first, 1.0))
-    denominator = jnp.where(crosses, direction * slope + root, 1.0)
-    # shares of the step
-    instants = jnp.where(crosses, -2 * direction * first / denominator, 0.0)
-    instant = jnp.where(touched, instants[1], jnp.max(instants, axis=0))
-    remaining = 1 - instant
+    instant = _instant_of_switch(first, slope, last, touched)
     switches = jnp.where(touched, jnp.any(last <= 0, axis=0), jnp.all(last > 0, axis=0))
-    sign = jnp.where(switches, direction * side, 0.0)
+    sign = jnp.where(switches, jnp.where(touched, -side, side), 0.0)
     torque = sign * (first[1] + instant * (slope[1] + instant * quadratic[1]))
     torque_slope = sign * (slope[1] + 2 * instant * quadratic[1])
-    torque_curvature = sign * 2 * quadratic[1]
-    # the torque varies as a parabola: the response to a constant one, integrated once for its slope and twice for its
-    # curvature
-    sizes, power = [], remaining
-    for p in range(1, len(contact) + 1):
-        by_slope = torque_slope + remaining / (p + 2) * torque_curvature
-        sizes.append(power * (torque + remaining / (p + 1) * by_slope))
-        power = power * remaining
+    sizes = _response_to_parabola(len(contact), torque, torque_slope, sign * 2 * quadratic[1], 1 - instant)
     sizes = computed_once(sizes, jnp.all(step > 0))
     by_state = jnp.moveaxis(contact, 1, 0)
     return tuple(reduce(add, (size * term for size, term in zip(sizes, terms, strict=True))) for terms in by_state)
+
+
+def _instant_of_switch(
+    first: Float[Array, "2 *#batch"],
+    slope: Float[Array, "2 *#batch"],
+    last: Float[Array, "2 *#batch"],
+    touched: Bool[Array | np.ndarray, "*#batch"],
+) -> Scalars:
+    """The share of a step after which teeth touch or part, by parabolas of overlap and compression over it: from their
+    first value and slope, per step, to the last value.
+
+    They touch once both have risen through zero, and part once compression falls through it. If only overlap has
+    fallen, compression has done so and risen again: such a graze is taken to part at the start.
+    """
+    direction = jnp.where(touched, -1.0, 1.0)
+    crosses = (direction * first < 0) & (direction * last > 0)
+    quadratic = last - first - slope
+    root = jnp.sqrt(jnp.where(crosses, slope**2 - 4 * quadratic * first, 1.0))
+    denominator = jnp.where(crosses, direction * slope + root, 1.0)
+    instants = jnp.where(crosses, -2 * direction * first / denominator, 0.0)
+    return jnp.where(touched, instants[1], jnp.max(instants, axis=0))
+
+
+def _response_to_parabola(
+    powers: int, torque: Scalars, slope: Scalars, curvature: Scalars, remaining: Scalars
+) -> list[Scalars]:
+    """The sizes of a response to powers of the time (see `contact_response`) after a torque that varies as a parabola:
+    the response to a constant one, integrated once for its slope and twice for its curvature.
+
+    **Arguments**: `remaining`, the share of the step for which the torque acts; `slope` and `curvature` per step.
+    """
+    sizes, power = [], remaining
+    for p in range(1, powers + 1):
+        by_slope = slope + remaining / (p + 2) * curvature
+        sizes.append(power * (torque + remaining / (p + 1) * by_slope))
+        power = power * remaining
+    return sizes
 
 
 def stick_or_reverse(

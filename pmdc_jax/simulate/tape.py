@@ -9,6 +9,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -95,7 +97,7 @@ class Tape(eqx.Module):
         sample_times, drives, free, later = (np.array(each) for each in zip(*grids, strict=True))
         empty_runs = _power_of_two(len(runs)) - len(runs)
 
-        def of_runs(values: Iterable[float | Sequence[float]]) -> np.ndarray:
+        def padded(values: Iterable[float | Sequence[float]]) -> np.ndarray:
             known = np.array(list(values))
             return np.append(known, np.zeros((empty_runs, *known.shape[1:]), known.dtype), axis=0)
 
@@ -105,13 +107,13 @@ class Tape(eqx.Module):
             **_laid_in_blocks(runs, grids, empty_runs, rises, follow),
             sample_time=sample_times,
             drive=Drive(voltage, current, torque, free=np.where(free, 1.0, 0.0)),
-            initial=of_runs(run.initial for run in runs),
-            averaging=of_runs(map(_averaging_shares, recordings)) if averaged else None,
-            span=np.maximum(of_runs(run.span for run in runs), 1) if slow else None,
+            initial=padded(run.initial for run in runs),
+            averaging=padded(map(_averaging_shares, recordings)) if averaged else None,
+            span=np.maximum(padded(run.span for run in runs), 1) if slow else None,
             later=later if np.any(later) else None,
-            load_unknown=of_runs(r.load is None and not unloaded and not r.held for r in recordings),
-            angle=of_runs(_first(r.angle) for r in recordings),
-            angle_known=of_runs(r.angle is not None for r in recordings),
+            load_unknown=padded(r.load is None and not unloaded and not r.held for r in recordings),
+            angle=padded(_first(r.angle) for r in recordings),
+            angle_known=padded(r.angle is not None for r in recordings),
             reading=None if timing.reading is None else np.asarray(timing.reading),
             longest=2.0 ** math.ceil(math.log2(sample_times.max() / 1e-3) - 1e-6) * 1e-3,
         )
@@ -120,6 +122,16 @@ class Tape(eqx.Module):
     def runs(self) -> int:
         """Number of runs, including the empty ones."""
         return self.initial.shape[0]
+
+    @property
+    def block_sample_time(self) -> Float[Array | np.ndarray, " blocks"]:
+        """The sample time of each block, s."""
+        return jnp.asarray(self.sample_time)[self.grid]
+
+    @property
+    def block_drive(self) -> Drive:
+        """The drive of each block."""
+        return jax.tree.map(lambda share: jnp.asarray(share)[self.grid], self.drive)
 
     def of_runs(self, runs: Sequence[int]) -> Tape:
         """The tape of some runs, padded to one of few array shapes."""

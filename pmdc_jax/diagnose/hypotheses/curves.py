@@ -133,7 +133,7 @@ def _late_current(tape: Tape, trajectory: Trajectory) -> Term:
     current = np.asarray(trajectory.current).T
     before = np.append(current.flat[0], current.flat[:-1]).reshape(current.shape)
     before[:, 0] = np.where(tape.begins, current[:, 0], before[:, 0])
-    rate = ((current - before) / np.asarray(tape.sample_time)[tape.grid][:, None]).T
+    rate = ((current - before) / np.asarray(tape.block_sample_time)[:, None]).T
     largest = float(np.quantile(np.abs(rate), 0.95)) + 1e-9
     knots = np.array([-largest, 0, largest])
     curve = Curve("sensor", "current_rate", "A", knots, shapes=knots[:, None])
