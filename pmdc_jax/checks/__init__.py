@@ -1,1 +1,1 @@
-"""Checks of recordings before anything is fitted."""
+"""Checks of recordings before anything is fitted, and the removal of samples that are no measurements."""

@@ -55,7 +55,7 @@ def trajectory_of(
     """
     current, speed = simulated[:, 0].T, simulated[:, 1].T
     drive = tape.block_drive
-    current = drive.voltage * current + drive.current * jnp.asarray(tape.value).T
+    current = jnp.asarray(drive.voltage * current + drive.current * jnp.asarray(tape.value).T)
     step = tape.block_sample_time[:, None]
     # the turn in a sample is its mean speed times its length
     next_speed = jnp.append(simulated[:, 1].reshape(-1)[1:], 0.0).reshape(tape.turn.shape)
