@@ -42,7 +42,8 @@ class MissingFriction(NamedTuple):
 
     friction_Nm: float
     z_score: float  # its value in standard errors
-    bias: Float[np.ndarray, " parameters"]  # of the search coordinates without friction in the model
+    # without friction in the model, of the logarithms of positive parameters, and of others in SI
+    bias: Float[np.ndarray, " parameters"]
 
 
 def missing_friction(prepared: Prepared, fit: Fit) -> MissingFriction | None:
@@ -57,8 +58,10 @@ def missing_friction(prepared: Prepared, fit: Fit) -> MissingFriction | None:
         return None
     regression = _regress(rows, fit_whitener(regression.residuals), count)
     z_score = regression.z_score(count)
-    friction, bias = float(regression.coefficients[count]), regression.coefficients[:count]
-    return MissingFriction(friction, z_score, bias) if z_score > MIN_Z_SCORE else None
+    if not z_score > MIN_Z_SCORE:
+        return None
+    *bias, friction = regression.coefficients[: count + 1]
+    return MissingFriction(float(friction), z_score, np.array(bias) * problem.parameters.scale)
 
 
 def friction_messages(missing: MissingFriction | None, identification: Identification) -> Iterator[str]:
