@@ -259,6 +259,18 @@ def test_an_effect_of_little_expected_gain_is_added_only_if_it_leaves_little(lea
     assert [signal.effect for signal in call.args[1]] == list(gains)[:2]
 
 
+def test_no_simpler_form_is_added_to_an_effect():
+    """A gear with play has a shaft, and Stribeck friction has Coulomb friction."""
+    gains = {"shaft_compliance": 90.0, "coulomb_friction": 80.0, "speed_sensor_lag": 70.0}
+    found = assessment_of(gains, unexplained=np.inf)
+    found.p_value, found.may_be_model_form_error, found.is_sensor_error = (0.0, lambda model: False, lambda: False)
+    refits = Mock(spec=Refits)
+    current = Mock(spec=Model, effects=("gear_backlash", "stribeck_friction"))
+    Proposals(refits, lambda model: found, set()).by_largest_gain(current)
+    [call] = refits.with_signals.call_args_list
+    assert [signal.effect for signal in call.args[1]] == ["speed_sensor_lag"]
+
+
 def test_signals_without_any_gain_are_no_effect():
     """As under a constant voltage without noise."""
     nothing = Signal(0.0, 0.0, Mock(spec=Curve), Mock(spec=Block))

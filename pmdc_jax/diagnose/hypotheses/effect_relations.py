@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
+
 from .trials import TRIALS
 
 # By richer effect, the effects that it contains and replaces
@@ -20,6 +22,12 @@ def are_rivals(a: set[str], b: set[str]) -> bool:
     """Whether two sets, `a` not empty, are alternatives: not the same torque, neither a part of the other, and neither
     the other with an effect in a simpler form."""
     return bool(a) and not (a <= b or b <= a or _are_same_torque(a, b) or _is_part_of_other(a, b))
+
+
+def covered_by(effects: Set[str]) -> set[str]:
+    """Some effects, and the simpler forms of them, which add nothing to them: a gear with play has a shaft."""
+    contained = {simple for e in effects for simple in CONTAINS.get(e, ())}
+    return {*effects, *contained, *(simple for simple, fuller in FULLER.items() if fuller.effect in effects)}
 
 
 def is_simpler_form(a: set[str], b: set[str]) -> bool:

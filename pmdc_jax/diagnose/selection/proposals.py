@@ -12,7 +12,7 @@ from operator import attrgetter
 from ...effects import EFFECTS
 from ..evidence.assessment import FALSE_ALARM, REFIT_ONLY, TRIAL_SHARE, Assessment
 from ..evidence.signals import Signal
-from ..hypotheses.effect_relations import CONTAINS
+from ..hypotheses.effect_relations import CONTAINS, covered_by
 from ..hypotheses.trials import TRIALS
 from ..model import MAX_EFFECTS, Model
 from .compare import DECISIVE_RATIO
@@ -80,8 +80,8 @@ class Proposals:
         if not _may_add_effect(current, assessment):
             return []
         if current.effects:
-            others = [s for s in clear_signals(assessment) if s.effect not in current.effects]
-            likeliest = of_largest_gain(others)
+            present = covered_by(set(current.effects))
+            likeliest = of_largest_gain([s for s in clear_signals(assessment) if s.effect not in present])
         else:
             likeliest = shortlist(current, assessment)
         return self._with_signals(current, likeliest)
@@ -94,8 +94,8 @@ class Proposals:
             return []
         present = set(current.effects)
         earlier = [self.assess(m) for m in self.superseded if set(m.effects) < present]
-        clear = {s.effect for before in earlier for s in clear_signals(before)}
-        others = [s for s in assessment.candidate_signals if s.effect in clear - present]
+        absent = {s.effect for before in earlier for s in clear_signals(before)} - covered_by(present)
+        others = [s for s in assessment.candidate_signals if s.effect in absent]
         return self._with_signals(current, of_largest_gain(others))
 
     def by_unfiltered_misfit(self, current: Model) -> Proposed:
@@ -107,7 +107,7 @@ class Proposals:
             return []
         unfiltered = assessment.screen._replace(evidence=assessment.screen.unfiltered)
         least = MIN_UNFILTERED_SHARE * assessment.screen.unfiltered.regress().squares
-        promising = most_promising(assessment.unfiltered_signals(), set(current.effects), least)
+        promising = most_promising(assessment.unfiltered_signals(), covered_by(set(current.effects)), least)
         tried = self.refits.with_signals(current, promising, unfiltered)
         return [m for m in tried if m is not None and m.fit.fitness < decisive]
 
@@ -116,7 +116,8 @@ class Proposals:
         assessment = self.assess(current)
         if len(current.effects) < MAX_EFFECTS or assessment.p_value >= FALSE_ALARM or assessment.is_negligible(current):
             return []
-        others = [s for s in clear_signals(assessment) if s.effect not in current.effects]
+        present = covered_by(set(current.effects))
+        others = [s for s in clear_signals(assessment) if s.effect not in present]
         if not others:
             return []
         new = max(others, key=attrgetter("gain")).effect

@@ -9,7 +9,7 @@ import numpy as np
 from ...effects import EFFECTS
 from ..evidence.assessment import EFFECT_SHARE, FALSE_ALARM, MODEL_FORM_SHARE, TRIAL_SHARE, Assessment
 from ..evidence.signals import Signal
-from ..hypotheses.effect_relations import CONTAINS, with_split_friction
+from ..hypotheses.effect_relations import CONTAINS, covered_by, with_split_friction
 from ..hypotheses.trials import TRIALS
 from ..model import Model
 
@@ -34,7 +34,8 @@ def additional_effects(current: Model, assessment: Assessment) -> list[Signal]:
     If what is left may be the model-form error of the clearest effect, only effects with `Trial.starts` are tried,
     which do more than their columns show; and none if it is a harmonic, which the teeth of a gear would imitate.
     """
-    ranked = [s for s in clear_signals(assessment) if s.effect not in current.effects]
+    present = covered_by(set(current.effects))
+    ranked = [s for s in clear_signals(assessment) if s.effect not in present]
     if _may_be_form_of_clearest(current, assessment):
         if assessment.is_harmonic_of(current):
             return []
