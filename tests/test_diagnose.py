@@ -264,7 +264,7 @@ def test_no_simpler_form_is_added_to_an_effect():
     gains = {"shaft_compliance": 90.0, "coulomb_friction": 80.0, "speed_sensor_lag": 70.0}
     found = assessment_of(gains, unexplained=np.inf)
     found.p_value, found.may_be_model_form_error, found.is_sensor_error = (0.0, lambda model: False, lambda: False)
-    refits = Mock(spec=Refits)
+    refits = Mock(spec=Refits, with_signals=Mock(return_value=[]))
     current = Mock(spec=Model, effects=("gear_backlash", "stribeck_friction"))
     Proposals(refits, lambda model: found, set()).by_largest_gain(current)
     [call] = refits.with_signals.call_args_list
