@@ -34,10 +34,11 @@ from pmdc_jax.diagnose.judgement import _by_evidence, implausible_effect, may_be
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
 from pmdc_jax.diagnose.response import respond, sensor_changes, state_increments, trajectory_of
 from pmdc_jax.diagnose.selection import naming, proposals
-from pmdc_jax.diagnose.selection.compare import Fitted
+from pmdc_jax.diagnose.selection.compare import Comparison, Fitted
 from pmdc_jax.diagnose.selection.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.selection.proposals import Proposals
 from pmdc_jax.diagnose.selection.refits import Refits
+from pmdc_jax.diagnose.selection.rivals import _better_by_own_filter
 from pmdc_jax.diagnose.selection.shortlist import most_promising, shortlist
 from pmdc_jax.diagnose.selection.starts import Starts, common_phase
 from pmdc_jax.effects import EFFECTS, ShaftCompliance
@@ -321,6 +322,24 @@ def test_a_full_set_exchanges_the_effect_in_the_same_equation(monkeypatch, count
     assert refits.without.call_count == exchanges
     if exchanges:
         refits.without.assert_called_with(current, "asymmetric_friction", "white")
+
+
+@pytest.mark.parametrize(
+    ("misfit", "preferred_by_own", "is_rival"), [(0.6, True, True), (0.6, False, False), (1.1, True, False)]
+)
+def test_a_gear_that_its_own_filter_prefers_is_a_rival_of_a_shaft(misfit, preferred_by_own, is_rival):
+    shaft = Mock(spec=Model, effects=("shaft_compliance",), fit=Mock(fitness=1.0))
+    gear = Mock(spec=Model, effects=("gear_backlash",), fit=Mock(fitness=misfit), is_possible=True)
+
+    def ranked(models, white):
+        gear_first = preferred_by_own and white == "gear's"
+        criteria = {shaft: 100.0, gear: 50.0 if gear_first else 150.0}
+        return [Fitted(m, criteria[m], criteria[m]) for m in sorted(models, key=criteria.get)]
+
+    comparison = Mock(spec=Comparison, ranked=ranked, filter_of=lambda model: "gear's" if model is gear else "shaft's")
+    refits = Mock(spec=Refits, models={frozenset({"gear_backlash"}): gear})
+    found = list(_better_by_own_filter(shaft, ["shaft_compliance"], refits, comparison))
+    assert found == ([gear] if is_rival else [])
 
 
 def test_an_unstable_motor_suggests_no_experiment(x64):

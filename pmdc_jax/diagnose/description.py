@@ -43,7 +43,7 @@ def effects_found(naming: Naming, final: Identification) -> tuple[EffectFound, .
 def rival_sets(naming: Naming) -> tuple[tuple[str, ...], ...]:
     """The other sets that explain the runs as well as the effects found, if any were."""
     rivals = naming.rivals if naming.chosen.effects else ()
-    return tuple(tuple(sorted(rival.effects)) for rival in rivals)
+    return tuple(dict.fromkeys(tuple(sorted(rival.effects)) for rival in rivals))
 
 
 def regions_of_misfit(naming: Naming) -> tuple[Region, ...]:
