@@ -172,6 +172,25 @@ def test_the_averaging_of_counts_is_recognised_by_their_noise():
     assert mean == OVER_LAST and np.isfinite(min_gain)
 
 
+def test_the_noise_of_a_mean_is_recognised_beside_a_resonance():
+    """As of teeth that rattle, whose power in the middle of the spectrum is larger than that of the counts."""
+    rng = np.random.default_rng(7)
+    numerator, denominator = signal.iirpeak(0.5, 30.0)
+    rattle = 5.0 * signal.lfilter(numerator, denominator, rng.standard_normal(12000))
+    slow = 300 * ndimage.gaussian_filter1d(rng.standard_normal(12000), 20.0)
+    counts = np.floor(np.cumsum(slow + rattle))
+    assert averaging_of_counts([np.diff(counts)]) == (OVER_LAST, -np.inf)
+
+
+def test_noisy_counts_are_no_certain_mean():
+    """None of 300 short records of instantaneous speeds, rounded to counts."""
+    rng = np.random.default_rng(8)
+    for deviation in np.repeat([0.3, 1.0, 3.0], 100):
+        slow = 300 * ndimage.gaussian_filter1d(rng.standard_normal(1500), 20.0)
+        _, min_gain = averaging_of_counts([np.round(slow + deviation * rng.standard_normal(1500))])
+        assert np.isfinite(min_gain), deviation
+
+
 def test_differences_over_two_samples_are_recognised_by_missing_power_at_the_nyquist_frequency():
     rng = np.random.default_rng(4)
     speed = 300 * ndimage.gaussian_filter1d(rng.standard_normal(4000), 2.0)
