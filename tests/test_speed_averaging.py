@@ -173,10 +173,10 @@ def test_the_averaging_of_counts_is_recognised_by_their_noise():
 
 
 def test_the_noise_of_a_mean_is_recognised_beside_a_resonance():
-    """As of teeth that rattle, whose power in the middle of the spectrum is larger than that of the counts."""
+    """As of teeth that rattle, whose power in the middle of the spectrum is that of the counts."""
     rng = np.random.default_rng(7)
     numerator, denominator = signal.iirpeak(0.5, 30.0)
-    rattle = 5.0 * signal.lfilter(numerator, denominator, rng.standard_normal(12000))
+    rattle = signal.lfilter(numerator, denominator, rng.standard_normal(12000))
     slow = 300 * ndimage.gaussian_filter1d(rng.standard_normal(12000), 20.0)
     counts = np.floor(np.cumsum(slow + rattle))
     assert averaging_of_counts([np.diff(counts)]) == (OVER_LAST, -np.inf)
