@@ -8,14 +8,15 @@ import numpy as np
 
 from ..motor import Motor
 from ..recordings.recording import AROUND, OVER_BOTH, OVER_LAST
+from ..simulate import Timing
 from .identification import RunFit, Search
 from .noise.sensor_noise import rms
 from .prepare import Prepared
 from .run_fits import of_training
 
-# An unknown load is worth a message from this share of the motor's torque on (root mean square),
+# Least share of the motor's torque (root mean square) from which an unknown load is worth a message
 MIN_LOAD_SHARE = 0.02
-# if it differs by less than this share of itself between the runs
+# Largest difference of an unknown load between the runs, over itself, for the same
 MAX_LOAD_SPREAD = 0.2
 # Initial rise of a winding's resistance that is worth a message
 MIN_INITIAL_RISE = 0.02
@@ -54,7 +55,7 @@ def _corrections(prepared: Prepared) -> list[str]:
         f"the sensor of the {output} picks up mains hum of {amplitude:.3g} {HUM_UNITS[output]}: it was removed"
         for output, amplitude in prepared.mains_hum.items()
     ]
-    acts = "steps between samples" if prepared.stepped else prepared.timing.what
+    acts = "steps between samples" if prepared.stepped else _timing_words(prepared.timing)
     if acts:
         messages.append(f"the voltage {acts}: this is modelled")
     if prepared.timing.current_mean:
@@ -91,3 +92,19 @@ def _warm_windings(fit: Mapping[str, RunFit]) -> list[str]:
     if not warm:
         return []
     return [f"the winding is warm, and R larger, at the start of {', '.join(warm)}: this is modelled"]
+
+
+def _timing_words(timing: Timing) -> str | None:
+    """What the voltages do, if they are not held from their sample on."""
+    if timing.lead == 0 and not timing.first_order_hold:
+        return None
+    if timing.smooth is not None:
+        return "changes smoothly between its samples, except at jumps, instead of being held"
+    if timing.first_order_hold:
+        return "is linear between samples instead of held"
+    if timing.reading is not None:
+        sooner = "earlier" if timing.lead > 0 else "later"
+        return f"acts {abs(timing.lead):.2g} of a sample {sooner} than it was recorded"
+    if timing.lead > 0:
+        return "was recorded one sample late, after it had been held instead of before"
+    return "acts one sample later than it was recorded"

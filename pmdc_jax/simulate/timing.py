@@ -15,7 +15,7 @@ class Timing(NamedTuple):
     first_order_hold: bool = False  # linear from sample to sample
     # with a first-order hold, R / L in 1/s, or zero if it is unknown, if they are on smooth curves between jumps
     smooth: float | None = None
-    load: bool = False  # whether the recorded loads have the same timing
+    moves_load: bool = False  # whether the recorded loads have the same timing
     current_mean: bool = False  # whether the recorded currents are means over the last sample
 
     @property
@@ -28,22 +28,6 @@ class Timing(NamedTuple):
         """The share of a sample between the instant at which a voltage begins to act and the reading of the outputs, if
         not zero."""
         return self.lead - self.ahead or None
-
-    @property
-    def what(self) -> str | None:
-        """What the voltages do, in words, if they are not held from their sample on."""
-        if self.lead == 0 and not self.first_order_hold:
-            return None
-        if self.smooth is not None:
-            return "changes smoothly between its samples, except at jumps, instead of being held"
-        if self.first_order_hold:
-            return "is linear between samples instead of held"
-        if self.reading is not None:
-            sooner = "earlier" if self.lead > 0 else "later"
-            return f"acts {abs(self.lead):.2g} of a sample {sooner} than it was recorded"
-        if self.lead > 0:
-            return "was recorded one sample late, after it had been held instead of before"
-        return "acts one sample later than it was recorded"
 
 
 ZERO_ORDER_HOLD = Timing(0)

@@ -59,7 +59,7 @@ def other_timings(fitted: FittedRuns) -> list[Timing]:
     proposed = [*_at_samples(fitted), *_by_electrical_equation(trials)]
     plausible, score = _likelier(trials, proposed), trials.negative_log_likelihood
     if any(run.load is not None for run in prepared.training):
-        plausible = [t if t.reading else min(t, t._replace(load=True), key=score) for t in plausible]
+        plausible = [t if t.reading else min(t, t._replace(moves_load=True), key=score) for t in plausible]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     likely = [timing for timing in plausible if not timing.current_mean]
     means = [timing for timing in plausible if timing.current_mean]

@@ -43,7 +43,7 @@ def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
     run, last = run.recorded, len(run.recorded) - 1
     rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)
     run = attrs.evolve(run, voltage=np.asarray(voltage)[rows])
-    if not timing.load or run.load is None:
+    if not timing.moves_load or run.load is None:
         return run
     # a load varies slowly enough to be held at its means instead of going straight
     ahead = np.minimum(rows + 1, last) if timing.first_order_hold else rows

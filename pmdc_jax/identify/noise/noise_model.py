@@ -41,7 +41,10 @@ class Series(NamedTuple):
 
 @frozen(eq=False)  # compared by identity
 class Whitener:
-    """For each run a filter, shared by runs of a kind, and the matrix that scales its output to unit variance."""
+    """For each run a filter, shared by runs of a kind, and the matrix that scales its output to unit variance.
+
+    It filters in NumPy; `Whitening` is what a fit compiles of it.
+    """
 
     filters: list[Float[np.ndarray, "order outputs outputs"]]
     scales: list[Float[np.ndarray, "outputs outputs"]]
