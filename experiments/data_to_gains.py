@@ -19,7 +19,7 @@ from pmdc_jax.control import PID, Course, Hardware, Law, closed_loop
 from pmdc_jax.control.metrics import smooth_overshoot, smooth_settling
 from pmdc_jax.demo import SAMPLE
 from pmdc_jax.motor import PARAMETERS, Motor
-from pmdc_jax.simulate import Tape, free_run, uniform
+from pmdc_jax.simulate import Tape, free_run, on_even_clock
 
 RUNS = ("prbs", "loaded")
 SETPOINT = 200.0  # rad/s
@@ -62,7 +62,7 @@ def main() -> None:
     found = identify(runs)
     noise = np.array([found.noise["current_A"], found.noise["speed_rad_s"]], float)
     with jax.enable_x64(True):
-        tape = jax.tree.map(jnp.asarray, Tape.from_recordings([uniform(run) for run in runs]))
+        tape = jax.tree.map(jnp.asarray, Tape.from_recordings([on_even_clock(run) for run in runs]))
         at = jnp.log(jnp.asarray([float(getattr(found.motor, n)) for n in PARAMETERS]))
         nominal, scale = motor_of(at), jnp.asarray(noise)
 

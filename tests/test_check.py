@@ -13,7 +13,7 @@ from linear_motor import exact_step
 from pmdc_jax.checks.check import check
 from pmdc_jax.checks.plausibility import speed_of
 from pmdc_jax.recordings.recording import Recording
-from pmdc_jax.simulate import uniform
+from pmdc_jax.simulate import on_even_clock
 
 EXCITATIONS = ("steps", "prbs", "staircase", "triangle", "load_cycles", "spin_up")
 
@@ -221,7 +221,7 @@ def test_a_wrapped_angle_is_noted_and_unwrapped(step):
     wraps = int(step * (len(run) - 1) / (2 * np.pi))
     assert found.severity == "note"
     assert f"wraps after each turn, {wraps} time" in found.what
-    for speed in (uniform(run).speed[1:], speed_of(run)):
+    for speed in (on_even_clock(run).speed[1:], speed_of(run)):
         np.testing.assert_allclose(speed, step / run.sample_time)
 
 

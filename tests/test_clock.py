@@ -12,7 +12,7 @@ from pmdc_jax.errors import InputError
 from pmdc_jax.motor import Drive, Motor
 from pmdc_jax.recordings.clock import evenly_stamped, is_even
 from pmdc_jax.recordings.recording import Recording
-from pmdc_jax.simulate import uniform
+from pmdc_jax.simulate import on_even_clock
 from pmdc_jax.simulate.between_samples import mean_and_rise_of_pieces, pieces_of
 from pmdc_jax.simulate.uneven import simulated_at_stamps
 
@@ -85,7 +85,7 @@ def test_an_interpolated_voltage_keeps_its_mean_and_first_moment_in_every_even_s
     """Against quadrature over each even sample; and the motor at the stamps against many short steps."""
     rng = np.random.default_rng(23)
     run = record(stamps("walk", 60, rng), rng, 0 * NOISE)
-    even = uniform(run)
+    even = on_even_clock(run)
     mean, rise = mean_and_rise_of_pieces(even, pieces_of(even, first_order_hold=True))
     share = (np.arange(2000) + 0.5) / 2000
     for k, begin in enumerate(even.time):
@@ -114,7 +114,7 @@ def test_an_interpolated_voltage_keeps_its_mean_and_first_moment_in_every_even_s
 
 def test_pieces_cover_every_even_sample_once():
     rng = np.random.default_rng(24)
-    even = uniform(record(stamps("walk", 200, rng), rng))
+    even = on_even_clock(record(stamps("walk", 200, rng), rng))
     pieces = pieces_of(even, first_order_hold=False)
     of_sample = np.bincount(pieces.even, pieces.length)
     np.testing.assert_allclose(of_sample, even.sample_time, rtol=1e-9)

@@ -27,7 +27,15 @@ from pmdc_jax.recordings.clock import is_even
 from pmdc_jax.recordings.recording import OVER_LAST, Recording
 from pmdc_jax.recordings.recording_file import write_recording
 from pmdc_jax.runtime.threads import map_in_threads, one_blas_thread
-from pmdc_jax.simulate import RunUnknowns, Tape, free_run, reference_solution, sensitivities, squared_errors, uniform
+from pmdc_jax.simulate import (
+    RunUnknowns,
+    Tape,
+    free_run,
+    on_even_clock,
+    reference_solution,
+    sensitivities,
+    squared_errors,
+)
 from pmdc_jax.simulate.exponential import phi_functions
 
 BLOCKS = 4  # every tape below has this shape, so that few are compiled
@@ -384,7 +392,7 @@ def test_an_invalid_candidate_has_huge_errors_and_affects_no_other(x64, candidat
 def test_nearly_even_samples_are_not_resampled():
     run = recording(step=1e-3)
     noisy = Recording("r", run.time + 1e-7 * np.sin(np.arange(SAMPLES)), run.voltage, speed=run.speed)
-    even = uniform(noisy)
+    even = on_even_clock(noisy)
     np.testing.assert_array_equal(even.voltage, run.voltage)
     np.testing.assert_array_equal(even.speed, run.speed)
     np.testing.assert_allclose(np.diff(even.time), even.sample_time, rtol=1e-9)
@@ -401,7 +409,7 @@ def test_resampling_keeps_the_integrals_of_voltage_and_load(steps, seed):
     time = 7.0 + 1e-3 * np.append(0.0, np.cumsum(steps))
     assume(not is_even(time))  # such stamps count as rounded, and are not resampled
     run = Recording("r", time, rng.normal(size=len(time)), speed=np.cos(time), load=rng.normal(size=len(time)))
-    even = uniform(run)
+    even = on_even_clock(run)
     assert np.ptp(np.diff(even.time)) < 1e-9
     for before, after in ((run.voltage, even.voltage), (run.load, even.load)):
         integral = np.append(0.0, np.cumsum(before[:-1] * np.diff(time)))
@@ -416,7 +424,7 @@ def test_outputs_are_interpolated_but_not_across_gaps():
     of a grid point past the last sample."""
     rng = np.random.default_rng(6)
     time = np.delete(1e-3 * (np.arange(100) + rng.uniform(-0.2, 0.2, 100)), np.arange(50, 60))
-    even = uniform(Recording("r", time, np.ones(90), current=3 * time, speed=1 + 5 * time))
+    even = on_even_clock(Recording("r", time, np.ones(90), current=3 * time, speed=1 + 5 * time))
     inside = (even.time > time[49]) & (even.time < time[50])
     assert 9 <= inside.sum() <= 11
     assert time[-1] <= even.time[-1] < time[-1] + 1e-3
@@ -430,7 +438,7 @@ def test_uneven_runs_of_one_clock_share_a_sample_time():
     """Each sample time needs step matrices of its own."""
     rng = np.random.default_rng(8)
     stamps = [1e-3 * (np.arange(200) + rng.uniform(-0.1, 0.1, 200)) for _ in range(3)]
-    runs = [uniform(Recording("r", t, np.ones(200), speed=t)) for t in stamps]
+    runs = [on_even_clock(Recording("r", t, np.ones(200), speed=t)) for t in stamps]
     assert Tape.from_recordings(runs).sample_time.tolist() == [1e-3]
 
 
@@ -446,10 +454,10 @@ def test_speed_is_computed_from_the_angle(wrapped):
     def measured(t):
         return angle(t) % (2 * np.pi) if wrapped else angle(t)
 
-    even = uniform(Recording("r", time, np.ones(400), angle=measured(time)))
+    even = on_even_clock(Recording("r", time, np.ones(400), angle=measured(time)))
     assert even.averaging == OVER_LAST and np.isnan(even.speed[0])
     np.testing.assert_allclose(even.speed[1:], np.diff(angle(time)) / 1e-3, rtol=1e-9)
-    uneven = uniform(Recording("r", stamps, np.ones(400), angle=measured(stamps))).recorded
+    uneven = on_even_clock(Recording("r", stamps, np.ones(400), angle=measured(stamps))).recorded
     assert uneven.averaging is None
     speed = 30 + 20 * np.cos(20 * stamps)
     np.testing.assert_allclose(uneven.speed[2:-2], speed[2:-2], rtol=1e-4)
@@ -459,7 +467,7 @@ def test_missing_angles_give_missing_speeds():
     time = 1e-3 * np.arange(100)
     angle = 30 * time
     angle[40] = np.nan
-    even = uniform(Recording("r", time, np.ones(100), angle=angle))
+    even = on_even_clock(Recording("r", time, np.ones(100), angle=angle))
     known = ~np.isnan(even.speed)
     assert known.sum() >= 97
     np.testing.assert_allclose(even.speed[known], 30.0, rtol=1e-9)

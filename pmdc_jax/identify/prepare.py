@@ -23,7 +23,7 @@ from ..recordings.clock import evenly_stamped
 from ..recordings.readings import reading_interval
 from ..recordings.recording import NEEDED_TO_IDENTIFY, SIMULATED_OUTPUTS, Averaging, Finding, Recording
 from ..recordings.recording_file import Runs, named_apart, recordings_of, refuse_copies
-from ..simulate import ZERO_ORDER_HOLD, Tape, Timing, uniform
+from ..simulate import ZERO_ORDER_HOLD, Tape, Timing, on_even_clock
 from .identification import Role
 from .noise.sensor_noise import white_noise
 from .parameters import Parameters, check_names
@@ -155,7 +155,7 @@ def _laid_out(
     unloaded: bool,
 ) -> Prepared:
     """The recordings as a least-squares problem for the motor without effects, all of whose parameters are fitted."""
-    runs = [uniform(evenly_stamped(r)) for r in recordings]
+    runs = [on_even_clock(evenly_stamped(r)) for r in recordings]
     training = runs[: roles.count("train")]
     noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in SIMULATED_OUTPUTS])
     # hold-out runs are on the tape too, but only their own unknowns may be fitted to them

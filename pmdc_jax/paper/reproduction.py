@@ -120,12 +120,12 @@ def recovered_by_paper_ga(seed: int = 0) -> Recovered:
     from ..identify.parameters import Parameters
     from ..identify.search.bounds import search_bounds
     from ..identify.search.evolution import global_search
-    from ..simulate import Tape, uniform
+    from ..simulate import Tape, on_even_clock
 
     run = load_test()
     begin = time.perf_counter()
     parameters = Parameters.of(search_bounds([run]))
-    tape = Tape.from_recordings([uniform(run)])
+    tape = Tape.from_recordings([on_even_clock(run)])
     noise = np.array([NOISE["current"], NOISE["speed"]])
     result = global_search(parameters, tape, noise, method="paper_ga", seed=seed)
     motor = jax.tree.map(float, parameters(jnp.asarray(result.candidates[0])))

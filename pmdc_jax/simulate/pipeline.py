@@ -15,10 +15,10 @@ from ..motor_file import load_motor
 from ..recordings.recording import Recording
 from ..recordings.recording_file import Run, recordings_of
 from ..runtime.precision import double_precision
+from .even_clock import on_even_clock
 from .shooting import free_run
 from .tape import Tape
 from .uneven import simulated_at_stamps
-from .uniform import uniform
 
 
 @double_precision
@@ -39,7 +39,7 @@ def simulate(motor: Motor | str | Path, recording: Run) -> Recording:
         motor = load_motor(motor, "held" if recording.stands_still else recording.drive)
     subject: Motor = jax.tree.map(jnp.asarray, motor)
     # the instantaneous speed is simulated, even if the recorded one is a mean
-    even = attrs.evolve(uniform(recording), averaging=None)
+    even = attrs.evolve(on_even_clock(recording), averaging=None)
     tape = Tape.from_recordings([even], unloaded=True)
     simulated = tape.samples_of(0, free_run(subject, tape), len(even))
     if not even.has_even_clock:

@@ -84,7 +84,7 @@ class Tape(eqx.Module):
     ) -> Tape:
         """Lay recordings end to end.
 
-        **Arguments**: `recordings`, each with a uniform sample time (see `pmdc_jax.simulate.uniform`);
+        **Arguments**: `recordings`, each with an even sample time (see `pmdc_jax.simulate.on_even_clock`);
         `unloaded` declares the load of runs without a load column to be zero instead of unknown; `follow` makes
         the rotor turn by the measured speed where there is one, so that torques that depend on its angle stay in phase
         with the real ones, which a free run would lose after a few turns; `timing`, how voltages and torques go on

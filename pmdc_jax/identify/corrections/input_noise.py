@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...recordings.noise import noise_by_differences
-from ...simulate import uniform
+from ...simulate import on_even_clock
 from ..fit.fitted_runs import FittedRuns
 from ..fit.generalised_least_squares import series_of
 from ..fit.likelihood import negative_log_likelihood
@@ -64,7 +64,7 @@ def without_input_noise(recorded: FittedRuns) -> FittedRuns:
 def _with_drives(prepared: Prepared, drives: list[np.ndarray]) -> Prepared:
     """The runs with these drives on their tape."""
     runs = [
-        uniform(attrs.evolve(run.recorded, **{run.drive: drive}))
+        on_even_clock(attrs.evolve(run.recorded, **{run.drive: drive}))
         for run, drive in zip(prepared.runs, drives, strict=True)
     ]
     return prepared.with_tape_of(runs, "value", "rise", timing=prepared.timing)

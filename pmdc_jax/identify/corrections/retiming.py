@@ -6,7 +6,7 @@ import attrs
 import numpy as np
 
 from ...recordings.recording import Recording
-from ...simulate import Tape, Timing, uniform
+from ...simulate import Tape, Timing, on_even_clock
 from ..fit.polish import Fit
 from ..prepare import Prepared
 from ..problem import Problem
@@ -16,7 +16,7 @@ def with_timing(prepared: Prepared, timing: Timing) -> Prepared:
     """The runs with voltages of this timing."""
     tape = prepared.problem.tape
     runs = [
-        attrs.evolve(uniform(_retimed(run, k, tape, timing)), current_averaged=timing.current_mean)
+        attrs.evolve(on_even_clock(_retimed(run, k, tape, timing)), current_averaged=timing.current_mean)
         for k, run in enumerate(prepared.runs)
     ]
     fields = ("value", "load", "rise", "reading", "averaging", "span")

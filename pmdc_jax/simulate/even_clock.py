@@ -14,12 +14,12 @@ from ..recordings.recording import OVER_LAST, Recording
 MIN_TICK_SHARE = 0.98
 
 
-def uniform(recording: Recording) -> Recording:
-    """The recording on a uniform grid of time, with speed in place of angle.
+def on_even_clock(recording: Recording) -> Recording:
+    """The recording on an even clock, with speed in place of angle.
 
     Evenly sampled recordings keep their samples; if only the angle was measured, their speed is its mean over every
-    sample. Otherwise voltage, torque and load, which hold between samples, are averaged over each interval of the grid,
-    so that no volt-second is lost. Current and speed are interpolated linearly; inside gaps, and past the end, they are
+    sample. Otherwise voltage, torque and load, which hold between samples, are averaged over each of its intervals, so
+    that no volt-second is lost. Current and speed are interpolated linearly; inside gaps, and past the end, they are
     missing (NaN). The record is kept as `resampled_from`. A rotor that stands still throughout is taken as held,
     because its speed tells nothing.
     """
@@ -37,24 +37,24 @@ def uniform(recording: Recording) -> Recording:
             recording = attrs.evolve(recording, speed=_spline_derivative(angle, time))
     if even:
         return attrs.evolve(recording, time=np.linspace(time[0], time[-1], len(time)))
-    grid = _resampling_clock(time)
+    clock = _resampling_clock(time)
     driving = {"voltage": recording.voltage, "load": recording.load, "torque": recording.torque}
     simulated = {"current": recording.current, "speed": recording.speed}
     return attrs.evolve(
         recording,
-        time=grid,
+        time=clock,
         angle=None,
         temperature=None,
         resampled_from=recording,
-        **{k: _interval_means(time, x, grid) for k, x in driving.items() if x is not None},
-        **{k: _interpolate(time, x, grid) for k, x in simulated.items() if x is not None},
+        **{k: _interval_means(time, x, clock) for k, x in driving.items() if x is not None},
+        **{k: _interpolate(time, x, clock) for k, x in simulated.items() if x is not None},
     )
 
 
 def _resampling_clock(time: np.ndarray) -> np.ndarray:
     """An even clock that starts at the first sample. Its step is the mean step of time without gaps, or the median,
     whichever gives more samples a tick of their own. The mean is rounded to two digits where that hardly matters, and
-    otherwise to three like the median, so that runs of one clock share a grid."""
+    otherwise to three like the median, so that runs of one logger share a clock."""
     steps, elapsed = np.diff(time), time - time[0]
     typical = np.median(steps)
     mean = np.mean(steps[steps <= GAP * typical])
@@ -64,21 +64,21 @@ def _resampling_clock(time: np.ndarray) -> np.ndarray:
     return time[0] + step * np.arange(np.ceil(elapsed[-1] / step - 1e-9) + 1)
 
 
-def _interval_means(time: np.ndarray, driving: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _interval_means(time: np.ndarray, driving: np.ndarray, clock: np.ndarray) -> np.ndarray:
     integral = np.concatenate([[0.0], np.cumsum(driving[:-1] * np.diff(time))])
-    ends = np.append(grid, 2 * grid[-1] - grid[-2])
+    ends = np.append(clock, 2 * clock[-1] - clock[-2])
     total = np.interp(ends, time, integral) + driving[-1] * np.maximum(ends - time[-1], 0.0)
     return np.diff(total) / np.diff(ends)
 
 
-def _interpolate(time: np.ndarray, samples: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _interpolate(time: np.ndarray, samples: np.ndarray, clock: np.ndarray) -> np.ndarray:
     known = ~np.isnan(samples)
-    values = np.interp(grid, time[known], samples[known])
-    # the known samples on either side of each grid point must not be too far apart
-    right = np.clip(np.searchsorted(time[known], grid), 1, known.sum() - 1)
+    values = np.interp(clock, time[known], samples[known])
+    # the known samples on either side of each tick must not be too far apart
+    right = np.clip(np.searchsorted(time[known], clock), 1, known.sum() - 1)
     interval = time[known][right] - time[known][right - 1]
-    step = grid[1] - grid[0]
-    values[(interval > GAP * step) | (grid > time[-1] + 1e-9 * step)] = np.nan
+    step = clock[1] - clock[0]
+    values[(interval > GAP * step) | (clock > time[-1] + 1e-9 * step)] = np.nan
     return values
 
 
