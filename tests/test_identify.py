@@ -35,7 +35,7 @@ from pmdc_jax.identify.fit.refine import Optimum, refine
 from pmdc_jax.identify.fit.run_unknowns import fit_run_unknowns
 from pmdc_jax.identify.identification import CONVERGED_DISTANCE, Identification
 from pmdc_jax.identify.noise.noise_model import fit_whitener
-from pmdc_jax.identify.noise.sensor_noise import is_coarse, noise_of_sensor, white_noise
+from pmdc_jax.identify.noise.sensor_noise import is_coarse, noise_of_sensor, ratio_to_noise, white_noise
 from pmdc_jax.identify.noise.whitening import Whitening
 from pmdc_jax.identify.parameters import Parameters
 from pmdc_jax.identify.prepare import prepare
@@ -984,6 +984,13 @@ def test_a_rotor_at_rest_does_not_hide_the_noise_of_its_speed():
     measured = np.append(50.0 + residual[:1000], np.zeros(4000))
     assert noise_of_sensor(measured, residual) == pytest.approx(0.2, rel=0.1)
     assert noise_of_sensor(0 * measured, 0 * residual) == 0
+
+
+def test_a_smooth_error_as_of_another_solver_is_not_far_above_the_noise():
+    """A simulation without noise, reproduced to a millionth."""
+    speed = 400 * np.sin(np.linspace(0.0, 20.0, 5000))
+    assert ratio_to_noise([(speed, 1e-6 * speed)]) < 1
+    assert ratio_to_noise([(speed, 1e-3 * speed)]) > 50
 
 
 def test_white_noise_does_not_widen_intervals():

@@ -46,13 +46,16 @@ def noise_of_sensor(measured: np.ndarray, residual: np.ndarray) -> float:
 
 
 def ratio_to_noise(measured_and_left: Iterable[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Root mean square of the residuals of an output over the white noise of its sensor in each run.
+    """Root mean square of the residuals of an output over the white noise of its sensor in each run, which is taken to
+    be at least `MIN_RELATIVE_NOISE` of what was measured: a simulation leaves smaller errors of any kind.
 
     **Arguments**: what was measured and the residuals in every run, NaN where missing; runs too short to show their
     noise do not count.
     """
     scaled = [
-        residual / noise for measured, residual in measured_and_left if (noise := noise_of_sensor(measured, residual))
+        residual / max(noise, MIN_RELATIVE_NOISE * rms(measured))
+        for measured, residual in measured_and_left
+        if (noise := noise_of_sensor(measured, residual))
     ]
     return float(np.sqrt(np.nanmean(np.square(np.concatenate(scaled))))) if scaled else 0.0
 
