@@ -202,10 +202,14 @@ def test_differences_over_two_samples_are_recognised_by_missing_power_at_the_nyq
 
 
 @pytest.mark.slow
-def test_counts_without_a_current_are_not_taken_for_means():
+def test_counts_without_a_current_are_means_only_if_their_noise_says_so():
     """Their lag may be that of an inductance."""
-    runs = [attrs.evolve(r, current=None) for r in recorded("counts of the last sample")]
-    assert not any("mean over" in m for m in identify(runs).messages)
+    runs = [attrs.evolve(r, current=None) for r in recorded("counts of the last sample", J=1.5e-4)]
+    assert any("mean over" in m for m in identify(runs).messages)
+    rng = np.random.default_rng(9)
+    step = 2 * np.pi / LINES / 1e-3
+    noisy = [attrs.evolve(r, speed=step * np.round(r.speed / step + 2 * rng.standard_normal(len(r)))) for r in runs]
+    assert not any("mean over" in m for m in identify(noisy).messages)
 
 
 @pytest.mark.slow

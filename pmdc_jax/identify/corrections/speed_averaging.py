@@ -122,7 +122,7 @@ def _averaging_by_noise(prepared: Prepared) -> tuple[Averaging | None, float, bo
     in `averaging_of_counts`; and whether the speeds are counts.
 
     A mean over the last sample can be told from a delay only if the speed is counted, or where the current is such a
-    mean, and from an inductance only if the current was measured.
+    mean, and from an inductance only if the current was measured, unless the noise leaves no doubt.
     """
     if _is_slow(prepared):
         # with or without counts, only the fit tells
@@ -132,7 +132,7 @@ def _averaging_by_noise(prepared: Prepared) -> tuple[Averaging | None, float, bo
     mean, min_gain = averaging_of_counts(counts) if counts else averaging_of_differences([s for s, _ in speeds])
     if mean is None and speeds and not counts and prepared.timing.current_mean:
         mean = OVER_LAST
-    if mean == OVER_LAST and not prepared.problem.samples[0] > 0:
+    if mean == OVER_LAST and not prepared.problem.samples[0] > 0 and not np.isneginf(min_gain):
         mean = None
     return mean, min_gain, bool(counts)
 
