@@ -877,3 +877,10 @@ def test_effects_that_need_a_current_are_not_tried_without_one(x64):
     tried = {candidate.effect for candidate in Library(base).candidates}
     assert {"coulomb_friction", "speed_sensor_delay"} <= tried
     assert not any(EFFECTS[name].needs_current for name in tried)
+
+
+def test_no_voltage_is_missing_from_runs_driven_by_a_current(x64):
+    base = model_at([np.log(PAPER[n]) for n in ("Kt", "J", "f")], voltage=None)
+    tried = {candidate.effect for candidate in Library(base).candidates}
+    assert {"coulomb_friction", "torque_constant_saturation", "speed_sensor_delay"} <= tried
+    assert not tried & {"input_dead_zone", "brush_voltage_drop", "resistance_heating", "inductance_saturation"}

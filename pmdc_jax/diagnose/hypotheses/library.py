@@ -23,6 +23,7 @@ from ..model import Model
 from ..response import Outputs, Trajectory, sensor_changes, state_increments
 from .candidates import Candidate, Scales
 from .change import Change, columns_at_once
+from .effect_relations import unbalanced_equation
 from .trials import all_candidates
 
 # A motor counts as moving above this share of `Scales.speed`
@@ -43,7 +44,13 @@ class Library:
         tape = base.problem.tape
         self.measures_current = bool(np.any(np.asarray(tape.weight)[base.problem.fitted_blocks, 0]))
         has_current = self.measures_current or bool(np.any(np.asarray(tape.drive.current) > 0))
-        observable = {e for e, effect in EFFECTS.items() if has_current or not effect.needs_current}
+        has_voltage = bool(np.any(np.asarray(tape.drive.voltage) > 0))
+        observable = {
+            name
+            for name, effect in EFFECTS.items()
+            if (has_current or not effect.needs_current)
+            and (has_voltage or unbalanced_equation(effect.equation) != "electrical")
+        }
         self.candidates = [c for c in all_candidates(self.scales) if c.effect in observable]
         # the errors of a coarse encoder last long enough to look like a voltage that changes over time
         self.has_coarse_speed = any(is_coarse(speed) for speed in _measured_speeds(base.prepared.training))
