@@ -306,7 +306,7 @@ def test_a_full_set_exchanges_the_effect_in_the_same_equation(monkeypatch, count
     """Of dry friction, a delay and an offset the first, if Stribeck friction has the largest expected gain."""
     effects = ("asymmetric_friction", "speed_sensor_delay", "current_sensor_offset")[:count]
     peak = Mock(spec=Signal, effect="stribeck_friction", gain=1.0)
-    monkeypatch.setattr(proposals, "clear_signals", lambda found: [peak])
+    monkeypatch.setattr(proposals, "clear_new_signals", lambda current, found: [peak])
     exchanged = Mock(spec=Model)
     refits = Mock(spec=Refits, with_signals=lambda current, signals, found: [exchanged])
     refits.without.return_value = Mock(spec=Model)

@@ -187,10 +187,10 @@ def refit_from(prepared: Prepared, start: Optimum, white: Whitener, give_up_abov
 
 def model_of(fitted: FittedRuns) -> Model:
     """A fitted model, with the rotor angle of each sample estimated from recordings and fit together."""
-    prepared, fit = fitted
-    if not prepared.problem.depends_on_angle:  # with an effect of the angle, the fit has done this
-        prepared = prepared._replace(problem=with_rotor_angle(prepared.problem, fit))
-    return Model(FittedRuns(prepared, fit))
+    if not fitted.problem.depends_on_angle:  # with an effect of the angle, the fit has done this
+        prepared = fitted.prepared._replace(problem=with_rotor_angle(fitted.problem, fitted.fit))
+        fitted = fitted._replace(prepared=prepared)
+    return Model(fitted)
 
 
 def final_fit(model: Model, white: Whitener) -> FittedRuns:

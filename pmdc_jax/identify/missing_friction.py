@@ -60,8 +60,8 @@ def missing_friction(prepared: Prepared, fit: Fit) -> MissingFriction | None:
     z_score = regression.z_score(count)
     if not z_score > MIN_Z_SCORE:
         return None
-    *bias, friction = regression.coefficients[: count + 1]
-    return MissingFriction(float(friction), z_score, np.array(bias) * problem.parameters.scale)
+    bias = regression.coefficients[:count] * problem.parameters.scale
+    return MissingFriction(float(regression.coefficients[count]), z_score, np.asarray(bias))
 
 
 def friction_messages(missing: MissingFriction | None, identification: Identification) -> Iterator[str]:

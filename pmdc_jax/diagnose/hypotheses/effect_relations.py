@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
+from collections.abc import Collection
 
 from .trials import TRIALS
 
@@ -24,7 +24,7 @@ def are_rivals(a: set[str], b: set[str]) -> bool:
     return bool(a) and not (a <= b or b <= a or _are_same_torque(a, b) or _is_part_of_other(a, b))
 
 
-def covered_by(effects: Set[str]) -> set[str]:
+def covered_by(effects: Collection[str]) -> set[str]:
     """Some effects, and the simpler forms of them, which add nothing to them: a gear with play has a shaft."""
     contained = {simple for e in effects for simple in CONTAINS.get(e, ())}
     return {*effects, *contained, *(simple for simple, fuller in FULLER.items() if fuller.effect in effects)}

@@ -20,6 +20,7 @@ from .refits import Refits
 from .shortlist import (
     SHORTLIST,
     additional_effects,
+    clear_new_signals,
     clear_signals,
     most_promising,
     of_largest_gain,
@@ -80,8 +81,7 @@ class Proposals:
         if not _may_add_effect(current, assessment):
             return []
         if current.effects:
-            present = covered_by(set(current.effects))
-            likeliest = of_largest_gain([s for s in clear_signals(assessment) if s.effect not in present])
+            likeliest = of_largest_gain(clear_new_signals(current, assessment))
         else:
             likeliest = shortlist(current, assessment)
         return self._with_signals(current, likeliest)
@@ -107,7 +107,7 @@ class Proposals:
             return []
         unfiltered = assessment.screen._replace(evidence=assessment.screen.unfiltered)
         least = MIN_UNFILTERED_SHARE * assessment.screen.unfiltered.regress().squares
-        promising = most_promising(assessment.unfiltered_signals(), covered_by(set(current.effects)), least)
+        promising = most_promising(assessment.unfiltered_signals(), covered_by(current.effects), least)
         tried = self.refits.with_signals(current, promising, unfiltered)
         return [m for m in tried if m is not None and m.fit.fitness < decisive]
 
@@ -116,8 +116,7 @@ class Proposals:
         assessment = self.assess(current)
         if len(current.effects) < MAX_EFFECTS or assessment.p_value >= FALSE_ALARM or assessment.is_negligible(current):
             return []
-        present = covered_by(set(current.effects))
-        others = [s for s in clear_signals(assessment) if s.effect not in present]
+        others = clear_new_signals(current, assessment)
         if not others:
             return []
         new = max(others, key=attrgetter("gain")).effect

@@ -34,8 +34,7 @@ def additional_effects(current: Model, assessment: Assessment) -> list[Signal]:
     If what is left may be the model-form error of the clearest effect, only effects with `Trial.starts` are tried,
     which do more than their columns show; and none if it is a harmonic, which the teeth of a gear would imitate.
     """
-    present = covered_by(set(current.effects))
-    ranked = [s for s in clear_signals(assessment) if s.effect not in present]
+    ranked = clear_new_signals(current, assessment)
     if _may_be_form_of_clearest(current, assessment):
         if assessment.is_harmonic_of(current):
             return []
@@ -92,6 +91,12 @@ def clear_signals(assessment: Assessment) -> list[Signal]:
     log_level, curve = (np.log(FALSE_ALARM / len(assessment.screen.candidates)), assessment.curve_signals[0])
     large_gain = TRIAL_SHARE * curve.gain if curve.log_p < log_level else np.inf
     return [s for s in best.values() if s.log_p < log_level or s.gain > large_gain]
+
+
+def clear_new_signals(current: Model, assessment: Assessment) -> list[Signal]:
+    """The clear signals of effects that neither the model has, nor one of its effects makes needless."""
+    present = covered_by(current.effects)
+    return [s for s in clear_signals(assessment) if s.effect not in present]
 
 
 def richer_form(current: Model, assessment: Assessment, share: float = EFFECT_SHARE) -> list[Signal]:
