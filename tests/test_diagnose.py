@@ -41,7 +41,7 @@ from pmdc_jax.diagnose.selection.refits import Refits
 from pmdc_jax.diagnose.selection.rivals import _better_by_own_filter
 from pmdc_jax.diagnose.selection.shortlist import most_promising, shortlist
 from pmdc_jax.diagnose.selection.starts import Starts, common_phase
-from pmdc_jax.effects import EFFECTS, ShaftCompliance
+from pmdc_jax.effects import EFFECTS, ResistanceHeating, ShaftCompliance
 from pmdc_jax.identify.fit.fitted_runs import FittedRuns
 from pmdc_jax.identify.fit.polish import fit_at
 from pmdc_jax.identify.fit.refine import Optimum
@@ -115,6 +115,7 @@ NOTHING_PROPOSED = dict.fromkeys(
         "by_largest_gain",
         "by_unfiltered_misfit",
         "by_earlier_evidence",
+        "by_search_with_friction",
         "by_exchange",
         "by_swap",
         "in_other_forms",
@@ -221,20 +222,25 @@ def test_effects_of_little_expected_gain_are_not_tried(gains, min_gain, listed):
 @pytest.mark.parametrize(
     ("added", "misfit", "is_genuine"),
     [
-        ("quadratic_drag", 0.3, True),
-        ("quadratic_drag", 0.5, False),
-        ("torque_constant_saturation", 0.3, True),  # of the torque, not the voltage
-        ("inductance_saturation", 0.3, False),  # a voltage over the current, too
+        ("quadratic_drag", 4.0, True),  # 8 noise variances more than noise alone, and then 2
+        ("quadratic_drag", 5.0, False),
+        ("torque_constant_saturation", 4.0, True),  # of the torque, not the voltage
+        ("inductance_saturation", 4.0, False),  # a voltage over the current, too
     ],
 )
 def test_a_decisive_effect_on_other_axes_is_no_model_form_error(added, misfit, is_genuine):
     """Beside a brush drop of another formula, which leaves far more than noise."""
-    current = Mock(spec=Model, effects=("brush_voltage_drop",), fit=Mock(fitness=1.0))
-    better = Mock(spec=Model, effects=("brush_voltage_drop", added), fit=Mock(fitness=misfit))
+    problem = Mock(perfect_fitness=2.0)
+    current = Mock(spec=Model, effects=("brush_voltage_drop",), fit=Mock(fitness=10.0), problem=problem)
+    better = Mock(spec=Model, effects=("brush_voltage_drop", added), fit=Mock(fitness=misfit), problem=problem)
     selection = StepwiseSelection.__new__(StepwiseSelection)
     selection._leaves_little = lambda current, better: False
     selection.assess = lambda model: Mock(spec=Assessment, exceeds_model_form_error=lambda model: False)
     assert selection._is_genuine_improvement(current, better) == is_genuine
+    # near the noise, a little model-form error is a large share of what is left
+    near = Mock(spec=Model, effects=current.effects, fit=Mock(fitness=2.3), problem=problem)
+    nearer = Mock(spec=Model, effects=better.effects, fit=Mock(fitness=2.05), problem=problem)
+    assert not selection._is_genuine_improvement(near, nearer)
     # the first effect has no other beside it, whose formula may be wrong
     current.effects = ()
     assert not selection._is_genuine_improvement(current, better)
@@ -514,6 +520,14 @@ def test_a_shaft_that_cannot_ring_is_implausible(damping_ratio, implausible):
     rate = np.sqrt(stiffness / reduced)
     shaft = ShaftCompliance(*map(np.asarray, (stiffness, damping_ratio * 2 * rate * reduced, share)))
     motor = Motor(**{n: np.asarray(x) for n, x in PAPER.items()}, effects=(shaft,))
+    assert implausible_effect(motor) == implausible
+
+
+@pytest.mark.parametrize(("time_constant", "implausible"), [(0.5, None), (0.1, "resistance_heating")])
+def test_a_winding_that_warms_up_at_once_is_implausible(time_constant, implausible):
+    """A tenth of a second is the bound of the search. The smallest coreless windings take half a second."""
+    heating = ResistanceHeating(np.asarray(1e-3), np.asarray(time_constant))
+    motor = Motor(**{n: np.asarray(x) for n, x in PAPER.items()}, effects=(heating,))
     assert implausible_effect(motor) == implausible
 
 

@@ -303,6 +303,29 @@ def test_a_weak_effect_beside_a_strong_one_is_named():
 
 
 @pytest.mark.slow
+def test_three_effects_are_named_together():
+    """Heating and the brush drop explain nearly all; the friction that makes the rotor stick is a small rest."""
+    truth = vb.BenchMotor(
+        **PAPER,
+        coulomb_Nm=0.05,
+        brush_drop_V=0.6,
+        copper_alpha_per_K=0.00393,
+        thermal_resistance_K_per_W=0.3,
+        thermal_time_s=2.0,
+    )
+    found = diagnose(recorded(truth, 42, NOISE))
+    assert found.verdict == "named"
+    amplitudes = {
+        "coulomb_friction": ("torque_Nm", 0.05),
+        "brush_voltage_drop": ("voltage_V", 0.6),
+        "resistance_heating": ("rise_per_W", 0.00393 * 0.3),
+    }
+    assert {effect.name for effect in found.effects} == set(amplitudes)
+    for name, (field, true) in amplitudes.items():
+        assert found.final.parameters[f"{name}.{field}"].value == pytest.approx(true, rel=0.05)
+
+
+@pytest.mark.slow
 def test_drag_and_coulomb_friction_are_not_named_stribeck_friction():
     """The slope of a Stribeck curve and more viscous friction together resemble drag."""
     plant = Plant(**PAPER, friction_forward_Nm=0.12, friction_backward_Nm=0.12, drag=2.7e-6)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from ..effects import ShaftCompliance, range_of
+from ..effects import ResistanceHeating, ShaftCompliance, range_of
+from ..effects.base import AbstractEffect
 from ..identify.identification import Identification
 from ..motor import Motor
 from .diagnosis import Verdict, breaks_electrical_equation, holdouts_show_more, is_disturbed
@@ -19,16 +20,24 @@ MIN_CLOSED = 0.1
 ABSENT_SHARE = 1e-2
 # Damping over critical damping from which a shaft is none: couplings of rubber reach 0.3
 MAX_DAMPING_RATIO = 2.0
+# Thermal time constant, s, up to which what warms up is no winding: the smallest coreless ones take longer
+MIN_THERMAL_TIME = 0.2
 
 
 def implausible_effect(motor: Motor) -> str | None:
-    """The shaft, if its damping keeps it from any oscillation: it then stands for something else that is missing, such
-    as a current that was read late.
+    """The effect that stands for something else that is missing, if there is one: a shaft whose damping keeps it from
+    any oscillation, such as for a current that was read late, or a winding that warms up at once, for a voltage that
+    depends on the current.
 
     Judged only once a set is chosen: on the way to a gear, the play may appear as damping of a shaft.
     """
-    shafts = (e for e in motor.effects if isinstance(e, ShaftCompliance))
-    return next((e.name for e in shafts if e.damping_ratio(motor) > MAX_DAMPING_RATIO), None)
+
+    def is_implausible(effect: AbstractEffect) -> bool:
+        if isinstance(effect, ShaftCompliance):
+            return float(effect.damping_ratio(motor)) > MAX_DAMPING_RATIO
+        return isinstance(effect, ResistanceHeating) and float(effect.time_constant_s) < MIN_THERMAL_TIME
+
+    return next((effect.name for effect in motor.effects if is_implausible(effect)), None)
 
 
 def is_doubtful(naming: Naming) -> bool:

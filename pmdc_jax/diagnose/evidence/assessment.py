@@ -145,6 +145,12 @@ class Assessment(NamedTuple):
             return np.inf
         return self._unfiltered_share() * model.fit.fitness / self.explained_unfiltered
 
+    def leaves_unfiltered_misfit(self, model: Model) -> bool:
+        """Whether a model leaves more of the unfiltered misfit, noise apart, than formulas of its effects that are only
+        approximately right would."""
+        left = model.fit.fitness - model.problem.perfect_fitness
+        return bool(left > MODEL_FORM_SHARE * self.explained_unfiltered)
+
     def _unfiltered_share(self) -> float:
         """The share of the unfiltered squares that the clearest signal explains."""
         unfiltered = self.screen.unfiltered

@@ -148,6 +148,7 @@ class StepwiseSelection:
         unfiltered = [(propose.by_unfiltered_misfit, genuine)]
         absorbed = self.assess(current).unexplained < ABSORBED_SHARE
         kinds: list[tuple[Callable[[Model], Proposed], Accepts]] = [
+            (propose.by_search_with_friction, genuine),
             *(unfiltered if absorbed else []),
             (propose.by_evidence, genuine),
             (propose.by_largest_gain, little),
@@ -195,9 +196,8 @@ class StepwiseSelection:
         added = set(better.effects) - set(current.effects)
         if added & set(REFIT_ONLY.values()):
             return True
-        decisive = better.fit.fitness < current.fit.fitness / DECISIVE_RATIO
         on_other_axes = not any(has_axes_of(current, EFFECTS[effect]) for effect in added)
-        if current.effects and decisive and on_other_axes:
+        if current.effects and on_other_axes and _is_decisive(current, better):
             return True
         assessment = self.assess(current)
         return assessment.exceeds_model_form_error(current) or self._leaves_little(current, better)
@@ -267,3 +267,10 @@ class StepwiseSelection:
             rival = set(other.model.effects)
             if len(chosen - rival) == len(rival - chosen) == 1 and are_rivals(chosen, rival):
                 self.equivalents.setdefault(*(chosen - rival), set()).update(rival - chosen)
+
+
+def _is_decisive(current: Model, better: Model) -> bool:
+    """Whether a model far from the noise comes decisively nearer to it with a better one."""
+    noise = current.problem.perfect_fitness
+    far, nearer = (model.fit.fitness / noise for model in (current, better))
+    return bool(far > DECISIVE_RATIO and nearer - 1 < (far - 1) / DECISIVE_RATIO)

@@ -111,6 +111,24 @@ class Proposals:
         tried = self.refits.with_signals(current, promising, unfiltered)
         return [m for m in tried if m is not None and m.fit.fitness < decisive]
 
+    def by_search_with_friction(self, current: Model) -> Proposed:
+        """The current model with Coulomb friction from a new global search, where its effects leave much of the misfit
+        and friction, clear before they were added, is so no more.
+
+        Effects that were fitted to a rotor that sticks, without friction, are too far from the truth to show it.
+        """
+        assessment, present = self.assess(current), set(current.effects)
+        if not 0 < len(present) < MAX_EFFECTS or any(map(_sticks, present)) or assessment.p_value >= FALSE_ALARM:
+            return []
+        is_poor = current.fit.fitness > POOR_MISFIT * current.problem.perfect_fitness
+        if not (is_poor and assessment.leaves_unfiltered_misfit(current)):
+            return []
+        earlier = [self.assess(m) for m in self.superseded if set(m.effects) < present]
+        if _shows_friction(assessment) or not any(map(_shows_friction, earlier)):
+            return []
+        searched = self.refits.with_global_search(current, "coulomb_friction")
+        return [searched] if searched.fit.fitness < current.fit.fitness / DECISIVE_RATIO else []
+
     def by_exchange(self, current: Model) -> Proposed:
         """A model with `MAX_EFFECTS` effects, with the new one of largest gain in place of one in the same equation."""
         assessment = self.assess(current)
@@ -184,9 +202,8 @@ class Proposals:
             by_gain = sorted(self.assess(current).candidate_signals, key=lambda s: -s.gain)
             suspects = tuple(dict.fromkeys(s.effect for s in by_gain))[:SHORTLIST]
             nearest, noise = current, current.problem.perfect_fitness
-        sticks = any(EFFECTS[effect].holds == "speed" for effect in suspects)
         decisive = nearest.fit.fitness / DECISIVE_RATIO
-        if not sticks or decisive < noise:  # not even a perfect fit would cut the misfit so far
+        if not any(map(_sticks, suspects)) or decisive < noise:  # not even a perfect fit would cut the misfit so far
             return []
         searched = [self.refits.with_global_search(current, "coulomb_friction")]
         if "asymmetric_friction" in nearest.effects_at_end:
@@ -196,6 +213,16 @@ class Proposals:
     def _with_signals(self, current: Model, signals: Sequence[Signal]) -> Proposed:
         """The model with the effect of each signal."""
         return self.refits.with_signals(current, signals, self.assess(current).screen)
+
+
+def _shows_friction(assessment: Assessment) -> bool:
+    """Whether the evidence clearly shows an effect that may hold the rotor at rest."""
+    return any(_sticks(signal.effect) for signal in clear_signals(assessment))
+
+
+def _sticks(effect: str) -> bool:
+    """Whether an effect may hold the rotor at rest."""
+    return EFFECTS[effect].holds == "speed"
 
 
 def _may_add_effect(current: Model, assessment: Assessment) -> bool:

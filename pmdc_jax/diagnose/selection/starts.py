@@ -109,11 +109,10 @@ class Starts:
         coordinates, undetermined = [], current.undetermined
         for k, name in enumerate(parameters.names):
             effect, _, field = name.partition(".")
-            start = values.get(effect, self.first_values.get(effect))
-            if name in by_name and (start is None or name not in undetermined):
+            start = values.get(effect, self.first_values.get(effect, {}))
+            if name in by_name and (field not in start or name not in undetermined):
                 coordinates.append(by_name[name])
             else:
-                assert start is not None
                 coordinates.append(parameters.coordinate(k, start[field]))
         return coordinates
 

@@ -16,9 +16,9 @@ from ..prepare import Prepared
 
 # Currents of the onset that are tried, over the root mean square of those measured
 ONSETS = (0.02, 0.06, 0.2)
-# Fastest rate of a gradual drop, times the shortest sample time: a steeper one is hardly different from a constant one,
-# and would need too many steps in a sample
-MAX_RATE = 10.0
+# Fastest rate of a gradual drop, times the shortest sample time, from which a fit starts, and where it may end: a
+# steeper one is hardly different from a constant one, and would need too many steps in a sample
+MAX_RATE, MAX_FITTED_RATE = 10.0, 20.0
 ONSET = f"{GradualBrushDrop.name}.onset_A"
 
 
@@ -28,24 +28,28 @@ def with_gradual_brushes(fitted: FittedRuns) -> FittedRuns:
     prepared, problem = fitted.prepared, fitted.problem
     if BrushVoltageDrop not in problem.parameters.effects or not problem.samples[0] > 0 or leaves_only_noise(fitted):
         return fitted
-    onsets, least = float(problem.measured_rms[0]) * np.array(ONSETS), _least_onset(fitted)
+    onsets = float(problem.measured_rms[0]) * np.array(ONSETS)
     kinds = [GradualBrushDrop if kind is BrushVoltageDrop else kind for kind in problem.parameters.effects]
     gradual = prepared.with_effects(kinds)
-    ends = [_polished(gradual, fitted, onset) for onset in onsets[onsets > least]]
+    ends = [_polished(gradual, fitted, onset) for onset in onsets if _rate(fitted, onset) < MAX_RATE]
     if not ends:
         return fitted
     best = min(ends, key=lambda end: end.fit.cost)
+    if best.fit.cost >= fitted.fit.cost:  # a local optimum: a steep onset is as good as a constant drop
+        return fitted
     best = FittedRuns.polished(gradual, best.fit.optimum)
+    if _rate(best, best.problem.parameters.value(ONSET, np.asarray(best.fit.coordinates))) > MAX_FITTED_RATE:
+        return fitted
     gain = negative_log_likelihood(fitted) - negative_log_likelihood(best)
     return best if gain > MIN_LOG_LIKELIHOOD_GAIN else fitted
 
 
-def _least_onset(fitted: FittedRuns) -> float:
-    """The smallest current, A, that is simulated as an onset."""
+def _rate(fitted: FittedRuns, onset: float) -> float:
+    """The fastest rate of a drop as fitted, with its onset in A, times the shortest sample time."""
     motor, tape = fitted.problem.parameters(fitted.fit.coordinates), fitted.problem.tape
     drop = motor.effect_named(BrushVoltageDrop.name)
-    assert isinstance(drop, BrushVoltageDrop)
-    return float(drop.voltage_V / motor.L * np.min(np.asarray(tape.sample_time)) / MAX_RATE)
+    assert isinstance(drop, BrushVoltageDrop | GradualBrushDrop)
+    return float(drop.voltage_V / (onset * motor.L) * np.min(np.asarray(tape.sample_time)))
 
 
 def _polished(gradual: Prepared, fitted: FittedRuns, onset: float) -> FittedRuns:

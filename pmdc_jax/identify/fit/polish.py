@@ -198,6 +198,7 @@ def _evaluate_weighted(
             over = squares * stretch**2 / np.maximum(problem.samples, 1.0)
             cost = float(np.log(np.maximum(noise, 1e-300)).sum() + over.sum() / 2)
     fitness = float(squares.sum()) / problem.most_samples
-    # a failed simulation is infinitely bad
-    cost, fitness = (x if np.isfinite(x) else np.inf for x in (cost, fitness))
+    # a failed simulation is infinitely bad, and so is one whose derivatives fail: nothing can be told from it
+    succeeded = np.isfinite(cost) and np.isfinite(fitness) and np.all(np.isfinite(matrix))
+    cost, fitness = (cost, fitness) if succeeded else (np.inf, np.inf)
     return _WeightedPoint(unknowns, weighted, noise, matrix, cost, fitness)
