@@ -41,7 +41,7 @@ from pmdc_jax.diagnose.selection.refits import Refits
 from pmdc_jax.diagnose.selection.rivals import _better_by_own_filter
 from pmdc_jax.diagnose.selection.shortlist import most_promising, shortlist
 from pmdc_jax.diagnose.selection.starts import Starts, common_phase
-from pmdc_jax.effects import EFFECTS, ResistanceHeating, ShaftCompliance
+from pmdc_jax.effects import EFFECTS, GradualBrushDrop, ResistanceHeating, ShaftCompliance
 from pmdc_jax.identify.fit.fitted_runs import FittedRuns
 from pmdc_jax.identify.fit.polish import fit_at
 from pmdc_jax.identify.fit.refine import Optimum
@@ -883,6 +883,22 @@ def test_an_undetermined_effect_without_start_values_is_kept_as_it_is(x64):
     start = np.asarray(point.unknowns.coordinates)
     np.testing.assert_allclose(start[:-1], coordinates)
     assert prepared.problem.parameters.value("current_sensor_offset.offset_A", start) == pytest.approx(0.5)
+
+
+def test_a_parameter_that_only_a_fuller_form_has_is_kept_as_it_is(x64):
+    """The onset of a brush drop that was first fitted as a constant one, where no run is sensitive to it."""
+    constant = model_at(np.log([*(PAPER[n] for n in PARAMETERS), 2e-5]).tolist(), ("brush_voltage_drop",))
+    gradual = constant.prepared.with_effects([GradualBrushDrop])
+    unknowns = constant.fit.unknowns._replace(coordinates=jnp.append(constant.fit.coordinates, np.log(3.0)))
+    model = model_of(FittedRuns(gradual, fit_at(gradual.problem, Optimum(unknowns, np.inf, ()))))
+    assert "brush_voltage_drop.onset_A" in model.undetermined
+    starts = Starts(SCALES)
+    starts.first_values["brush_voltage_drop"] = {"voltage_V": 0.5}
+    effects = ("brush_voltage_drop", "current_sensor_offset")
+    prepared, point = starts.from_model(model, effects, {"current_sensor_offset": {"offset_A": 0.5}})
+    start = np.asarray(point.unknowns.coordinates)
+    assert prepared.problem.parameters.value("brush_voltage_drop.voltage_V", start) == pytest.approx(0.5)
+    assert prepared.problem.parameters.value("brush_voltage_drop.onset_A", start) == pytest.approx(3.0)
 
 
 def test_effects_that_need_a_current_are_not_tried_without_one(x64):

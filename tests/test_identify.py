@@ -675,6 +675,15 @@ def test_friction_is_recovered_from_a_value_near_zero(x64, runs):
     assert again.fitness == pytest.approx(optimum.fitness, rel=1e-6)
 
 
+def test_a_fit_whose_derivatives_fail_is_infinitely_bad(x64, runs):
+    """Its simulation may be finite, but nothing can be told from it, and no NaN may reach what comes next."""
+    problem = problem_of(runs)
+    fit = polish(problem, refine(problem, start_at(problem)))
+    failed = fit.evaluation._replace(jacobian=fit.evaluation.jacobian.at[0, 0, 0, 0].set(jnp.nan))
+    assert np.isfinite(polish(problem, fit.optimum, steps=0, at_start=fit.evaluation).fitness)
+    assert polish(problem, fit.optimum, at_start=failed).fitness == np.inf
+
+
 SLOW_SENSORS = {  # s
     "speed_sensor_lag": ("time_constant_s", 2e-2),
     "speed_sensor_delay": ("delay_s", 2e-2),
