@@ -8,6 +8,7 @@ import pytest
 from scipy.linalg import expm
 
 import pmdc_jax
+from pmdc_jax.effects import BrushVoltageDrop
 from pmdc_jax.errors import InputError
 from pmdc_jax.motor import Drive, Motor
 from pmdc_jax.recordings.clock import evenly_stamped, is_even
@@ -70,6 +71,48 @@ def test_a_motor_is_identified_from_uneven_samples(kind):
     fit = result.fit["r"]
     assert fit.speed_rmse == pytest.approx(NOISE[1], rel=0.1)
     assert fit.current_rmse == pytest.approx(NOISE[0], rel=0.1)
+
+
+@pytest.mark.slow
+def test_an_effect_is_diagnosed_from_uneven_samples():
+    """The samples are shifted along the motion with the effect: that without it would keep L 12 % off."""
+    rng, dead_zone, runs = np.random.default_rng(41), 1.0, []
+    for name in ("one", "other"):
+        driven = record(stamps("jitter", 3000, rng), rng)
+        command = driven.voltage + dead_zone * np.sign(driven.voltage)
+        runs.append(attrs.evolve(driven, name=name, voltage=command))
+    found = pmdc_jax.diagnose(runs)
+    assert found.verdict == "named"
+    assert [effect.name for effect in found.effects] == ["input_dead_zone"]
+    for name, true in {**MOTOR, "input_dead_zone.width_V": dead_zone}.items():
+        estimate = found.final.parameters[name]
+        assert abs(estimate.value - true) < min(3 * estimate.stderr, 0.03 * true), name
+
+
+def with_brush_drop(time: np.ndarray, voltage: np.ndarray, drop: float) -> np.ndarray:
+    """Current and speed with a set-valued brush drop, in many implicit steps from stamp to stamp."""
+    R, L, Kb, Kt, J, f = MOTOR.values()
+    i, w, states = 0.0, 0.0, np.zeros((len(time), 2))
+    for k, step in enumerate(np.diff(time) / 400):
+        for _ in range(400):
+            free = (i + step * (voltage[k] - Kb * w) / L) / (1 + step * R / L)
+            i = np.sign(free) * max(abs(free) - step * drop / (L + step * R), 0.0)
+            w = (w + step * Kt * i / J) / (1 + step * f / J)
+        states[k + 1] = i, w
+    return states
+
+
+def test_a_brush_drop_is_simulated_at_uneven_stamps():
+    """Also where the voltage jumps within a sample of the even clock and the drop changes its sign with it."""
+    rng, drop = np.random.default_rng(42), 0.8
+    time, voltage = stamps("jitter", 240, rng), np.repeat(rng.choice([-12.0, 12.0], 24), 10)
+    run = Recording("r", time, voltage, *with_brush_drop(time, voltage, drop).T, load=np.zeros(240))
+    found = pmdc_jax.simulate(Motor(**MOTOR, effects=(BrushVoltageDrop(np.asarray(drop)),)), run)
+    linear = pmdc_jax.simulate(Motor(**MOTOR), run)
+    for got, without, true in ((found.current, linear.current, run.current), (found.speed, linear.speed, run.speed)):
+        error, effect = got - true, without - true
+        # the drop reverses when the current does, a little after the voltage
+        assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(effect**2))
 
 
 @pytest.mark.parametrize("kind", ["jitter", "walk", "two rates"])

@@ -29,7 +29,8 @@ def simulated_at_stamps(
     """Current A and speed rad/s at the time stamps of a record, from those at the samples of its `even` clock.
 
     Exact for the linear motor, including the difference between the recorded drive and the straight line in its place.
-    The contribution of effects is taken to grow in proportion to time within an even sample.
+    The effects are taken to contribute a constant voltage and torque within an even sample, but for a voltage that
+    changes its sign with the drive.
     """
     pieces = pieces_of(even, first_order_hold)
     time, begins, length, index, value, slope, loads = pieces
@@ -48,11 +49,14 @@ def simulated_at_stamps(
         return simulated[of] + _times(constant[by], rate) + _times(growing[by], rate_slope)
 
     by_effects = simulated[1:] - moved(whole, np.arange(len(simulated) - 1))
-    by_effects = np.append(by_effects, np.zeros((1, 2)), 0)[index] * (begins / step)[:, None]
+    rate_by_effects = np.append(np.linalg.solve(constant[0], by_effects.T).T, np.zeros((1, 2)), 0)
+    by_effects = _times(constant[to_start], rate_by_effects[index])
+    changed_by_effects = _at_reversals(rate_by_effects[:, 0], mean, index, value)
     # the response to the drive's difference from the straight line: over the pieces of an even sample, and then from
     # sample to sample
     difference = value - line_start[index] - rise[index] * begins / step
     rate = np.outer(difference, B[:, 0]) + np.outer(loads - load[index], B[:, 1])
+    rate[:, 0] += changed_by_effects
     response = _times(constant[within], rate)
     response += _times(growing[within], np.outer(slope - line_slope[index], B[:, 0]))
     in_sample, at_end = _through_pieces(index, transition[within], response, len(even))
@@ -60,6 +64,24 @@ def simulated_at_stamps(
     carried_over = _times(transition[to_start], carried_over[index])
     reached = moved(to_start, index) + by_effects + in_sample + carried_over
     return reached[np.searchsorted(time, even.recorded.time)]
+
+
+def _at_reversals(
+    rate: Float[np.ndarray, " samples"],
+    mean: Float[np.ndarray, " samples"],
+    index: Int[np.ndarray, " pieces"],
+    value: Float[np.ndarray, " pieces"],
+) -> Float[np.ndarray, " pieces"]:
+    """What to add to the rate of the current by effects, A/s, in each piece of an even sample in which both change
+    their sign, effects and drive: a piece has the rate of the neighbouring sample whose drive has its sign.
+
+    **Arguments**: `rate` of the current by effects, A/s, and `mean` of the drive in each even sample; `index` of the
+    even sample, and `value` of the drive, of each piece.
+    """
+    before, after = np.maximum(index - 1, 0), np.minimum(index + 1, len(rate) - 1)
+    reverses = (mean[before] * mean[after] < 0) & (rate[before] * rate[after] < 0)
+    of_sign = np.where(value * mean[before] > 0, rate[before], rate[after])
+    return np.where(reverses, of_sign - rate[index], 0.0)
 
 
 def _through_pieces(

@@ -14,6 +14,7 @@ import numpy as np
 from ...effects import EFFECTS
 from ...identify.corrections.gradual_brushes import with_gradual_brushes
 from ...identify.corrections.initial_temperature import with_initial_temperatures
+from ...identify.corrections.uneven_sampling import with_even_clock
 from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.noise.noise_model import Whitener
 from ...identify.noise.spectral_lines import Line
@@ -119,9 +120,10 @@ class StepwiseSelection:
         return Assessment(evidence, candidate_signals, curve_signals, p_value, explained, explained_unfiltered)
 
     def _with_refined_runs(self, model: Model) -> Model:
-        """The model with runs that begin with a warm winding, or with a brush drop that sets in gradually, if that is
-        clearly likelier: other effects would seem to be missing without."""
-        for refine in (with_initial_temperatures, with_gradual_brushes):
+        """The model with the samples of an uneven clock shifted along its own motion, and with runs that begin with a
+        warm winding, or a brush drop that sets in gradually, if that is clearly likelier: other effects would seem to
+        be missing without."""
+        for refine in (with_even_clock, with_initial_temperatures, with_gradual_brushes):
             refined = refine(model.fitted)
             if refined.prepared is not model.prepared:
                 self.superseded.add(model)
