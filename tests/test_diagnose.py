@@ -161,7 +161,8 @@ def test_a_model_with_warm_runs_takes_the_place_of_one_in_which_all_begin_cold(m
     selection.refits = Mock(spec=Refits, replace=lambda model: model)
     monkeypatch.setattr(naming, "with_initial_temperatures", lambda fitted: FittedRuns("warm", "fit"))
     monkeypatch.setattr(naming, "model_of", lambda fitted: warm if fitted.prepared == "warm" else None)
-    monkeypatch.setattr(naming, "with_gradual_brushes", lambda fitted: fitted)
+    for other in ("with_even_clock", "with_gradual_brushes"):
+        monkeypatch.setattr(naming, other, lambda fitted: fitted)
     assert StepwiseSelection._with_refined_runs(selection, cold) is warm
     assert cold in selection.superseded
     monkeypatch.setattr(naming, "with_initial_temperatures", lambda fitted: fitted)
