@@ -50,19 +50,17 @@ def simulated_at_stamps(
 
     by_effects = simulated[1:] - moved(whole, np.arange(len(simulated) - 1))
     rate_by_effects = np.append(np.linalg.solve(constant[0], by_effects.T).T, np.zeros((1, 2)), 0)
-    by_effects = _times(constant[to_start], rate_by_effects[index])
-    changed_by_effects = _at_reversals(rate_by_effects[:, 0], mean, index, value)
-    # the response to the drive's difference from the straight line: over the pieces of an even sample, and then from
-    # sample to sample
+    # the response to what differs from the straight line and the constant rate: over the pieces of an even sample, and
+    # then from sample to sample
     difference = value - line_start[index] - rise[index] * begins / step
     rate = np.outer(difference, B[:, 0]) + np.outer(loads - load[index], B[:, 1])
-    rate[:, 0] += changed_by_effects
+    rate[:, 0] += _at_reversals(rate_by_effects[:, 0], mean, index, value)
     response = _times(constant[within], rate)
     response += _times(growing[within], np.outer(slope - line_slope[index], B[:, 0]))
     in_sample, at_end = _through_pieces(index, transition[within], response, len(even))
     carried_over = np.append(np.zeros((1, 2)), _accumulated(transition[0], at_end)[:-1], 0)
     carried_over = _times(transition[to_start], carried_over[index])
-    reached = moved(to_start, index) + by_effects + in_sample + carried_over
+    reached = moved(to_start, index) + _times(constant[to_start], rate_by_effects[index]) + in_sample + carried_over
     return reached[np.searchsorted(time, even.recorded.time)]
 
 
