@@ -73,6 +73,16 @@ def test_a_motor_is_identified_from_uneven_samples(kind):
     assert fit.current_rmse == pytest.approx(NOISE[0], rel=0.1)
 
 
+@pytest.mark.parametrize("seed", [55, 56, 57])
+def test_an_inductance_that_settles_within_a_sample_has_an_honest_interval(seed):
+    """Mostly the jitter of the clock shows it: derivatives at even samples promise three times too much."""
+    rng = np.random.default_rng(seed)
+    time = 2.5 * stamps("jitter", 2400, rng)  # L / R is a seventh of a sample
+    estimate = pmdc_jax.identify([record(time, rng)]).parameters["L"]
+    assert abs(estimate.value - MOTOR["L"]) < 3 * estimate.stderr
+    assert estimate.stderr < 0.02 * MOTOR["L"]
+
+
 @pytest.mark.slow
 def test_an_effect_is_diagnosed_from_uneven_samples():
     """The samples are shifted along the motion with the effect: that without it would keep L 12 % off."""

@@ -562,7 +562,7 @@ def test_rounding_errors_of_a_coarse_reading_are_no_evidence():
             Series(x, known, kind)
             for x in (speed[..., None], np.ones((len(speed), 1, 1)), np.round(speed) - speed, speed)
         )
-        errors = rounding_errors(RunSeries(shared, own, residual, simulated), seed)
+        errors = rounding_errors(RunSeries(shared, own, residual, simulated), [1.0], seed)
         parts = (shared.values, (speed * np.abs(speed))[..., None], errors, residual.values[..., None])
         rows = np.concatenate([*parts, own.values], -1)[:, 0] * np.sqrt(12)
         evidence, drag = (gather_evidence([[rows]], 1, 1, rounding_errors=ROUNDING_DRAWS), Block((1,)))
@@ -589,10 +589,11 @@ def test_only_rounding_without_dither_is_coarse(read, coarse):
     left, simulated = (
         Series(0.5 * x, known, (1e-3, (0,))) for x in (read(exact, np.random.default_rng(0)) - exact, exact)
     )
-    errors = rounding_errors(RunSeries(simulated, simulated, left, simulated), 0)
+    fit = RunSeries(simulated, simulated, left, simulated)
+    errors = rounding_errors(fit, [0.5], seed=0)
     assert bool(errors.any()) is coarse
     assert np.abs(errors).max() <= 0.25 + 1e-12
-    assert np.array_equal(errors, rounding_errors(RunSeries(simulated, simulated, left, simulated), 0))
+    assert np.array_equal(errors, rounding_errors(fit, [0.5], seed=0))
 
 
 # ---------------------------------------------------------------------------------- the noise

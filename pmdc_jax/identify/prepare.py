@@ -113,7 +113,7 @@ class Prepared(NamedTuple):
     def with_effects(self, effects: Sequence[type[AbstractEffect]]) -> Prepared:
         """The same runs for a motor with other effects."""
         parameters = self.parameters(effects)
-        return self.with_problem(parameters=parameters, free=parameters.all_free, whitening=None)
+        return self.with_problem(parameters=parameters, free=parameters.all_free, whitening=None, shift=None)
 
 
 def prepare(

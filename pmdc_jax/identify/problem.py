@@ -38,6 +38,14 @@ class Nuisance(eqx.Module):
     noise: Float[Array | np.ndarray, "2"]
 
 
+class Shift(eqx.Module):
+    """How outputs at the samples of an uneven clock depend on the unknowns, beside those at the even samples to which
+    they were shifted."""
+
+    slope: Float[Array, "blocks 2 samples columns"]  # A and rad/s
+    at: Unknowns  # where they were shifted
+
+
 class Problem(eqx.Module):
     """A least-squares problem: runs on tape, the noise to scale by, the free coordinates and the runs to fit.
 
@@ -52,6 +60,7 @@ class Problem(eqx.Module):
     begins_warm: Bool[Array, " runs"]  # which runs may begin with a warm winding
     whitening: Whitening | None = None  # in place of the noise, where residuals are correlated
     nuisance: Nuisance | None = None
+    shift: Shift | None = None
 
     @property
     def fitted_blocks(self) -> Bool[np.ndarray, " blocks"]:
@@ -156,23 +165,29 @@ def evaluate(
 
     **Arguments**: `starts`, as from `predicted_starts`, where an evaluation nearby is known; they make it quicker.
     """
-    # without whitening and nuisance, so that the simulation, slow to compile, is compiled only once
-    bare = replace(problem, whitening=None, nuisance=None)
+    # without all that is allowed for afterwards, so that the simulation, slow to compile, is compiled only once
+    bare = replace(problem, whitening=None, nuisance=None, shift=None)
     if bare.parameters.effects:
         simulated = _evaluate_in_threads(bare, unknowns, starts)
     else:
         simulated = _evaluate_linear(bare, unknowns)
-    return whitened(problem, _without_nuisance(problem, simulated))
+    return whitened(problem, _without_nuisance(problem, _at_shifted_samples(problem, unknowns, simulated)))
 
 
 def predicted_starts(
     problem: Problem, evaluation: Evaluation, change: Float[np.ndarray, " unknowns"]
 ) -> Float[np.ndarray, "blocks states"]:
     """Where the blocks start, to first order, after a change of the unknowns at which an evaluation was made."""
-    shared, own = np.split(change, [len(problem.free)])
+    return np.asarray(evaluation.starts) + np.einsum(
+        "bsp,bp->bs", np.asarray(evaluation.d_starts), _by_blocks(problem, change)
+    )
+
+
+def _by_blocks(problem: Problem, flat: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "blocks columns"]:
+    """The coordinates, and the own unknowns of its run, for each block."""
+    shared, own = np.split(flat, [len(problem.free)])
     of_run = own.reshape(problem.tape.runs, UNKNOWNS_PER_RUN)[np.asarray(problem.tape.run)]
-    by_shared, by_own = np.split(np.asarray(evaluation.d_starts), [len(shared)], axis=-1)
-    return np.asarray(evaluation.starts) + by_shared @ shared + np.einsum("bsp,bp->bs", by_own, of_run)
+    return np.concatenate([np.broadcast_to(shared, (len(of_run), len(shared))), of_run], 1)
 
 
 def _evaluate_in_threads(
@@ -221,6 +236,32 @@ def _evaluated(
 
 # `quickly_compiled` programs are as fast as others without effects, and up to a third slower with them
 _evaluate, _evaluate_linear = compiled(_evaluated), quickly_compiled(_evaluated)
+
+
+def _at_shifted_samples(problem: Problem, unknowns: Unknowns, plain: Evaluation) -> Evaluation:
+    """The evaluation with outputs and derivatives as at the samples of an uneven clock, if some were shifted."""
+    if problem.shift is None:
+        return plain
+    change = np.asarray(flatten(unknowns)) - np.asarray(flatten(problem.shift.at))
+    scale = problem.tape.weight / problem.noise[:, None]
+    determinable = problem.determinable()[problem.tape.run]
+    return _add_shift(plain, problem.shift.slope, _by_blocks(problem, change), scale, determinable)
+
+
+@compiled
+def _add_shift(
+    plain: Evaluation,
+    slope: Float[Array, "blocks 2 samples columns"],
+    change: Float[Array | np.ndarray, "blocks columns"],
+    scale: Float[Array | np.ndarray, "blocks 2 samples"],
+    determinable: Bool[Array, "blocks columns"],
+) -> Evaluation:
+    moved = jnp.einsum("bcsp,bp->bcs", slope, change)
+    return plain._replace(
+        simulated=plain.simulated + moved,
+        residuals=plain.residuals + scale * moved,
+        jacobian=plain.jacobian + scale[..., None] * slope * determinable[:, None, None, :],
+    )
 
 
 def _without_nuisance(problem: Problem, plain: Evaluation) -> Evaluation:

@@ -22,7 +22,7 @@ from ...simulate import Tape
 from ..hypotheses.change import Change, columns_at_once
 from ..model import Model, RunSeries, series_of_runs
 from ..response import Trajectory, respond
-from .quantisation import rounding_errors
+from .quantisation import converter_steps, rounding_errors
 
 # Samples that are whitened at once, to limit the memory
 CHUNK = 2048
@@ -55,12 +55,12 @@ def gather_rows(model: Model, bare: Motor, trajectory: Trajectory, changes: Iter
     """The rows of every training run, from `changes` with `count` columns in all, which the motor without effects,
     `bare`, propagates."""
     tape, fits = model.problem.tape, series_of_runs(model)
-    rows_of_runs = [
-        Rows(
-            fit, _late_readings(fit), np.empty((*fit.residual.values.shape, count), np.float32), rounding_errors(fit, k)
-        )
-        for k, fit in enumerate(fits)
-    ]
+    rows_of_runs = []
+    for k, (fit, run) in enumerate(zip(fits, model.prepared.training, strict=True)):
+        columns = np.empty((*fit.residual.values.shape, count), np.float32)
+        _, outputs = fit.residual.kind
+        rounding = rounding_errors(fit, converter_steps(run, outputs), seed=k)
+        rows_of_runs.append(Rows(fit, _late_readings(fit), columns, rounding))
     first = 0
     for change, width in _batches(changes, columns_at_once(tape)):
         response = _output_change(bare, tape, trajectory, change)

@@ -100,7 +100,7 @@ class Library:
 def _sensor_floors(base: Model) -> dict[str, float]:
     """By unit, the amplitude that imperfect sensors alone may produce: the noise taken out of the recorded voltage (V,
     standard deviation) or its resolution, if larger; half the quantum of the current (A)."""
-    training = base.prepared.training
+    training = [run.recorded for run in base.prepared.training]
     currents = [run.current for run in training if run.current is not None]
     rounded = max((quantum(np.diff(current)) / 2 for current in currents), default=0.0)
     noise = max(base.prepared.input_noise.values(), default=0.0)

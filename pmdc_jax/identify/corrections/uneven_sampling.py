@@ -1,94 +1,137 @@
 """Unevenly sampled recordings, such as those with the time stamps of a computer or the steps of a variable-step solver.
 
 The simulation has even samples. Interpolating the measurement at these would lose peaks and colour the noise; instead,
-each recorded sample is shifted by what the fitted motor does between its time and the nearest even sample.
+each recorded sample is shifted by what the fitted motor does between its time and the nearest even sample. How far that
+is depends on the motor, too: the `Shift` of the problem adds its derivatives to those of the even samples.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
 import attrs
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from ...recordings.clock import GAP
 from ...recordings.recording import SIMULATED_OUTPUTS, Recording
+from ...runtime.threads import map_in_threads
 from ...simulate import Tape
 from ...simulate.uneven import simulated_at_stamps
 from ..fit.fitted_runs import FittedRuns
-from ..fit.polish import Fit, fit_at
+from ..fit.polish import Fit, fit_at, polish, reweighted
+from ..parameters import Parameters
 from ..prepare import Prepared
-from ..problem import Problem
+from ..problem import Problem, Shift, evaluate
 
 # Refits at most
 MAX_REFITS = 12
-# Refits end when the shifts of the samples change by less than this, sum of squares in noise variances: that could move
-# no estimate by more than its root, 0.1 standard errors
+# Refits end when shifting the samples anew changes the residuals by less than this, sum of squares in noise variances:
+# that could move no estimate by more than its root, 0.1 standard errors
 SHIFT_TOLERANCE = 0.01
-# Steps of the parameters that shrink by less than this ratio are extrapolated to their limit
-MAX_STEP_RATIO = 0.9
+# Changes of the outputs, in noise standard deviations, over which derivatives of the shift are differenced
+DIFFERENCE = 1e-3
+
+# Current A and speed rad/s at the samples of an even clock or at those of the record; their derivatives by unknowns
+Outputs = Float[np.ndarray, "samples 2"]
+Recorded = Float[np.ndarray, "recorded 2"]
+Derivatives = Float[np.ndarray, "samples 2 columns"]
 
 
 def with_even_clock(fitted: FittedRuns) -> FittedRuns:
     """The runs with every sample of an uneven clock shifted to the nearest even sample along the simulated motion, and
     the fit to them; both unchanged where all clocks are even."""
-    uneven = not all(run.has_even_clock for run in fitted.prepared.runs)
-    last = None
-    for _ in range(MAX_REFITS if uneven else 0):
-        before, fitted = fitted, FittedRuns.polished(_shifted(*fitted), fitted.fit.optimum)
-        if _squares_between(before.problem, fitted) < SHIFT_TOLERANCE:
+    if all(run.has_even_clock for run in fitted.prepared.runs):
+        return fitted
+    for _ in range(MAX_REFITS):
+        shifted, before = _shifted(*fitted), fitted.fit
+        start = fit_at(shifted.problem, before.optimum)
+        at_start = reweighted(shifted.problem, start)
+        fitted = FittedRuns(shifted, polish(shifted.problem, before.optimum, at_start=at_start))
+        if _squares_between(before, start, shifted.problem) < SHIFT_TOLERANCE:
             break
-        step = np.asarray(fitted.fit.coordinates - before.fit.coordinates)
-        rate = step @ last / (last @ last) if last is not None else 0.0
-        last = step
-        if 0 < rate < MAX_STEP_RATIO:
-            # where the current settles within a sample, samples shifted with a wrong inductance reproduce most of its
-            # error, and plain iteration would converge slowly
-            fitted, last = _extrapolated(fitted, rate / (1 - rate) * step), None
     return fitted
 
 
-def _extrapolated(fitted: FittedRuns, step: Float[np.ndarray, " parameters"]) -> FittedRuns:
-    """The fit evaluated a `step` further on, within the bounds (Irons and Tuck, doi:10.1002/nme.1620010306)."""
-    further = fitted.fit.optimum.moved(fitted.problem.parameters, step)
-    return fitted._replace(fit=fit_at(fitted.problem, further))
-
-
-def _squares_between(before: Problem, after: FittedRuns) -> float:
-    """Sum of squared differences between the samples of the training runs, in noise variances."""
-    one, other = before.tape, after.problem.tape
-    moved = (np.asarray(other.measured) - np.asarray(one.measured)) * np.asarray(other.weight)
-    return float(np.square(moved / after.fit.noise[:, None])[after.problem.fitted_blocks].sum())
+def _squares_between(one: Fit, other: Fit, problem: Problem) -> float:
+    """Sum of squared differences between the residuals of two fits in the training runs, in noise variances."""
+    residuals = [np.asarray(fit.evaluation.residuals) * fit.noise[:, None] for fit in (one, other)]
+    return float(np.square((residuals[0] - residuals[1]) / other.noise[:, None])[problem.fitted_blocks].sum())
 
 
 def _shifted(prepared: Prepared, fit: Fit) -> Prepared:
     """The runs with their samples shifted along the simulated motion of this fit."""
-    tape, simulated = prepared.problem.tape, fit.evaluation.simulated
-    motor = prepared.problem.parameters(fit.coordinates)
-    runs = []
+    problem, tape = prepared.problem, prepared.problem.tape
+    everywhere = replace(tape, weight=jnp.ones_like(tape.weight))
+    plain = evaluate(replace(problem, tape=everywhere, whitening=None, nuisance=None, shift=None), fit.unknowns)
+    jacobian = np.asarray(plain.jacobian) * np.asarray(problem.noise)[:, None, None]
+    runs, slope = [], np.zeros_like(jacobian)
     for k, run in enumerate(prepared.runs):
         if not run.has_even_clock:
-            now = tape.samples_of(k, simulated, len(run))
-            then = simulated_at_stamps(motor, tape.drive_of(k), run, now, prepared.timing.first_order_hold)
-            run = _nearest_samples(run, now, then)
+            now = tape.samples_of(k, plain.simulated, len(run))
+            d_now = tape.samples_of(k, np.moveaxis(jacobian, 2, -1), len(run))
+            first_order_hold = prepared.timing.first_order_hold
+            at_stamps = partial(
+                simulated_at_stamps, drive=tape.drive_of(k), even=run, first_order_hold=first_order_hold
+            )
+            then, d_then = _with_derivatives(at_stamps, problem.parameters, fit, now, d_now)
+            nearest = _nearest(run)
+            _set_samples(slope, tape.blocks_of(k), d_then[nearest] - d_now)
+            run = _at_even_samples(run, nearest, now - then[nearest])
         runs.append(run)
     laid, begins = Tape.from_recordings(runs), np.asarray(tape.begins)
     # the first sample of a run is the first of the even clock: it counts if it did before
     laid.weight[begins, :, 0] = np.asarray(tape.weight)[begins, :, 0]
-    moved = prepared._replace(runs=runs)
+    moved = prepared.with_problem(shift=Shift(jnp.asarray(slope), fit.unknowns))._replace(runs=runs)
     return moved.with_tape(measured=jnp.asarray(laid.measured), weight=jnp.asarray(laid.weight))
 
 
-def _nearest_samples(run: Recording, now: np.ndarray, then: np.ndarray) -> Recording:
-    """A run on an even clock with the output recorded nearest to each of its samples, and NaN inside gaps.
+def _with_derivatives(
+    at_stamps: Callable[..., Recorded], parameters: Parameters, fit: Fit, now: Outputs, d_now: Derivatives
+) -> tuple[Recorded, Float[np.ndarray, "recorded 2 columns"]]:
+    """The outputs at the stamps of a record, and their derivatives by the coordinates and the run's own unknowns, from
+    those at the even samples."""
+    coordinates = np.asarray(fit.coordinates)
 
-    **Arguments**: `now` and `then`, the simulated outputs at the even samples and at the recorded ones.
-    """
+    def outputs(column: int, step: float) -> Recorded:
+        along = step * np.eye(d_now.shape[-1])[column, : len(coordinates)]
+        return at_stamps(parameters(jnp.asarray(coordinates + along)), simulated=now + step * d_now[..., column])
+
+    def derivative(column: int) -> Recorded:
+        size = float(np.max(np.abs(d_now[..., column]) / fit.noise))
+        if not size:
+            return np.zeros_like(then)
+        step = min(DIFFERENCE, DIFFERENCE / size)
+        return (outputs(column, step) - outputs(column, -step)) / (2 * step)
+
+    then = outputs(0, 0.0)
+    return then, np.stack(map_in_threads(derivative, range(d_now.shape[-1])), -1)
+
+
+def _set_samples(
+    signal: Float[np.ndarray, "blocks 2 length columns"], blocks: Bool[np.ndarray, " blocks"], values: Derivatives
+) -> None:
+    """Set the samples of one run, in its blocks of some length."""
+    part = np.moveaxis(signal[blocks], 2, 1)
+    in_time = part.reshape(-1, *values.shape[1:])
+    in_time[: len(values)] = values
+    signal[blocks] = np.moveaxis(in_time.reshape(part.shape), 1, 2)
+
+
+def _nearest(run: Recording) -> Int[np.ndarray, " samples"]:
+    """The recorded sample nearest to each of a run on an even clock."""
+    return np.rint(np.interp(run.time, run.recorded.time, np.arange(len(run.recorded)))).astype(int)
+
+
+def _at_even_samples(run: Recording, nearest: Int[np.ndarray, " samples"], shift: Outputs) -> Recording:
+    """A run on an even clock with the outputs of the nearest recorded samples, shifted, and NaN inside gaps."""
     record = run.recorded
-    nearest = np.rint(np.interp(run.time, record.time, np.arange(len(record)))).astype(int)
     near = np.abs(record.time[nearest] - run.time) <= GAP / 2 * run.sample_time
     outputs = {
-        name: np.where(near, signal[nearest] + now[:, c] - then[nearest, c], np.nan)
+        name: np.where(near, signal[nearest] + shift[:, c], np.nan)
         for c, name in enumerate(SIMULATED_OUTPUTS)
         if getattr(run, name) is not None and (signal := getattr(record, name)) is not None
     }
