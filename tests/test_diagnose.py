@@ -186,16 +186,17 @@ def test_an_effect_that_only_led_to_a_better_optimum_is_not_kept(genuine, p_valu
 
 
 @pytest.mark.parametrize("variable", ["speed", "current"])
-@pytest.mark.parametrize("at_bound", [set(), {"f"}])
-def test_effects_that_would_need_a_negative_viscous_friction_are_not_those_missing(variable, at_bound):
+@pytest.mark.parametrize("zero", [(), ("at_bound",), ("undetermined",)])
+def test_effects_that_would_need_a_negative_viscous_friction_are_not_those_missing(variable, zero):
     """An eddy-current brake, taken for Coulomb friction: its torque falls at high speed."""
     curve = Curve("mechanical", variable, "N m", np.linspace(-1.0, 1.0, 5))
     rest = Signal(1.0, -50.0, curve, Mock(spec=Block))
     screen = Mock(spec=Screen)
     screen.unfiltered.regress.side_effect = lambda blocks=(): Mock(squares=1.0 - 0.1 * bool(blocks))
     found = Assessment(screen, [], [rest], 0.0, explained=20.0, explained_unfiltered=20.0)
-    model = Mock(spec=Model, effects=("coulomb_friction",), at_bound=at_bound, fit=Mock(fitness=1.0))
-    assert found.may_be_model_form_error(model) == (variable == "current" or not at_bound)
+    friction = {name: {"f"} if name in zero else set() for name in ("at_bound", "undetermined")}
+    model = Mock(spec=Model, effects=("coulomb_friction",), fit=Mock(fitness=1.0), **friction)
+    assert found.may_be_model_form_error(model) == (variable == "current" or not zero)
 
 
 def test_a_correction_of_a_formula_does_not_hide_an_effect_found_without_a_filter():

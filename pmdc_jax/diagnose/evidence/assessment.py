@@ -116,11 +116,11 @@ class Assessment(NamedTuple):
         return self._belongs_to(model) or bool(own_curve and within)
 
     def _calls_for_negative_friction(self, model: Model) -> bool:
-        """Whether a torque over speed is left and viscous friction is at its bound, zero: the model's effects then
+        """Whether a torque over speed is left and viscous friction is next to zero, its bound: the model's effects then
         depend on the speed in another way than what is missing."""
         clearest = self.clearest.term
         over_speed = isinstance(clearest, Curve) and (clearest.equation, clearest.variable) == ("mechanical", "speed")
-        return over_speed and "f" in model.at_bound
+        return over_speed and "f" in model.at_bound | model.undetermined
 
     def is_sensor_error(self) -> bool:
         """Whether the clearest signal is an error of a sensor that no effect of the library has."""
