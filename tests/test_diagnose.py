@@ -141,7 +141,7 @@ class UndecidedSelection(StepwiseSelection):
         return [self.other if current is self.one else self.one]
 
     _best = staticmethod(lambda tried, white: tried[0])
-    _with_refined_runs = _without_needless = staticmethod(lambda model: model)
+    _with_refined_runs = _at_better_optimum = _without_needless = staticmethod(lambda model: model)
     elimination = Mock(reduced=lambda model: model)
     _is_genuine_improvement = staticmethod(lambda *models: True)
     _naming = staticmethod(lambda model: Mock(spec=Naming, chosen=model))

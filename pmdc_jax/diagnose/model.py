@@ -28,6 +28,11 @@ MAX_EFFECTS = 3
 MIN_VOLTAGE_SPREAD = 0.05
 # A model is exact if its residuals are a smaller share of what was measured, as root mean squares
 EXACT_MISFIT = 1e-4
+# Misfit (noise variances per output) from which a first-order start, or where a rotor sticks any start, may lead a
+# refit to a wrong optimum
+POOR_MISFIT = 10.0
+# Standard errors from the end of a fit to where the gradient leads beyond which it has found no optimum
+STALLED_DISTANCE = 3.0
 
 
 @attrs.frozen(eq=False)
@@ -98,6 +103,17 @@ class Model:
         """The largest range of rotor angles, in rad, of any training run."""
         angle, tape = np.asarray(self.trajectory.angle), self.problem.tape
         return float(max(np.ptp(angle[:, tape.blocks_of(run)]) for run in self.prepared.training_indices))
+
+    @property
+    def is_poor(self) -> bool:
+        """Whether it leaves so much more than the noise (`POOR_MISFIT`) that it may be a wrong optimum."""
+        return self.fit.fitness > POOR_MISFIT * self.problem.perfect_fitness
+
+    @property
+    def is_stalled(self) -> bool:
+        """Whether its fit ended far from where a gradient leads (`STALLED_DISTANCE`), as where a rotor sticks and
+        slips."""
+        return self.fit.optimum.distance > STALLED_DISTANCE
 
     @property
     def at_bound(self) -> set[str]:

@@ -41,8 +41,8 @@ MAX_DETUNING = 0.05
 NEGLIGIBLE = 2e-3
 # The same below which no recording is exact enough to tell anything: a hundredth of the effects, as amplitudes
 INEXACT = 1e-4
-# The first for models with a refit-only form, whose fit is never exact because when teeth meet is unpredictable
-NEGLIGIBLE_REFIT_ONLY = 1e-2
+# The first for models whose fit is never exact because when teeth meet, or a rotor slips, is unpredictable
+NEGLIGIBLE_INEXACT = 1e-2
 
 
 def familywise_p_value(candidate_signals: Sequence[Signal], curve_signals: Sequence[Signal], count: int) -> float:
@@ -176,14 +176,15 @@ class Assessment(NamedTuple):
 
     def is_negligible(self, model: Model) -> bool:
         """Whether too little is left for another trial (`NEGLIGIBLE`)."""
-        return self.unexplained < (NEGLIGIBLE_REFIT_ONLY if _has_refit_only(model) else NEGLIGIBLE)
+        is_inexact = _has_refit_only(model) or model.is_stalled
+        return self.unexplained < (NEGLIGIBLE_INEXACT if is_inexact else NEGLIGIBLE)
 
     def is_unrelated_to(self, model: Model) -> bool:
         """Whether what is left is clearly one more effect, in another equation or over another variable than any of the
         model's, so that these cannot have left it.
 
         Never beside a refit-only form: what gear teeth leave, which meet at unpredictable times, can look like any
-        effect; nor if so little is left (`INEXACT`).
+        effect; nor a torque where a rotor slips at unpredictable times; nor if so little is left (`INEXACT`).
         """
         if _has_refit_only(model) or self.p_value >= FALSE_ALARM or self.best_candidate_share < EFFECT_SHARE:
             return False
@@ -192,6 +193,8 @@ class Assessment(NamedTuple):
         best_curve = max(self.curve_signals, key=attrgetter("gain"))
         best = max(self.candidate_signals, key=attrgetter("gain")).candidate
         assert isinstance(best_curve.term, Curve) and best is not None
+        if model.is_stalled and EFFECTS[best.effect].equation == "mechanical":
+            return False
         # of model-form error a curve over the effect's own variable explains nearly all
         own_curve = has_axes_of(model, best_curve.term) and best_curve.gain > CURVE_SHARE * self.clearest.gain
         return not (own_curve or has_axes_of(model, EFFECTS[best.effect]))

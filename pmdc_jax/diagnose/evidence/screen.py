@@ -20,7 +20,7 @@ from .signals import Screen, Signal, signals
 
 # Samples of an uneven clock are simulated only approximately: what explains a smaller share of their whitened squares
 # is no evidence
-UNEVEN_SHARE = 0.001
+UNEVEN_SHARE = 0.005
 
 
 def screen(model: Model, library: Library) -> Screen:

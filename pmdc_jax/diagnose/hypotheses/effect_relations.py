@@ -1,9 +1,10 @@
-"""Which effects contain others, and which sets of effects are the same torque while the motor turns."""
+"""Which effects contain others, which hold the rotor, and which sets are the same torque while the motor turns."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 
+from ...effects import EFFECTS
 from .trials import TRIALS
 
 # By richer effect, the effects that it contains and replaces
@@ -16,6 +17,11 @@ def unbalanced_equation(equation: str) -> str:
     """The equation that a missing effect violates: the electrical one for a voltage lost before the terminals
     ("input"), otherwise its own."""
     return "electrical" if equation == "input" else equation
+
+
+def may_hold_rotor(effect: str) -> bool:
+    """Whether an effect may hold the rotor at rest."""
+    return EFFECTS[effect].holds == "speed"
 
 
 def are_rivals(a: set[str], b: set[str]) -> bool:

@@ -89,7 +89,7 @@ class StepwiseSelection:
         current = self.base
         self.superseded.add(current)
         while better := self._step(current):
-            current = self._with_refined_runs(self._without_needless(better))
+            current = self._with_refined_runs(self._at_better_optimum(self._without_needless(better)))
             self.superseded.add(current)
         others = self.proposals.by_swap(current, self.equivalents)
         # even if little is left: what backlash leaves is small beside what a large effect explains
@@ -140,6 +140,13 @@ class StepwiseSelection:
                 self.superseded.add(model)
                 return smaller
         return model
+
+    def _at_better_optimum(self, model: Model) -> Model:
+        """The model just accepted, or one with the same effects found around it that leaves far less."""
+        better = self.refits.searched_around(model)
+        if better is not model:
+            self.superseded.add(model)
+        return better
 
     def _step(self, current: Model) -> Model | None:
         """The next model: of several kinds of proposals the first that is better and accepted; None if there is none.

@@ -12,9 +12,9 @@ from operator import attrgetter
 from ...effects import EFFECTS
 from ..evidence.assessment import FALSE_ALARM, REFIT_ONLY, TRIAL_SHARE, Assessment
 from ..evidence.signals import Signal
-from ..hypotheses.effect_relations import CONTAINS, covered_by
+from ..hypotheses.effect_relations import CONTAINS, covered_by, may_hold_rotor
 from ..hypotheses.trials import TRIALS
-from ..model import MAX_EFFECTS, Model
+from ..model import MAX_EFFECTS, POOR_MISFIT, Model
 from .compare import DECISIVE_RATIO
 from .refits import Refits
 from .shortlist import (
@@ -30,8 +30,6 @@ from .shortlist import (
 
 # Least share of the unfiltered squares that a candidate must promise to be tried on the unfiltered misfit
 MIN_UNFILTERED_SHARE = 0.05
-# Misfit (noise variances per output) from which a first-order start may lead a refit to a wrong optimum
-POOR_MISFIT = 10.0
 
 # What a refit-only form may leave of what its simple form left unexplained, to be all that is missing
 MAX_REST = 0.5
@@ -118,10 +116,9 @@ class Proposals:
         Effects that were fitted to a rotor that sticks, without friction, are too far from the truth to show it.
         """
         assessment, present = self.assess(current), set(current.effects)
-        if not 0 < len(present) < MAX_EFFECTS or any(map(_sticks, present)) or assessment.p_value >= FALSE_ALARM:
+        if not 0 < len(present) < MAX_EFFECTS or any(map(may_hold_rotor, present)) or assessment.p_value >= FALSE_ALARM:
             return []
-        is_poor = current.fit.fitness > POOR_MISFIT * current.problem.perfect_fitness
-        if not (is_poor and assessment.leaves_unfiltered_misfit(current)):
+        if not (current.is_poor and assessment.leaves_unfiltered_misfit(current)):
             return []
         earlier = [self.assess(m) for m in self.superseded if set(m.effects) < present]
         if _shows_friction(assessment) or not any(map(_shows_friction, earlier)):
@@ -203,7 +200,9 @@ class Proposals:
             suspects = tuple(dict.fromkeys(s.effect for s in by_gain))[:SHORTLIST]
             nearest, noise = current, current.problem.perfect_fitness
         decisive = nearest.fit.fitness / DECISIVE_RATIO
-        if not any(map(_sticks, suspects)) or decisive < noise:  # not even a perfect fit would cut the misfit so far
+        if (
+            not any(map(may_hold_rotor, suspects)) or decisive < noise
+        ):  # not even a perfect fit would cut the misfit so far
             return []
         searched = [self.refits.with_global_search(current, "coulomb_friction")]
         if "asymmetric_friction" in nearest.effects_at_end:
@@ -217,12 +216,7 @@ class Proposals:
 
 def _shows_friction(assessment: Assessment) -> bool:
     """Whether the evidence clearly shows an effect that may hold the rotor at rest."""
-    return any(_sticks(signal.effect) for signal in clear_signals(assessment))
-
-
-def _sticks(effect: str) -> bool:
-    """Whether an effect may hold the rotor at rest."""
-    return EFFECTS[effect].holds == "speed"
+    return any(may_hold_rotor(signal.effect) for signal in clear_signals(assessment))
 
 
 def _may_add_effect(current: Model, assessment: Assessment) -> bool:

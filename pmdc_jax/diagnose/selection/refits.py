@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import jax.numpy as jnp
 import numpy as np
 
+from ...effects import EFFECTS
 from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.fit.gauss_newton import TRIAL_TOLERANCE
 from ...identify.fit.generalised_least_squares import residuals_of, with_whitening
@@ -22,7 +23,7 @@ from ...progress import ReportProgress
 from ...runtime.threads import map_in_threads, map_in_threads_until
 from ..evidence.signals import Screen, Signal
 from ..hypotheses.candidates import Scales
-from ..hypotheses.effect_relations import FULLER
+from ..hypotheses.effect_relations import FULLER, may_hold_rotor
 from ..hypotheses.trials import TRIALS
 from ..model import Model, model_of, refit_from
 from .compare import Comparison
@@ -39,6 +40,8 @@ MIN_IMPROVEMENT = 1e-3
 SHORT_REFIT_STEPS = 8
 # ... two of which found the same optimum if their misfits differ by less than this factor
 SAME_OPTIMUM_RATIO = 1.05
+# Factor around the parameters of effects that may hold the rotor within which a population searches
+STICKING_FACTOR = 2.0
 # A fuller form whose short refits leave no less than this share of the simple form's misfit is searched no further
 MAX_FULLER_MISFIT = 0.9
 
@@ -136,6 +139,20 @@ class Refits:
         model = self._stored_or_fitted(effects, current, search)
         assert model is not None
         return model
+
+    def searched_around(self, model: Model) -> Model:
+        """The model; or the same effects fitted from the best of a population around it, in their parameters that may
+        hold the rotor at rest, if that leaves far less: where a rotor sticks and slips, each moment at which it does is
+        an optimum of its own."""
+        sticking = [effect for effect in model.effects if may_hold_rotor(effect)]
+        if not sticking or not model.is_poor:
+            return model
+        factors = {f"{effect}.{field}": STICKING_FACTOR for effect in sticking for field in EFFECTS[effect].ranges}
+        around = _best_around(model.prepared, model.fit.optimum, factors, self.solved.seed)
+        elsewhere = FittedRuns.polished(model.prepared, around, TRIAL_TOLERANCE)
+        if elsewhere.fit.fitness > MAX_PLAIN_MISFIT * model.fit.fitness:
+            return model
+        return self.replace(model_of(elsewhere))
 
     def with_fuller_form_held(self, current: Model, white: Whitener, effect: str, give_up_above: float) -> Model:
         """The current model with a fuller form of an effect, whose extra parameters are held where they clearly act;
