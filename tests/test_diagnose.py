@@ -34,7 +34,7 @@ from pmdc_jax.diagnose.judgement import _by_evidence, implausible_effect, may_be
 from pmdc_jax.diagnose.model import Model, RunSeries, model_of
 from pmdc_jax.diagnose.response import respond, sensor_changes, state_increments, trajectory_of
 from pmdc_jax.diagnose.selection import naming, proposals
-from pmdc_jax.diagnose.selection.compare import Comparison, Fitted
+from pmdc_jax.diagnose.selection.compare import DECISIVE_RATIO, Comparison, Fitted
 from pmdc_jax.diagnose.selection.naming import Naming, StepwiseSelection
 from pmdc_jax.diagnose.selection.proposals import Proposals
 from pmdc_jax.diagnose.selection.refits import Refits
@@ -171,16 +171,26 @@ def test_a_model_with_warm_runs_takes_the_place_of_one_in_which_all_begin_cold(m
 
 @pytest.mark.parametrize("genuine", [True, False])
 @pytest.mark.parametrize("p_value", [0.0, 1.0])
-def test_an_effect_that_only_led_to_a_better_optimum_is_not_kept(genuine, p_value):
+@pytest.mark.parametrize(
+    ("negligible", "unrelated", "misfit"),
+    [(False, False, 2.0), (True, False, 2.0), (True, True, 2.0), (True, False, 9.0)],
+)
+def test_an_effect_that_only_led_to_a_better_optimum_is_not_kept(genuine, p_value, negligible, unrelated, misfit):
     """Torque ripple beside friction that sticks and slips: the fit without it, from where that with it ended, leaves
-    no more."""
+    no more, or so little that it would not have been tried."""
     selection = UndecidedSelection()
-    both, one, none = (Mock(spec=Model, is_possible=True, effects=e) for e in (("a", "b"), ("a",), ()))
+    both, one, none = (
+        Mock(spec=Model, is_possible=True, effects=effects, fit=Mock(fitness=fitness))
+        for effects, fitness in ((("a", "b"), 1.5), (("a",), misfit), ((), 99.0))
+    )
     selection.refits = Mock(spec=Refits, without_each=lambda model, effects, white: [none, one])
     selection.comparison.filter_of = lambda model: "white"
-    selection.assess.return_value.p_value = p_value
+    evidence = selection.assess.return_value
+    evidence.p_value, evidence.is_negligible.return_value = p_value, negligible
+    evidence.is_unrelated_to.return_value = unrelated
     selection._is_genuine_improvement = lambda smaller, model: genuine
-    needless = p_value < FALSE_ALARM and not genuine
+    of_no_use = negligible and not unrelated and misfit < 1.5 * DECISIVE_RATIO
+    needless = of_no_use or (p_value < FALSE_ALARM and not genuine)
     assert StepwiseSelection._without_needless(selection, both) is (one if needless else both)
     assert (both in selection.superseded) == needless
 

@@ -378,6 +378,45 @@ def test_stribeck_friction_of_a_rotor_that_sticks_for_long_is_named():
         assert effect.parameters[field].value == pytest.approx(truth, rel=0.02)
 
 
+def in_speed_loop(set_points: np.ndarray, rng: np.random.Generator) -> Recording:
+    """A 20 W motor with Stribeck friction and a little torque noise in a PI loop, by implicit steps of 25 us."""
+    R, L, K, J, f = 2.3, 3.5e-4, 0.0234, 5.6e-6, 5e-6
+    coulomb, static, stribeck_speed = STICKING
+    step, substeps, i, w, integral, torque, rows = 1e-3, 40, 0.0, 0.0, 0.0, 0.0, []
+    h, decay = step / substeps, np.exp(-step / 0.02)
+    for wanted in set_points:
+        integral += (wanted - w) * step
+        voltage = np.clip(0.03 * (wanted - w) + 0.6 * integral, -12.0, 12.0)
+        rows.append((voltage, i, w))
+        torque = decay * torque + 4e-5 * np.sqrt(1 - decay**2) * rng.standard_normal()
+        for _ in range(substeps):
+            i = (i + h * (voltage - K * w) / L) / (1 + h * R / L)
+            free = w + h * (K * i - f * w - torque) / J
+            friction = coulomb + (static - coulomb) * np.exp(-((w / stribeck_speed) ** 2))
+            w = np.sign(free) * max(abs(free) - h * friction / J, 0.0)
+    voltage, current, speed = np.array(rows).T
+    current, speed = (x + size * rng.standard_normal(len(x)) for x, size in ((current, 8e-3), (speed, 0.15)))
+    return Recording("loop", step * np.arange(len(speed)), voltage, current, speed, load=np.zeros(len(speed)))
+
+
+# Coulomb and static friction, N m, and Stribeck speed, rad/s
+STICKING = (3.1e-3, 5.4e-3, 7.0)
+
+
+@pytest.mark.slow
+def test_friction_of_a_rotor_that_sticks_and_slips_in_a_speed_loop_is_named_alone():
+    """Replayed in open loop, each moment at which it slips is an optimum of its own; a wrong one calls for effects that
+    are not there."""
+    runs = [
+        attrs.evolve(in_speed_loop(np.repeat(levels, 500), np.random.default_rng(seed)), name=str(seed))
+        for seed, levels in ((71, (3.0, -5.0, 8.0, -3.0, 12.0, 4.0)), (72, (40.0, -20.0, 5.0, -50.0, 10.0, 30.0)))
+    ]
+    (effect,) = diagnose(runs).effects
+    assert effect.name == "stribeck_friction"
+    for field, truth in zip(("coulomb_Nm", "static_Nm", "speed_rad_s"), STICKING, strict=True):
+        assert effect.parameters[field].value == pytest.approx(truth, rel=0.1)
+
+
 @pytest.mark.slow
 def test_a_load_that_exceeds_friction_is_named_with_it():
     """A hoist, which such a load drives backwards. Friction in one direction only fits nearly as well, and a whitening

@@ -133,13 +133,21 @@ class StepwiseSelection:
     def _without_needless(self, model: Model) -> Model:
         """The model just accepted, without an effect that would not be accepted beside the others as they are fitted
         now: where a rotor sticks and slips, it may only have led them to a better optimum."""
-        if self.assess(model).p_value >= FALSE_ALARM:
-            return model
         for smaller in self.refits.without_each(model, model.effects, self.comparison.filter_of(model)):
-            if smaller.effects and self._is_new(smaller) and not self._is_genuine_improvement(smaller, model):
+            if smaller.effects and self._is_new(smaller) and self._is_enough(smaller, model):
                 self.superseded.add(model)
                 return smaller
         return model
+
+    def _is_enough(self, smaller: Model, model: Model) -> bool:
+        """Whether a model without one of the effects of another would not be extended by it: too little is left for a
+        trial, or more than the other one explains."""
+        assessment = self.assess(smaller)
+        decisive = model.fit.fitness < smaller.fit.fitness / DECISIVE_RATIO
+        if assessment.is_negligible(smaller) and not (decisive or assessment.is_unrelated_to(smaller)):
+            return True
+        leaves_more = self.assess(model).p_value < FALSE_ALARM
+        return leaves_more and not self._is_genuine_improvement(smaller, model)
 
     def _at_better_optimum(self, model: Model) -> Model:
         """The model just accepted, or one with the same effects found around it that leaves far less."""
