@@ -78,7 +78,6 @@ def scalar_phi(z: ArrayLike, k: int) -> np.ndarray:
         return np.exp(z)
     small = np.abs(z) < SERIES_LIMIT
     safe = np.where(small, 1.0, z)
-    first = np.where(small, 1 + z / 2 + z**2 / 6 + z**3 / 24 + z**4 / 120, np.expm1(safe) / safe)
-    if k == 1:
-        return first
-    return np.where(small, 1 / 2 + z / 6 + z**2 / 24 + z**3 / 120, (first - 1) / safe)
+    series = (1 + z / 3 * (1 + z / 4 * (1 + z / 5))) / 2
+    first = np.where(small, 1 + z * series, np.expm1(safe) / safe)
+    return first if k == 1 else np.where(small, series, (first - 1) / safe)

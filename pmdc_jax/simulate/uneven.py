@@ -122,7 +122,7 @@ def _phi_responses(A: Float[np.ndarray, "2 2"], length: np.ndarray) -> list[np.n
 
     **Source**: Higham, "Functions of Matrices" (2008), definition 1.4.
     """
-    one, other = np.linalg.eigvals(A).astype(complex)
+    one, other = np.linalg.eigvals(A)
     if abs(one - other) < MIN_EIGENVALUE_GAP * abs(one + other):  # critically damped
         other = one * (1 + MIN_EIGENVALUE_GAP)
     distance = (one - other) or 1.0

@@ -105,7 +105,7 @@ def _with_derivatives(
         if not size:
             return np.zeros_like(then)
         step = min(DIFFERENCE, DIFFERENCE / size)
-        return (outputs(column, step) - outputs(column, -step)) / (2 * step)
+        return (outputs(column, step) - then) / step
 
     then = outputs(0, 0.0)
     return then, np.stack(map_in_threads(derivative, range(d_now.shape[-1])), -1)
