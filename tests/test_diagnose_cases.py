@@ -378,6 +378,10 @@ def test_stribeck_friction_of_a_rotor_that_sticks_for_long_is_named():
         assert effect.parameters[field].value == pytest.approx(truth, rel=0.02)
 
 
+# Coulomb and static friction, N m, and Stribeck speed, rad/s
+STICKING = (3.1e-3, 5.4e-3, 7.0)
+
+
 def in_speed_loop(set_points: np.ndarray, rng: np.random.Generator) -> Recording:
     """A 20 W motor with Stribeck friction and a little torque noise in a PI loop, by implicit steps of 25 us."""
     R, L, K, J, f = 2.3, 3.5e-4, 0.0234, 5.6e-6, 5e-6
@@ -397,10 +401,6 @@ def in_speed_loop(set_points: np.ndarray, rng: np.random.Generator) -> Recording
     voltage, current, speed = np.array(rows).T
     current, speed = (x + size * rng.standard_normal(len(x)) for x, size in ((current, 8e-3), (speed, 0.15)))
     return Recording("loop", step * np.arange(len(speed)), voltage, current, speed, load=np.zeros(len(speed)))
-
-
-# Coulomb and static friction, N m, and Stribeck speed, rad/s
-STICKING = (3.1e-3, 5.4e-3, 7.0)
 
 
 @pytest.mark.slow

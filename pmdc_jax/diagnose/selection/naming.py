@@ -142,12 +142,13 @@ class StepwiseSelection:
     def _is_enough(self, smaller: Model, model: Model) -> bool:
         """Whether a model without one of the effects of another would not be extended by it: too little is left for a
         trial, or more than the other one explains."""
-        assessment = self.assess(smaller)
-        decisive = model.fit.fitness < smaller.fit.fitness / DECISIVE_RATIO
-        if assessment.is_negligible(smaller) and not (decisive or assessment.is_unrelated_to(smaller)):
-            return True
         leaves_more = self.assess(model).p_value < FALSE_ALARM
-        return leaves_more and not self._is_genuine_improvement(smaller, model)
+        if leaves_more and not self._is_genuine_improvement(smaller, model):
+            return True
+        if model.fit.fitness < smaller.fit.fitness / DECISIVE_RATIO:
+            return False  # without the evidence against the smaller one, which is slow to gather
+        assessment = self.assess(smaller)
+        return assessment.is_negligible(smaller) and not assessment.is_unrelated_to(smaller)
 
     def _at_better_optimum(self, model: Model) -> Model:
         """The model just accepted, or one with the same effects found around it that leaves far less."""

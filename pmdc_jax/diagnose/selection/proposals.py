@@ -200,9 +200,8 @@ class Proposals:
             suspects = tuple(dict.fromkeys(s.effect for s in by_gain))[:SHORTLIST]
             nearest, noise = current, current.problem.perfect_fitness
         decisive = nearest.fit.fitness / DECISIVE_RATIO
-        if (
-            not any(map(may_hold_rotor, suspects)) or decisive < noise
-        ):  # not even a perfect fit would cut the misfit so far
+        # below the noise, not even a perfect fit would cut the misfit so far
+        if not any(map(may_hold_rotor, suspects)) or decisive < noise:
             return []
         searched = [self.refits.with_global_search(current, "coulomb_friction")]
         if "asymmetric_friction" in nearest.effects_at_end:
