@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import attrs
@@ -25,6 +26,7 @@ from pmdc_jax.motor import Motor
 from pmdc_jax.recordings.recording import AROUND, OVER_BOTH, OVER_LAST, Averaging, Recording
 from pmdc_jax.simulate import UNKNOWNS_PER_RUN, RunUnknowns, Tape, free_run, sensitivities, squared_errors
 
+DOCUMENTED = Path(__file__).parents[1] / "docs" / "effects.md"
 STARTS = ((5.0, 60.0), (-3.0, -8.0), (0.0, 0.0))  # current A, speed rad/s of each run
 
 Values = Mapping[str, float]
@@ -392,6 +394,15 @@ def relative_errors(found: list[np.ndarray], expected: list[np.ndarray]) -> np.n
 
 def test_every_effect_has_a_case():
     assert set(CASES) == set(EFFECTS)
+
+
+@every_effect
+def test_every_effect_and_its_parameters_are_documented(name):
+    rows = DOCUMENTED.read_text(encoding="utf-8").splitlines()
+    (row,) = [line for line in rows if line.startswith(f"| `{name}` |")]
+    shares_row_above = name == "gear_backlash"  # of `shaft_compliance`, which it extends
+    fields = EFFECTS[name].ranges.keys() - (EFFECTS["shaft_compliance"].ranges.keys() if shares_row_above else set())
+    assert all(f"`{field}`" in row for field in fields)
 
 
 @each_simulated

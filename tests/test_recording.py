@@ -224,6 +224,15 @@ def test_a_reference_is_not_taken_for_the_measured_speed(tmp_path):
     np.testing.assert_allclose(read_text(tmp_path, text).speed, 2 * T * RPM)
 
 
+def test_a_commanded_voltage_is_used_if_none_was_measured(tmp_path):
+    run = read_text(tmp_path, table("time_s,u_cmd / V,u_bat / V,I_mot [mA],n_rpm", T, T, 0 * T + 24, T, T))
+    np.testing.assert_allclose(run.voltage, T)
+    assert ("u_cmd / V", True) in [(n.column, "because of its unit" in n.what) for n in run.notes]
+    run = read_text(tmp_path, table("time_s,u_cmd / V,U_mot / V,I_mot [mA],n_rpm", T, 2 * T, T, T, T))
+    np.testing.assert_allclose(run.voltage, T)
+    assert read_text(tmp_path, table("time_s,voltage_V,i_cmd / A,n_rpm", T, T, T, T)).current is None
+
+
 def test_columns_are_converted_to_si_and_others_are_listed_as_ignored(tmp_path):
     text = table("time_ms,voltage_V,Speed [rpm],flag", 1000 * T, T, 60 + T, T)
     run = read_text(tmp_path, text)

@@ -103,8 +103,10 @@ LOADS = re.compile(r"(?i)(?<![a-z])(load|last|brak|brems|dyno)")
 DATED = ("timestamp", "time_stamp", "datetime", "date_time", "date", "datum")
 # The layout of times of the day in a header, as in Time [hh:mm:ss.fff]
 CLOCK_LAYOUT = re.compile(r"(?i)\s*[\[(]\s*h+:m+(:s+)?[.,\w]*\s*[\])]$")
-# Words in the names of columns that hold set points, limits or supplies rather than a measurement of the motor
-NOT_MEASURED = re.compile(r"(?i)(?<![a-z])(ref|set|soll|cmd|command|target|demand|desired|limit|max|min|supply|bat)")
+# Words in the names of columns that hold a set point rather than a measurement
+COMMANDED = re.compile(r"(?i)(?<![a-z])(ref|set|soll|cmd|command|target|demand|desired)")
+# ... and in those of columns that hold a limit or a supply rather than what is at the motor
+NOT_AT_MOTOR = re.compile(r"(?i)(?<![a-z])(limit|max|min|supply|bat)")
 
 
 @frozen
@@ -171,27 +173,28 @@ def _match_by_unit_or_symbol(headers: Sequence[str], matched: Mapping[str, Colum
     free = [header for header in headers if header not in taken]
     known: dict[str, Column] = {}
     for quantity in (q for q in RECOGNISED_BY_UNIT if q not in matched):
-        alike = [
-            evolve(_column(header, quantity, unit), by_unit=True)
-            for header in free
-            if (unit := _measured_unit(header, quantity))
-        ]
+        alike = _of_unit(free, quantity, commanded=False)
         if symbol := MOTOR_SYMBOLS.get(quantity):
             marked = (header for header in free if symbol.fullmatch(_normalised(header)))
             alike += [_column(header, quantity, None) for header in marked]
+        if quantity == "voltage" and not alike:  # a bridge applies about what it is told to
+            alike = _of_unit(free, quantity, commanded=True)
         if len(alike) == 1:
             known[quantity] = alike[0]
     return known
 
 
-def _measured_unit(header: str, quantity: str) -> str | None:
-    """The shaft unit of the quantity in a header, None without one or if the name does not go with it (see `LOADS` and
-    `NOT_MEASURED`)."""
-    for name, unit, _ in _readings(header):
-        if unit and _is_unit_of(unit, quantity, QUANTITIES[quantity].units[:1]):
-            named = quantity != "load" or LOADS.search(name)
-            return unit if named and not NOT_MEASURED.search(name) else None
-    return None
+def _of_unit(headers: Sequence[str], quantity: str, *, commanded: bool) -> list[Column]:
+    """The headers with a shaft unit of the quantity and a name that goes with it, of measurements or of set points."""
+    columns = []
+    for header in headers:
+        units = QUANTITIES[quantity].units[:1]
+        readings = ((name, unit) for name, unit, _ in _readings(header) if unit and _is_unit_of(unit, quantity, units))
+        name, unit = next(readings, ("", None))
+        fits = bool(COMMANDED.search(name)) == commanded and not NOT_AT_MOTOR.search(name)
+        if unit and fits and (quantity != "load" or LOADS.search(name)):
+            columns.append(evolve(_column(header, quantity, unit), by_unit=True))
+    return columns
 
 
 def understand(header: str) -> Column | None:

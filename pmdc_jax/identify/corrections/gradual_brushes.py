@@ -9,9 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...effects import BrushVoltageDrop, GradualBrushDrop
+from ...runtime.threads import map_in_threads
 from ..fit.fitted_runs import FittedRuns
 from ..fit.gauss_newton import TRIAL_TOLERANCE
 from ..fit.likelihood import MIN_LOG_LIKELIHOOD_GAIN, leaves_only_noise, negative_log_likelihood
+from ..fit.polish import fit_at, polish, reweighted
+from ..fit.refine import Optimum
 from ..prepare import Prepared
 
 # Currents of the onset that are tried, over the root mean square of those measured
@@ -19,6 +22,8 @@ ONSETS = (0.02, 0.06, 0.2)
 # Fastest rate of a gradual drop, times the shortest sample time, from which a fit starts, and where it may end: a
 # steeper one is hardly different from a constant one, and would need too many steps in a sample
 MAX_RATE, MAX_FITTED_RATE = 10.0, 20.0
+# Gauss-Newton steps, slow where the onset is steep, after which a gradual drop must fit better than a constant one
+FIRST_STEPS = 4
 ONSET = f"{GradualBrushDrop.name}.onset_A"
 
 
@@ -31,13 +36,15 @@ def with_gradual_brushes(fitted: FittedRuns) -> FittedRuns:
     onsets = float(problem.measured_rms[0]) * np.array(ONSETS)
     kinds = [GradualBrushDrop if kind is BrushVoltageDrop else kind for kind in problem.parameters.effects]
     gradual = prepared.with_effects(kinds)
-    ends = [_polished(gradual, fitted, onset) for onset in onsets if _rate(fitted, onset) < MAX_RATE]
-    if not ends:
+    starts = [_start(gradual, fitted, onset) for onset in onsets if _rate(fitted, onset) < MAX_RATE]
+    if not starts:
         return fitted
-    best = min(ends, key=lambda end: end.fit.cost)
-    if best.fit.cost >= fitted.fit.cost:  # a local optimum: a steep onset is as good as a constant drop
+    at_starts = map_in_threads(lambda start: fit_at(gradual.problem, start), starts)
+    nearest = min(at_starts, key=lambda fit: fit.cost)
+    begun = polish(gradual.problem, nearest.optimum, FIRST_STEPS, TRIAL_TOLERANCE, reweighted(gradual.problem, nearest))
+    if begun.cost >= fitted.fit.cost:  # a local optimum: a steep onset is as good as a constant drop
         return fitted
-    best = FittedRuns.polished(gradual, best.fit.optimum)
+    best = FittedRuns.polished(gradual, begun.optimum)
     if _rate(best, best.problem.parameters.value(ONSET, np.asarray(best.fit.coordinates))) > MAX_FITTED_RATE:
         return fitted
     gain = negative_log_likelihood(fitted) - negative_log_likelihood(best)
@@ -52,11 +59,10 @@ def _rate(fitted: FittedRuns, onset: float) -> float:
     return float(drop.voltage_V / (onset * motor.L) * np.min(np.asarray(tape.sample_time)))
 
 
-def _polished(gradual: Prepared, fitted: FittedRuns, onset: float) -> FittedRuns:
-    """The fit to the runs with a gradual drop, from the fit with a constant one and an onset in A."""
+def _start(gradual: Prepared, fitted: FittedRuns, onset: float) -> Optimum:
+    """Where a fit with a gradual drop starts: at the fit with a constant one, with an onset in A."""
     names = fitted.problem.parameters.names
     values = dict(zip(names, np.asarray(fitted.fit.coordinates), strict=True)) | {ONSET: np.log(onset)}
     coordinates = jnp.asarray([values[name] for name in gradual.problem.parameters.names])
-    start = fitted.fit.optimum
-    start = start._replace(unknowns=start.unknowns._replace(coordinates=coordinates), at_bound=())
-    return FittedRuns.polished(gradual, start, TRIAL_TOLERANCE)
+    at_constant = fitted.fit.optimum
+    return at_constant._replace(unknowns=at_constant.unknowns._replace(coordinates=coordinates), at_bound=())
