@@ -91,6 +91,11 @@ def _largest_squares(prepared: Prepared, least: float, margin: float) -> float:
     return least + margin + HOPELESS_EXCESS - _penalty(prepared)
 
 
+def is_decisively_better(better: Model, worse: Model) -> bool:
+    """Whether a model leaves so much less unfiltered squares than another that no filter need compare them."""
+    return better.fit.fitness < worse.fit.fitness / DECISIVE_RATIO
+
+
 def simplest_equivalent(ranked: Sequence[Fitted]) -> Model:
     """The best model, or one with an effect in a simpler form whose criterion is within `BIC_MARGIN` of the best."""
     best = ranked[0]

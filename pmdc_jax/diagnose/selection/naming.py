@@ -29,7 +29,7 @@ from ..evidence.signals import Screen, signals
 from ..hypotheses.effect_relations import are_rivals
 from ..hypotheses.library import Library
 from ..model import MAX_EFFECTS, Model, final_fit, model_of
-from .compare import BIC_MARGIN, DECISIVE_RATIO, Comparison, Fitted, simplest_equivalent
+from .compare import BIC_MARGIN, DECISIVE_RATIO, Comparison, Fitted, is_decisively_better, simplest_equivalent
 from .elimination import BackwardElimination
 from .proposals import Proposals, Proposed
 from .refits import Refits
@@ -145,7 +145,7 @@ class StepwiseSelection:
         leaves_more = self.assess(model).p_value < FALSE_ALARM
         if leaves_more and not self._is_genuine_improvement(smaller, model):
             return True
-        if model.fit.fitness < smaller.fit.fitness / DECISIVE_RATIO:
+        if is_decisively_better(model, smaller):
             return False  # without the evidence against the smaller one, which is slow to gather
         assessment = self.assess(smaller)
         return assessment.is_negligible(smaller) and not assessment.is_unrelated_to(smaller)
@@ -215,7 +215,7 @@ class StepwiseSelection:
         if added & set(REFIT_ONLY.values()):
             return True
         on_other_axes = not any(has_axes_of(current, EFFECTS[effect]) for effect in added)
-        if current.effects and on_other_axes and _is_decisive(current, better):
+        if current.effects and on_other_axes and _comes_decisively_nearer(current, better):
             return True
         assessment = self.assess(current)
         return assessment.exceeds_model_form_error(current) or self._leaves_little(current, better)
@@ -287,8 +287,8 @@ class StepwiseSelection:
                 self.equivalents.setdefault(*(chosen - rival), set()).update(rival - chosen)
 
 
-def _is_decisive(current: Model, better: Model) -> bool:
-    """Whether a model far from the noise comes decisively nearer to it with a better one."""
+def _comes_decisively_nearer(current: Model, better: Model) -> bool:
+    """Whether a better model takes away most of what one far from the noise leaves beyond it."""
     noise = current.problem.perfect_fitness
     far, nearer = (model.fit.fitness / noise for model in (current, better))
     return bool(far > DECISIVE_RATIO and nearer - 1 < (far - 1) / DECISIVE_RATIO)

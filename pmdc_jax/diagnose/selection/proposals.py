@@ -15,7 +15,7 @@ from ..evidence.signals import Signal
 from ..hypotheses.effect_relations import CONTAINS, covered_by, may_hold_rotor
 from ..hypotheses.trials import TRIALS
 from ..model import MAX_EFFECTS, POOR_MISFIT, Model
-from .compare import DECISIVE_RATIO
+from .compare import DECISIVE_RATIO, is_decisively_better
 from .refits import Refits
 from .shortlist import (
     SHORTLIST,
@@ -99,15 +99,14 @@ class Proposals:
     def by_unfiltered_misfit(self, current: Model) -> Proposed:
         """The current model with one of the effects that gain most on the unfiltered misfit, if that falls by a factor
         of `DECISIVE_RATIO`: a whitening filter absorbs as noise what lasts as long as a short run."""
-        assessment, decisive = self.assess(current), current.fit.fitness / DECISIVE_RATIO
-        full = len(current.effects) == MAX_EFFECTS
-        if full or assessment.p_value >= FALSE_ALARM or decisive < current.problem.perfect_fitness:
+        assessment, full = self.assess(current), len(current.effects) == MAX_EFFECTS
+        if full or assessment.p_value >= FALSE_ALARM or not _may_improve_decisively(current):
             return []
         unfiltered = assessment.screen._replace(evidence=assessment.screen.unfiltered)
         least = MIN_UNFILTERED_SHARE * assessment.screen.unfiltered.regress().squares
         promising = most_promising(assessment.unfiltered_signals(), covered_by(current.effects), least)
         tried = self.refits.with_signals(current, promising, unfiltered)
-        return [m for m in tried if m is not None and m.fit.fitness < decisive]
+        return [m for m in tried if m is not None and is_decisively_better(m, current)]
 
     def by_search_with_friction(self, current: Model) -> Proposed:
         """The current model with Coulomb friction from a new global search, where its effects leave much of the misfit
@@ -124,7 +123,7 @@ class Proposals:
         if _shows_friction(assessment) or not any(map(_shows_friction, earlier)):
             return []
         searched = self.refits.with_global_search(current, "coulomb_friction")
-        return [searched] if searched.fit.fitness < current.fit.fitness / DECISIVE_RATIO else []
+        return [searched] if is_decisively_better(searched, current) else []
 
     def by_exchange(self, current: Model) -> Proposed:
         """A model with `MAX_EFFECTS` effects, with the new one of largest gain in place of one in the same equation."""
@@ -194,23 +193,27 @@ class Proposals:
         possible = [model for model in tried if model is not None and model.is_possible]
         if possible:
             nearest = min(possible, key=lambda m: m.fit.fitness)
-            suspects, noise = nearest.effects, POOR_MISFIT * current.problem.perfect_fitness
+            suspects, rest = nearest.effects, POOR_MISFIT
         else:
             by_gain = sorted(self.assess(current).candidate_signals, key=lambda s: -s.gain)
             suspects = tuple(dict.fromkeys(s.effect for s in by_gain))[:SHORTLIST]
-            nearest, noise = current, current.problem.perfect_fitness
-        decisive = nearest.fit.fitness / DECISIVE_RATIO
-        # below the noise, not even a perfect fit would cut the misfit so far
-        if not any(map(may_hold_rotor, suspects)) or decisive < noise:
+            nearest, rest = current, 1.0
+        if not any(map(may_hold_rotor, suspects)) or not _may_improve_decisively(nearest, rest):
             return []
         searched = [self.refits.with_global_search(current, "coulomb_friction")]
         if "asymmetric_friction" in nearest.effects_at_end:
             searched.append(self.refits.with_global_search(searched[0], "constant_load"))
-        return [model for model in searched if model.fit.fitness < decisive]
+        return [model for model in searched if is_decisively_better(model, nearest)]
 
     def _with_signals(self, current: Model, signals: Sequence[Signal]) -> Proposed:
         """The model with the effect of each signal."""
         return self.refits.with_signals(current, signals, self.assess(current).screen)
+
+
+def _may_improve_decisively(model: Model, rest: float = 1.0) -> bool:
+    """Whether a model leaves so much that another one could be decisively better, although that leaves the noise, or
+    the `rest`, in noise variances of each output."""
+    return model.fit.fitness / DECISIVE_RATIO >= rest * model.problem.perfect_fitness
 
 
 def _shows_friction(assessment: Assessment) -> bool:

@@ -21,7 +21,7 @@ from ..prepare import Prepared
 ONSETS = (0.02, 0.06, 0.2)
 # Fastest rate of a gradual drop, times the shortest sample time, from which a fit starts, and where it may end: a
 # steeper one is hardly different from a constant one, and would need too many steps in a sample
-MAX_RATE, MAX_FITTED_RATE = 10.0, 20.0
+MAX_RATE, MAX_FITTED_RATE = 30.0, 60.0
 # Gauss-Newton steps, slow where the onset is steep, after which a gradual drop must fit better than a constant one
 FIRST_STEPS = 4
 ONSET = f"{GradualBrushDrop.name}.onset_A"
@@ -56,7 +56,8 @@ def _rate(fitted: FittedRuns, onset: float) -> float:
     motor, tape = fitted.problem.parameters(fitted.fit.coordinates), fitted.problem.tape
     drop = motor.effect_named(BrushVoltageDrop.name)
     assert isinstance(drop, BrushVoltageDrop | GradualBrushDrop)
-    return float(drop.voltage_V / (onset * motor.L) * np.min(np.asarray(tape.sample_time)))
+    rate = GradualBrushDrop(drop.voltage_V, jnp.asarray(onset)).fastest_rate(motor, jnp.zeros(()))
+    return float(rate * np.min(np.asarray(tape.sample_time)))
 
 
 def _start(gradual: Prepared, fitted: FittedRuns, onset: float) -> Optimum:
