@@ -675,6 +675,15 @@ def test_friction_is_recovered_from_a_value_near_zero(x64, runs):
     assert again.fitness == pytest.approx(optimum.fitness, rel=1e-6)
 
 
+def test_friction_next_to_nothing_grows_at_once(x64):
+    """Within a factor of e it would gain so little that a fit in noise might end there."""
+    problem = problem_of(light_and_loaded(0, noise=vb.Noise(2.0, 10.0)))
+    optimum = polish(problem, refine(problem, start_at(problem))).optimum
+    coordinates = optimum.unknowns.coordinates.at[5].add(np.log(1e-4))
+    vanished = optimum._replace(unknowns=optimum.unknowns._replace(coordinates=coordinates))
+    assert polish(problem, vanished, steps=2).optimum.fitness == pytest.approx(optimum.fitness, rel=1e-3)
+
+
 def test_a_fit_whose_derivatives_fail_is_infinitely_bad(x64, runs):
     """Its simulation may be finite, but nothing can be told from it, and no NaN may reach what comes next."""
     problem = problem_of(runs)

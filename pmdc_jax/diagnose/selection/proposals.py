@@ -98,9 +98,11 @@ class Proposals:
 
     def by_unfiltered_misfit(self, current: Model) -> Proposed:
         """The current model with one of the effects that gain most on the unfiltered misfit, if that falls by a factor
-        of `DECISIVE_RATIO`: a whitening filter absorbs as noise what lasts as long as a short run."""
+        of `DECISIVE_RATIO`: a whitening filter absorbs as noise what lasts as long as a short run, or what a fit leaves
+        that found no optimum."""
         assessment, full = self.assess(current), len(current.effects) == MAX_EFFECTS
-        if full or assessment.p_value >= FALSE_ALARM or not _may_improve_decisively(current):
+        may_hide = current.is_poor and current.is_stalled
+        if full or not _may_improve_decisively(current) or (assessment.p_value >= FALSE_ALARM and not may_hide):
             return []
         unfiltered = assessment.screen._replace(evidence=assessment.screen.unfiltered)
         least = MIN_UNFILTERED_SHARE * assessment.screen.unfiltered.regress().squares

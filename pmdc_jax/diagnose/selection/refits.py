@@ -42,6 +42,8 @@ SHORT_REFIT_STEPS = 8
 SAME_OPTIMUM_RATIO = 1.05
 # Factor around the parameters of effects that may hold the rotor within which a population searches
 STICKING_FACTOR = 2.0
+# ... if a model leaves so many noise variances of each output; and what another optimum may leave of those beyond one
+MIN_MISFIT_AROUND, MAX_REST_AROUND = 2.0, 0.9
 # A fuller form whose short refits leave no less than this share of the simple form's misfit is searched no further
 MAX_FULLER_MISFIT = 0.9
 
@@ -142,15 +144,15 @@ class Refits:
 
     def searched_around(self, model: Model) -> Model:
         """The model; or the same effects fitted from the best of a population around it, in their parameters that may
-        hold the rotor at rest, if that leaves far less: where a rotor sticks and slips, each moment at which it does is
-        an optimum of its own."""
-        sticking = [effect for effect in model.effects if may_hold_rotor(effect)]
-        if not sticking or not model.is_poor:
+        hold the rotor at rest, if that leaves less: where a rotor sticks and slips, each moment at which it does is an
+        optimum of its own."""
+        sticking, noise = [e for e in model.effects if may_hold_rotor(e)], model.problem.perfect_fitness
+        if not sticking or model.fit.fitness < MIN_MISFIT_AROUND * noise:
             return model
         factors = {f"{effect}.{field}": STICKING_FACTOR for effect in sticking for field in EFFECTS[effect].ranges}
         around = _best_around(model.prepared, model.fit.optimum, factors, self.solved.seed)
         elsewhere = FittedRuns.polished(model.prepared, around, TRIAL_TOLERANCE)
-        if elsewhere.fit.fitness > MAX_PLAIN_MISFIT * model.fit.fitness:
+        if elsewhere.fit.fitness - noise > MAX_REST_AROUND * (model.fit.fitness - noise):
             return model
         return self.replace(model_of(elsewhere))
 

@@ -37,6 +37,8 @@ MAX_ROUNDING, SHORTENING, MIN_STEP_SHARE = 1e-9, 4, 1e-3
 # From this evaluation on a polish is given up where it would be of no use even if the squares fell so many times
 # further than the next step is predicted to reduce them
 FIRST_TO_GIVE_UP, OPTIMISM = 3, 3.0
+# Upper bound of viscous friction over what is usual
+UPPER_OVER_USUAL_F = 10.0
 
 
 class Fit(NamedTuple):
@@ -87,7 +89,6 @@ def polish(
     known; `give_up_above`, the sum of whitened squares from which on the fit is of no use: it is given up once it will
     hardly fall so far.
     """
-    ridge = ridge_of(problem)
     fixed, held = set(start.at_bound), None  # at a bound now, and as the last step was made
     best = trial = _evaluate_weighted(problem, start.unknowns, at_start, start.starts)
     step, share, gain = np.zeros(len(flatten(start.unknowns))), 1.0, np.inf
@@ -101,7 +102,7 @@ def polish(
             fell = (best.cost - trial.cost) * float(np.sum(problem.samples))
             best, share = trial, 1.0
             fixed = _still_held(problem, best, fixed)
-            step, gain = gauss_newton_step(best.matrix, fixed, ridge)
+            step, gain = _step_from(problem, best, fixed)
             predicted = gain / _residual_variance(problem, best)
             if predicted <= tolerance:
                 break
@@ -128,6 +129,24 @@ def polish(
 def fit_at(problem: Problem, point: Optimum) -> Fit:
     """The fit that stays at a point: its evaluation and its noise."""
     return polish(problem, point, steps=0)
+
+
+def _step_from(problem: Problem, best: _WeightedPoint, fixed: set[int]) -> tuple[np.ndarray, float]:
+    """The Gauss-Newton step from a point, and the gain that it predicts.
+
+    Viscous friction that is next to nothing, as where another effect was missing before, would stay so if the ridge
+    held it within a factor of e: it may grow to what is usual.
+    """
+    parameters, ridge = problem.parameters, ridge_of(problem)
+    if "f" in parameters.names:
+        f = parameters.names.index("f")
+        usual = float(parameters.upper[f]) - np.log(UPPER_OVER_USUAL_F)
+        weaker = ridge.copy()
+        weaker[f] *= np.exp(2 * min(float(best.unknowns.coordinates[f]) - usual, 0.0))
+        step, gain = gauss_newton_step(best.matrix, fixed, weaker)
+        if step[f] > 0:
+            return step, gain
+    return gauss_newton_step(best.matrix, fixed, ridge)
 
 
 def _still_held(problem: Problem, best: _WeightedPoint, fixed: set[int]) -> set[int]:
