@@ -175,6 +175,19 @@ class Tape(eqx.Module):
         part = np.moveaxis(np.asarray(signal)[self.blocks_of(run)], -1, 1)
         return part.reshape(-1, *part.shape[2:])[:length]
 
+    def set_samples_of(
+        self,
+        run: int,
+        signal: Float[np.ndarray, "blocks *outputs samples"],
+        values: Float[np.ndarray, "length *outputs"],
+    ) -> None:
+        """Set the samples of one run in a signal laid out like the tape."""
+        blocks = self.blocks_of(run)
+        part = np.moveaxis(signal[blocks], -1, 1)
+        in_time = part.reshape(-1, *part.shape[2:])
+        in_time[: len(values)] = values
+        signal[blocks] = np.moveaxis(in_time.reshape(part.shape), 1, -1)
+
     def grid_of(self, run: int) -> int:
         """The grid of one run."""
         return int(np.asarray(self.grid)[self.blocks_of(run)][0])

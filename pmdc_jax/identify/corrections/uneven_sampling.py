@@ -14,7 +14,7 @@ from functools import partial
 import attrs
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ...recordings.clock import GAP
 from ...recordings.recording import SIMULATED_OUTPUTS, Recording
@@ -67,25 +67,25 @@ def _shifted(prepared: Prepared, fit: Fit) -> Prepared:
     problem, tape = prepared.problem, prepared.problem.tape
     everywhere = replace(tape, weight=jnp.ones_like(tape.weight))
     plain = evaluate(replace(problem, tape=everywhere, whitening=None, nuisance=None, shift=None), fit.unknowns)
-    jacobian = np.asarray(plain.jacobian) * np.asarray(problem.noise)[:, None, None]
+    jacobian = np.moveaxis(np.asarray(plain.jacobian) * np.asarray(problem.noise)[:, None, None], 2, -1)
     runs, slope = [], np.zeros_like(jacobian)
     for k, run in enumerate(prepared.runs):
         if not run.has_even_clock:
             now = tape.samples_of(k, plain.simulated, len(run))
-            d_now = tape.samples_of(k, np.moveaxis(jacobian, 2, -1), len(run))
+            d_now = tape.samples_of(k, jacobian, len(run))
             first_order_hold = prepared.timing.first_order_hold
             at_stamps = partial(
                 simulated_at_stamps, drive=tape.drive_of(k), even=run, first_order_hold=first_order_hold
             )
             then, d_then = _with_derivatives(at_stamps, problem.parameters, fit, now, d_now)
             nearest = _nearest(run)
-            _set_samples(slope, tape.blocks_of(k), d_then[nearest] - d_now)
+            tape.set_samples_of(k, slope, d_then[nearest] - d_now)
             run = _at_even_samples(run, nearest, now - then[nearest])
         runs.append(run)
     laid, begins = Tape.from_recordings(runs), np.asarray(tape.begins)
     # the first sample of a run is the first of the even clock: it counts if it did before
     laid.weight[begins, :, 0] = np.asarray(tape.weight)[begins, :, 0]
-    moved = prepared.with_problem(shift=Shift(jnp.asarray(slope), fit.unknowns))._replace(runs=runs)
+    moved = prepared.with_problem(shift=Shift(jnp.asarray(np.moveaxis(slope, -1, 2)), fit.unknowns))._replace(runs=runs)
     return moved.with_tape(measured=jnp.asarray(laid.measured), weight=jnp.asarray(laid.weight))
 
 
@@ -109,16 +109,6 @@ def _with_derivatives(
 
     then = outputs(0, 0.0)
     return then, np.stack(map_in_threads(derivative, range(d_now.shape[-1])), -1)
-
-
-def _set_samples(
-    signal: Float[np.ndarray, "blocks 2 length columns"], blocks: Bool[np.ndarray, " blocks"], values: Derivatives
-) -> None:
-    """Set the samples of one run, in its blocks of some length."""
-    part = np.moveaxis(signal[blocks], 2, 1)
-    in_time = part.reshape(-1, *values.shape[1:])
-    in_time[: len(values)] = values
-    signal[blocks] = np.moveaxis(in_time.reshape(part.shape), 1, 2)
 
 
 def _nearest(run: Recording) -> Int[np.ndarray, " samples"]:
