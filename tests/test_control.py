@@ -44,7 +44,7 @@ from pmdc_jax.control.margins import linear_loop, loop_gain, margins, sensitivit
 from pmdc_jax.control.metrics import BAND, smooth_overshoot, smooth_settling
 from pmdc_jax.control.specification import LoopRequirements
 from pmdc_jax.control.spread import drawn_motors, even_spread
-from pmdc_jax.effects import EFFECTS, SpeedSensorDelay, SpeedSensorLag
+from pmdc_jax.effects import EFFECTS, ShaftCompliance, SpeedSensorDelay, SpeedSensorLag
 from pmdc_jax.motor import PARAMETERS, Motor
 from pmdc_jax.motor_file import Uncertainty
 from pmdc_jax.simulate.propagator import steps_within
@@ -507,6 +507,44 @@ def test_margins_of_a_loop_with_a_slow_speed_sensor_match_python_control(lag, la
     assert found.sensitivity_peak == pytest.approx(peak, rel=1e-3)
     at_few_frequencies = float(sensitivity_peak(linear_loop(sensing, law)))
     assert at_few_frequencies == pytest.approx(peak, rel=2e-2)
+
+
+def test_margins_of_a_loop_with_a_compliant_shaft_match_python_control():
+    """Its resonance leaves less than a rigid shaft would."""
+    step, share, stiffness, damping = 1e-3, 0.7, 1.0, 5e-4
+    shaft = ShaftCompliance(stiffness_Nm_rad=stiffness, damping_Nms_rad=damping, load_share=share)
+    R, L, Kb, Kt, J, f = (PAPER[name] for name in PARAMETERS)
+    rotor, load = (1 - share) * J, share * J
+    A = [  # current, speed, speed of the load, twist
+        [-R / L, -Kb / L, 0, 0],
+        [Kt / rotor, -(f + damping) / rotor, damping / rotor, -stiffness / rotor],
+        [0, damping / load, -damping / load, stiffness / load],
+        [0, 1, -1, 0],
+    ]
+    motor = ct.ss(A, [[1 / L], [0], [0], [0]], [[0, 1, 0, 0]], 0).sample(step)
+    loop = ct.ss2tf(motor) * (0.05 + ct.tf([step * 1.0], [1, -1], step)) * ct.tf([1], [1, 0], step)
+    angle = np.geomspace(1e-3, np.pi, 20_000)
+    gain, phase, *_ = ct.stability_margins(ct.frd(loop(np.exp(1j * angle)), angle / step, smooth=True))
+    law = Law.of(PI(0.05, 1.0, 1.0, 0.01), Hardware(step, 30.0, None, None, 1), MOTOR)
+    found = margins(MOTOR.with_effects([shaft]), law)
+    assert found.stable
+    assert found.gain_margin == pytest.approx(gain, rel=1e-3)
+    assert found.phase_margin_deg == pytest.approx(phase, rel=1e-3)
+    assert found.gain_margin < margins(MOTOR, law).gain_margin / 2
+
+
+def test_an_unstable_loop_is_avoided_while_tuning():
+    """Its sensitivity alone may be small."""
+
+    def law(factor: float) -> Law:
+        return Law.of(PI(0.05 * factor, 1.0 * factor, 1.0, 0.01), SAMPLED, MOTOR)
+
+    def peak(factor: float) -> float:
+        return float(sensitivity_peak(linear_loop(MOTOR, law(factor))))
+
+    margin = margins(MOTOR, law(1.0)).gain_margin
+    assert peak(margin / 2) == pytest.approx(margins(MOTOR, law(margin / 2)).sensitivity_peak, rel=2e-2)
+    assert peak(5 * margin) > 20
 
 
 @pytest.mark.parametrize("name", LAWS)

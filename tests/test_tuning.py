@@ -15,9 +15,10 @@ from linear_motor import PAPER
 
 from pmdc_jax import InputError, cli, load_controller, load_uncertainty, save_motor, tune
 from pmdc_jax.control.pipeline import robustness
+from pmdc_jax.control.remarks import remarks
 from pmdc_jax.control.specification import LoopRequirements
 from pmdc_jax.control.tuning import Tuning
-from pmdc_jax.effects import CoggingTorque, SpeedSensorDelay
+from pmdc_jax.effects import CoggingTorque, ShaftCompliance, SpeedSensorDelay
 from pmdc_jax.motor import Motor
 from pmdc_jax.report.notation import NARROW_SPACE
 from pmdc_jax.report.tuning.figures import _range, loop_figure
@@ -127,6 +128,20 @@ def test_a_loop_that_misses_its_specification_is_reported():
     unsettled = evolve(found, tuned=evolve(found.tuned, metrics=slow))
     assert "does not settle" in summary(unsettled)[0]
     assert not unsettled.meets_specification
+    unstable = evolve(found, tuned=evolve(found.tuned, margins=evolve(found.margins, stable=False)))
+    assert not unstable.meets_specification
+    assert any("unstable" in message for message in remarks(unstable, None))
+
+
+@pytest.mark.slow
+def test_a_loop_with_a_soft_shaft_settles_with_its_load():
+    """The fastest settling of a rigid shaft is over within a quarter of its resonance."""
+    shaft = ShaftCompliance(stiffness_Nm_rad=5.0, damping_Nms_rad=0.002, load_share=0.7)
+    motor = Motor(R=1.0, L=0.002, Kb=0.3, Kt=0.3, J=0.002, f=0.001, effects=(shaft,))
+    found = tune(motor, "pid", setpoint=100.0, voltage_limit=60.0, current_limit=20.0)
+    assert found.meets_specification
+    assert found.metrics["SettlingTime"] < 0.12
+    assert found.margins.sensitivity_peak < 2.1
 
 
 @pytest.mark.slow

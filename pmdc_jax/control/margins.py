@@ -10,6 +10,7 @@ import numpy as np
 from attrs import frozen
 from jaxtyping import Array, Complex, Float
 
+from ..effects import ShaftCompliance
 from ..effects.base import State
 from ..motor import Drive, Motor
 from ..simulate.propagator import make_propagator, state_of
@@ -20,6 +21,8 @@ SENSITIVITY_ANGLES = np.geomspace(1e-3, np.pi, 48)
 MARGIN_ANGLES = np.geomspace(1e-5, np.pi, 20_000)
 UNSTABLE_FROM = 1 - 1e-12  # largest modulus of an eigenvalue: 1, but for rounding
 TINY = 1e-300  # against division by zero
+# Squarings after which the growth of a loop is known to 1 %, and how its excess over that counts while tuning
+SQUARINGS, LEAST_GROWTH, INSTABILITY_FACTOR = 12, 1.01, 100.0
 
 Matrix = Float[Array | np.ndarray, "n n"]
 Vector = Float[Array | np.ndarray, " n"]
@@ -48,10 +51,10 @@ class Loop(NamedTuple):
 
 
 def linear_loop(motor: Motor, law: Law) -> Loop:
-    """The loop linearised at rest, with the motor's linear part and its sensors. The law itself is linear until its
-    limits bind, so its derivatives describe it exactly."""
+    """The loop linearised at rest, with the motor's linear part, a compliant shaft and its sensors. The law itself is
+    linear until its limits bind, so its derivatives describe it exactly."""
     step = jnp.asarray(law.hardware.sample_time, float)
-    motor = motor.with_effects(e for e in motor.effects if e.equation == "sensor")
+    motor = motor.with_effects(e for e in motor.effects if e.equation == "sensor" or isinstance(e, ShaftCompliance))
     transition, drive, *_ = make_propagator(motor, step, Drive())
     motor_size, delay = len(transition), motor.speed_delay()
     at_rest = State(jnp.zeros(()), jnp.zeros(()), {})
@@ -82,7 +85,8 @@ def linear_loop(motor: Motor, law: Law) -> Loop:
 
 
 def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
-    """Largest |S| = |1 / (1 + loop gain)| over frequency: 1 / distance of the loop gain from -1.
+    """Largest |S| = |1 / (1 + loop gain)| over frequency: 1 / distance of the loop gain from -1. Of an unstable loop,
+    it is larger by `INSTABILITY_FACTOR` times the growth beyond `LEAST_GROWTH` in a sample.
 
     S(z) = det(z - A) / det(z - A_closed), as polynomials in z - 1 to avoid cancellation at short sample times. A delay
     of the sensor changes both matrices by a multiple of a matrix of rank 1, and the determinants in proportion.
@@ -104,7 +108,19 @@ def sensitivity_peak(loop: Loop) -> Float[Array, ""]:
 
     opened = seen_late(loop.A, loop.N)
     closed = seen_late(loop.closed, loop.N + loop.B * loop.D)
-    return jnp.max(jnp.abs(opened) / jnp.maximum(jnp.abs(closed), TINY))
+    instability = jax.nn.relu(_growth(loop.closed) - LEAST_GROWTH)
+    return jnp.max(jnp.abs(opened) / jnp.maximum(jnp.abs(closed), TINY)) * (1 + INSTABILITY_FACTOR * instability)
+
+
+def _growth(matrix: Matrix) -> Float[Array, ""]:
+    """About the largest modulus of an eigenvalue, by repeated squaring; it has a gradient, unlike the eigenvalues of
+    some matrices."""
+    log_norm, power = jnp.zeros(()), jnp.asarray(matrix)
+    for _ in range(SQUARINGS):
+        norm = jnp.sqrt(jnp.sum(jnp.square(power)))
+        power = power / norm
+        power, log_norm = power @ power, 2 * (log_norm + jnp.log(norm))
+    return jnp.exp(log_norm / 2**SQUARINGS)
 
 
 def _delay(

@@ -15,6 +15,9 @@ from .tuning import Tuning
 OVERSHOOT_TO_REPORT = 1.2
 SENSITIVITY_TO_REPORT = 1.1
 CURRENT_TO_REPORT = 1.02
+# Share of Kb by which it may be smaller than known, when magnets are hot; and share of L / R from which a sample is so
+# long that its current depends on the back-EMF more than on the current measured at its start
+KB_CHANGE_TO_SURVIVE, MEASURED_SHARE = 0.15, 0.25
 # Kt over Kb, or its inverse, from which one of them must be in another unit: in SI they differ by iron losses
 CONSTANTS_RATIO_TO_REPORT = 3.0
 
@@ -29,10 +32,26 @@ def remarks(result: Tuning, uncertainty: Uncertainty | None) -> Iterator[str]:
     if peak is not None and peak > SENSITIVITY_TO_REPORT * MAX_SENSITIVITY:
         yield f"the loop has small stability margins: its sensitivity peak is {peak:.2f}"
     limit = result.requirements.current_limit
-    if limit is not None and result.peak_current > CURRENT_TO_REPORT * limit:
+    if limit is not None:
+        yield from _current_limit_remarks(result, limit)
+
+
+def _current_limit_remarks(result: Tuning, limit: float) -> Iterator[str]:
+    """Messages where the current exceeds its limit, and where that limit leaves no room for another Kb."""
+    motor, sample_time = result.motor, float(result.hardware.sample_time)
+    if result.peak_current > CURRENT_TO_REPORT * limit:
+        predicted = "that of the motor without its effects" if motor.effects else "what it predicts for one instant"
         yield (
             f"the current reaches {result.peak_current:.3g} A in simulation, beyond its limit of {limit:g} A, because"
-            " the controller limits that of the motor without its effects: choose a lower limit"
+            f" the controller limits {predicted}: choose a lower limit"
+        )
+    # a sample much shorter than L / R starts from the measured current
+    share, time_constant = float(motor.R) * limit / abs(float(motor.Kb) * result.setpoint), float(motor.L / motor.R)
+    if share < KB_CHANGE_TO_SURVIVE and sample_time > time_constant * MEASURED_SHARE:
+        yield (
+            f"the current limit relies on the back-EMF: with Kb {100 * share:.2g} % smaller, as of hot magnets, the"
+            " controller could not brake from the set point. Choose a larger limit, or a sample time far below L / R ="
+            f" {time_constant:.2g} s"
         )
 
 
@@ -62,6 +81,8 @@ def _unmet_requirements(result: Tuning) -> Iterator[str]:
     max_settling, max_overshoot = requirements.max_settling, requirements.allowed_overshoot
     if settling is None:
         yield "the loop does not settle: try another controller or a shorter sample time"
+    elif not result.margins.stable:
+        yield "the loop is unstable within its limits, and may oscillate although the step settles: choose another one"
     elif max_settling is not None and settling > max_settling:
         yield f"settling takes {settling:.4g} s, longer than the required {max_settling:g} s"
     if overshoot is not None and overshoot > max_overshoot:

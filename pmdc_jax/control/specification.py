@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from attrs import frozen
 
+from ..effects import GearBacklash, ShaftCompliance
 from ..errors import InputError
 from ..motor import Motor
 from ..simulate.propagator import steps_within
@@ -36,6 +37,7 @@ LOOP_DEAD_TIMES = 4
 PART_SETTLINGS = 2.5
 PART_DEAD_TIMES = 20
 PART_TORQUE_PERIODS = 2
+PART_RESONANCES = 5
 ROUNDING = 1e-9  # relative, within which a number counts as round
 MIN_SAMPLES = 32  # in each part of the task
 MAX_SAMPLES = 20_000  # in each part of the task
@@ -111,7 +113,8 @@ class LoopRequirements:
         dead_time = _dead_time(motor, sample_time, self.delay)
         stall_current = voltage_limit / float(motor.R)
         max_current = min(stall_current, self.current_limit or stall_current)
-        part_samples = _part_samples(fastest, dead_time, _torque_period(motor, setpoint), sample_time)
+        resonance = _resonance_period(motor)
+        part_samples = _part_samples(fastest, dead_time, _torque_period(motor, setpoint), resonance, sample_time)
         task = Task(
             hardware=Hardware(
                 sample_time, voltage_limit, self.current_limit, self.speed_step, self.delay, self.measures_current
@@ -119,7 +122,7 @@ class LoopRequirements:
             setpoint=setpoint,
             load=default_load_torque(*operation) if self.load_torque is None else self.load_torque,
             fastest_settling=fastest,
-            settling_scale=max(fastest, LOOP_DEAD_TIMES * dead_time),
+            settling_scale=max(fastest, LOOP_DEAD_TIMES * dead_time, resonance / 2),
             max_overshoot=self.allowed_overshoot,
             max_sensitivity=self.max_sensitivity,
             noise=jnp.zeros(PART_COUNT * part_samples),
@@ -188,9 +191,15 @@ def _torque_period(motor: Motor, setpoint: float) -> float:
     return max(angles, default=0.0) / (SECOND_SETPOINT * abs(setpoint))
 
 
-def _part_samples(fastest: float, dead_time: float, torque_period: float, sample_time: float) -> int:
+def _resonance_period(motor: Motor) -> float:
+    """The longest period, s, of a resonance of shaft or gear; zero without one."""
+    shafts = (e for e in motor.effects if isinstance(e, ShaftCompliance | GearBacklash))
+    return max((2 * math.pi / float(shaft.natural_frequency(motor)) for shaft in shafts), default=0.0)
+
+
+def _part_samples(fastest: float, dead_time: float, torque_period: float, resonance: float, sample_time: float) -> int:
     """Samples in one part of the task, rounded up to 2^k or 1.5 2^k so that few shapes are compiled."""
-    more = max(PART_DEAD_TIMES * dead_time, PART_TORQUE_PERIODS * torque_period)
+    more = max(PART_DEAD_TIMES * dead_time, PART_TORQUE_PERIODS * torque_period, PART_RESONANCES * resonance)
     duration = max(PART_SETTLINGS * fastest, fastest + more)
     needed = max(MIN_SAMPLES, math.ceil(duration / sample_time))
     if needed > MAX_SAMPLES:

@@ -101,8 +101,11 @@ class Tuning:
 
     @property
     def meets_specification(self) -> bool:
-        """Whether the overshoot, and the settling time if limited, meet the specification on the nominal motor."""
+        """Whether the overshoot, and the settling time if limited, meet the specification on the nominal motor, and the
+        loop is stable."""
         overshoot, settling = self.metrics["Overshoot"], self.metrics["SettlingTime"]
         if overshoot is None or settling is None or overshoot > self.requirements.allowed_overshoot:
+            return False
+        if not self.margins.stable:
             return False
         return self.requirements.max_settling is None or settling <= self.requirements.max_settling

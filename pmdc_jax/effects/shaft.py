@@ -34,10 +34,13 @@ class _TwoInertias(AbstractEffect):
     def load_at_rotor(self, load: Scalars) -> Scalars:
         return 0.0 * load
 
+    def natural_frequency(self, motor: Motor) -> Scalars:
+        """The frequency at which the ends would oscillate without damping, sqrt(k / (J s (1 - s))), rad/s."""
+        return jnp.sqrt(self.stiffness_Nm_rad / (motor.J * self.load_share * (1 - self.load_share)))
+
     def damping_ratio(self, motor: Motor) -> Scalars:
         """Damping over critical damping, d / (2 sqrt(k J s (1 - s))): below 1 the ends oscillate against each other."""
-        reduced = motor.J * self.load_share * (1 - self.load_share)
-        return self.damping_Nms_rad / (2 * jnp.sqrt(self.stiffness_Nm_rad * reduced))
+        return self.damping_Nms_rad * self.natural_frequency(motor) / (2 * self.stiffness_Nm_rad)
 
     def derivative(self, motor: Motor, state: State, load: Scalars) -> dict[str, Scalars]:
         speed, twist = self.states
@@ -132,8 +135,7 @@ class GearBacklash(_TwoInertias):
     def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars:
         """The natural frequency of teeth in contact, rad/s: a step is then a third of the half period of a bounce."""
         del current
-        share = self.load_share
-        return jnp.sqrt(self.stiffness_Nm_rad / (motor.J * share * (1 - share)))
+        return self.natural_frequency(motor)
 
     def initial_states(self, speed: Scalars, load: Scalars, angle: Scalars) -> dict[str, Scalars]:
         del angle
