@@ -131,6 +131,17 @@ def test_a_loop_that_misses_its_specification_is_reported():
     unstable = evolve(found, tuned=evolve(found.tuned, margins=evolve(found.margins, stable=False)))
     assert not unstable.meets_specification
     assert any("unstable" in message for message in remarks(unstable, None))
+    coarse = evolve(found, requirements=evolve(found.requirements, speed_step=0.05 * found.setpoint))
+    assert any("wider than the settling band" in message for message in remarks(coarse, None))
+    assert not any("wider than" in message for message in remarks(found, None))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sample_time", [1e-3, 2e-4])
+def test_a_current_limit_that_relies_on_the_back_emf_is_pointed_out(sample_time):
+    """With a winding of 0.157 ohm, 20 A are 3 V: an eighth of the back-EMF at the set point. L / R is 2 ms."""
+    found = tune(MOTOR, "pi", setpoint=481.0, voltage_limit=30.0, current_limit=20.0, sample_time=sample_time, starts=8)
+    assert any("relies on the back-EMF" in message for message in found.messages) == (sample_time == 1e-3)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from ..motor import Motor
 from ..motor_file import Uncertainty
 from .evaluation import SMALL_STEP
+from .metrics import BAND
 from .specification import MAX_SENSITIVITY
 from .tuning import Tuning
 
@@ -28,6 +29,7 @@ def remarks(result: Tuning, uncertainty: Uncertainty | None) -> Iterator[str]:
     yield from _unmet_requirements(result)
     yield from _constants_remark(result.motor)
     yield from _small_step_remark(result)
+    yield from _quantum_remark(result)
     peak = result.margins.sensitivity_peak
     if peak is not None and peak > SENSITIVITY_TO_REPORT * MAX_SENSITIVITY:
         yield f"the loop has small stability margins: its sensitivity peak is {peak:.2f}"
@@ -87,6 +89,16 @@ def _unmet_requirements(result: Tuning) -> Iterator[str]:
         yield f"settling takes {settling:.4g} s, longer than the required {max_settling:g} s"
     if overshoot is not None and overshoot > max_overshoot:
         yield f"overshoot is {overshoot:.3g} %, above the allowed {max_overshoot:g} %"
+
+
+def _quantum_remark(result: Tuning) -> Iterator[str]:
+    """A message where the speed sensor cannot tell whether the speed is within the settling band."""
+    quantum, band = result.requirements.speed_step or 0.0, BAND * abs(result.setpoint)
+    if quantum > 2 * band:
+        yield (
+            f"the speed sensor's step of {quantum:g} rad/s is wider than the settling band of ± {band:.2g} rad/s: the"
+            " speed may wander by that step"
+        )
 
 
 def _small_step_remark(result: Tuning) -> Iterator[str]:
