@@ -98,10 +98,10 @@ class Proposals:
 
     def by_unfiltered_misfit(self, current: Model) -> Proposed:
         """The current model with one of the effects that gain most on the unfiltered misfit, if that falls by a factor
-        of `DECISIVE_RATIO`: a whitening filter absorbs as noise what lasts as long as a short run, or what a fit leaves
-        that found no optimum."""
+        of `DECISIVE_RATIO`: a whitening filter absorbs as noise what lasts as long as a short run, or as a rotor sticks
+        that does so at other moments than the measured one."""
         assessment, full = self.assess(current), len(current.effects) == MAX_EFFECTS
-        may_hide = current.is_poor and current.is_stalled
+        may_hide = current.is_poor and any(map(may_hold_rotor, current.effects))
         if full or not _may_improve_decisively(current) or (assessment.p_value >= FALSE_ALARM and not may_hide):
             return []
         unfiltered = assessment.screen._replace(evidence=assessment.screen.unfiltered)
