@@ -396,15 +396,6 @@ def test_every_effect_has_a_case():
     assert set(CASES) == set(EFFECTS)
 
 
-@every_effect
-def test_every_effect_and_its_parameters_are_documented(name):
-    rows = DOCUMENTED.read_text(encoding="utf-8").splitlines()
-    (row,) = [line for line in rows if line.startswith(f"| `{name}` |")]
-    shares_row_above = name == "gear_backlash"  # of `shaft_compliance`, which it extends
-    fields = EFFECTS[name].ranges.keys() - (EFFECTS["shaft_compliance"].ranges.keys() if shares_row_above else set())
-    assert all(f"`{field}`" in row for field in fields)
-
-
 @each_simulated
 def test_agrees_with_an_independent_integrator(x64, name):
     expected = [reference(name, run) for run in RUNS]
@@ -817,6 +808,15 @@ def test_every_effect_is_documented(name):
         assert pint.Unit(r.unit).dimensionality is not None
         unit = r.unit.replace("1/", "per_").replace("/", "_")
         assert field.endswith(unit.replace(" ", "").replace("^", ""))
+
+
+@every_effect
+def test_every_effect_is_on_the_page_of_effects(name):
+    rows = DOCUMENTED.read_text(encoding="utf-8").splitlines()
+    (row,) = [line for line in rows if line.startswith(f"| `{name}` |")]
+    shares_row_above = name == "gear_backlash"  # of `shaft_compliance`, which it extends
+    fields = EFFECTS[name].ranges.keys() - (EFFECTS["shaft_compliance"].ranges.keys() if shares_row_above else set())
+    assert all(f"`{field}`" in row for field in fields)
 
 
 def test_effects_that_share_a_state_agree_on_it(x64):

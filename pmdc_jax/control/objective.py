@@ -82,7 +82,8 @@ class Task(eqx.Module):
     set point. Gains tuned on the first part alone may rely on an integrator windup that happens to suit that step.
 
     **Fields**: `setpoint`, rad/s; `load`, N m, applied in the second and third part; `fastest_settling`, s, of any
-    controller within the limits; `settling_scale`, s, the same, or what the loop's dead time allows if that is longer;
+    controller within the limits; `settling_scale`, s, the same, or what the loop's dead time or a shaft's resonance
+    allows if that is longer;
     `max_overshoot`, %; `max_sensitivity`, limit of the peak sensitivity, None for no
     limit; `noise`, rad/s, added to the measured speed at each sample; `part_samples`, samples of each part; `substeps`,
     simulation steps per sample, as the motor's effects need.

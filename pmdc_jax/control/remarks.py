@@ -84,7 +84,7 @@ def _unmet_requirements(result: Tuning) -> Iterator[str]:
     if settling is None:
         yield "the loop does not settle: try another controller or a shorter sample time"
     elif not result.margins.stable:
-        yield "the loop is unstable within its limits, and may oscillate although the step settles: choose another one"
+        yield "the loop is unstable and may oscillate within its limits, though a step settles: try another controller"
     elif max_settling is not None and settling > max_settling:
         yield f"settling takes {settling:.4g} s, longer than the required {max_settling:g} s"
     if overshoot is not None and overshoot > max_overshoot:

@@ -32,8 +32,11 @@ MAX_SAMPLE_TIME_RATIO = 10  # sample time over the transients, above which it mu
 NO_OVERSHOOT = 0.01  # %; less is none
 # Dead times of a loop in the shortest settling that it can have
 LOOP_DEAD_TIMES = 4
+# ... and periods of a shaft's resonance
+RESONANCES_TO_SETTLE = 0.5
 # Duration of each part of the task: at least 2.5 times the fastest settling, and at least the fastest settling plus 20
-# dead times of the loop, and plus two periods of a torque that depends on the angle, at half the set point
+# dead times of the loop, and plus two periods of a torque that depends on the angle, at half the set point, and plus
+# five of a shaft's resonance
 PART_SETTLINGS = 2.5
 PART_DEAD_TIMES = 20
 PART_TORQUE_PERIODS = 2
@@ -122,7 +125,7 @@ class LoopRequirements:
             setpoint=setpoint,
             load=default_load_torque(*operation) if self.load_torque is None else self.load_torque,
             fastest_settling=fastest,
-            settling_scale=max(fastest, LOOP_DEAD_TIMES * dead_time, resonance / 2),
+            settling_scale=max(fastest, LOOP_DEAD_TIMES * dead_time, RESONANCES_TO_SETTLE * resonance),
             max_overshoot=self.allowed_overshoot,
             max_sensitivity=self.max_sensitivity,
             noise=jnp.zeros(PART_COUNT * part_samples),

@@ -186,9 +186,8 @@ def _match_by_unit_or_symbol(headers: Sequence[str], matched: Mapping[str, Colum
 
 def _of_unit(headers: Sequence[str], quantity: str, *, commanded: bool) -> list[Column]:
     """The headers with a shaft unit of the quantity and a name that goes with it, of measurements or of set points."""
-    columns = []
+    columns, units = [], QUANTITIES[quantity].units[:1]
     for header in headers:
-        units = QUANTITIES[quantity].units[:1]
         readings = ((name, unit) for name, unit, _ in _readings(header) if unit and _is_unit_of(unit, quantity, units))
         name, unit = next(readings, ("", None))
         fits = bool(COMMANDED.search(name)) == commanded and not NOT_AT_MOTOR.search(name)

@@ -37,7 +37,7 @@ MAX_ROUNDING, SHORTENING, MIN_STEP_SHARE = 1e-9, 4, 1e-3
 # From this evaluation on a polish is given up where it would be of no use even if the squares fell so many times
 # further than the next step is predicted to reduce them
 FIRST_TO_GIVE_UP, OPTIMISM = 3, 3.0
-# Upper bound of viscous friction over what is usual
+# Upper bound of viscous friction over what is usual (see `search_bounds`)
 UPPER_OVER_USUAL_F = 10.0
 
 
@@ -89,6 +89,7 @@ def polish(
     known; `give_up_above`, the sum of whitened squares from which on the fit is of no use: it is given up once it will
     hardly fall so far.
     """
+    ridge = ridge_of(problem)
     fixed, held = set(start.at_bound), None  # at a bound now, and as the last step was made
     best = trial = _evaluate_weighted(problem, start.unknowns, at_start, start.starts)
     step, share, gain = np.zeros(len(flatten(start.unknowns))), 1.0, np.inf
@@ -102,7 +103,7 @@ def polish(
             fell = (best.cost - trial.cost) * float(np.sum(problem.samples))
             best, share = trial, 1.0
             fixed = _still_held(problem, best, fixed)
-            step, gain = _step_from(problem, best, fixed)
+            step, gain = _step_from(problem, best, fixed, ridge)
             predicted = gain / _residual_variance(problem, best)
             if predicted <= tolerance:
                 break
@@ -131,22 +132,25 @@ def fit_at(problem: Problem, point: Optimum) -> Fit:
     return polish(problem, point, steps=0)
 
 
-def _step_from(problem: Problem, best: _WeightedPoint, fixed: set[int]) -> tuple[np.ndarray, float]:
+def _step_from(
+    problem: Problem, best: _WeightedPoint, fixed: set[int], ridge: Float[np.ndarray, " unknowns"]
+) -> tuple[np.ndarray, float]:
     """The Gauss-Newton step from a point, and the gain that it predicts.
 
     Viscous friction that is next to nothing, as where another effect was missing before, would stay so if the ridge
     held it within a factor of e: it may grow to what is usual.
     """
-    parameters, ridge = problem.parameters, ridge_of(problem)
-    if "f" in parameters.names:
-        f = parameters.names.index("f")
-        usual = float(parameters.upper[f]) - np.log(UPPER_OVER_USUAL_F)
-        weaker = ridge.copy()
-        weaker[f] *= np.exp(2 * min(float(best.unknowns.coordinates[f]) - usual, 0.0))
-        step, gain = gauss_newton_step(best.matrix, fixed, weaker)
-        if step[f] > 0:
-            return step, gain
-    return gauss_newton_step(best.matrix, fixed, ridge)
+    parameters, plain = problem.parameters, gauss_newton_step(best.matrix, fixed, ridge)
+    if "f" not in parameters.names:
+        return plain
+    f = parameters.names.index("f")
+    over_usual = float(best.unknowns.coordinates[f] - parameters.upper[f]) + np.log(UPPER_OVER_USUAL_F)
+    if over_usual >= 0:
+        return plain
+    weaker = ridge.copy()
+    weaker[f] *= np.exp(2 * over_usual)
+    growing = gauss_newton_step(best.matrix, fixed, weaker)
+    return growing if growing[0][f] > 0 else plain
 
 
 def _still_held(problem: Problem, best: _WeightedPoint, fixed: set[int]) -> set[int]:
