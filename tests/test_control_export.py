@@ -21,6 +21,7 @@ from pmdc_jax.control.law import LawState
 
 HARDWARE = {
     "delay, current limit": Hardware(1e-3, 30.0, 60.0, 0.1, 1),
+    "no delay, current limit": Hardware(1e-3, 30.0, 45.0, None, 0),
     "no delay, no current sensor": Hardware(1e-3, 30.0, 45.0, None, 0, False),
     "delay, no current sensor or limit": Hardware(5e-4, 30.0, None, None, 1, False),
 }
@@ -60,7 +61,7 @@ def inputs() -> np.ndarray:
 @eqx.filter_jit
 def in_python(law: Law, samples):
     zero = jnp.zeros(())
-    start = LawState(Memory(zero, zero), zero, zero)
+    start = LawState(Memory(zero, zero), zero, zero, zero)
     return jax.lax.scan(lambda state, now: law.step(state, *now), start, samples)[1]
 
 

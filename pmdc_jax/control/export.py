@@ -41,6 +41,7 @@ typedef struct {
     pmdc_real filtered; /* rad/s, speed after the derivative filter */
     pmdc_real current;  /* A, as estimated */
     pmdc_real voltage;  /* V, last command */
+    pmdc_real missing;  /* V, missing in the model by the measured currents; used by a current limit */
 } pmdc_state;
 
 static inline pmdc_real pmdc_clip(pmdc_real value, pmdc_real lowest, pmdc_real highest)
@@ -54,6 +55,7 @@ static inline void pmdc_start(pmdc_state *state)
     state->filtered = 0;
     state->current = 0;
     state->voltage = 0;
+    state->missing = 0;
 }
 
 static inline pmdc_real pmdc_step(pmdc_state *state, pmdc_real reference, pmdc_real speed,
@@ -121,6 +123,11 @@ def _predicted_state(law: Law) -> list[str]:
     if not law.hardware.measures_current:
         lines += ["(void)current;", "current = state->current;"]
     lines += ["const pmdc_real here = current;", "pmdc_real ahead = speed;"]
+    if _corrects_its_prediction(law):
+        lines += [
+            "/* integrate half of what the prediction lacked */",
+            "state->missing += (1 - PMDC_MODEL_II) / (2 * PMDC_MODEL_IV) * (here - state->current);",
+        ]
     if law.hardware.delay:
         lines += [
             "/* the last command acts until this one does */",
@@ -128,6 +135,11 @@ def _predicted_state(law: Law) -> list[str]:
             f"current = {_next_sample('I', 'state->voltage')};",
         ]
     return lines
+
+
+def _corrects_its_prediction(law: Law) -> bool:
+    """Whether the missing voltage is used: by a current limit, where a current is measured."""
+    return law.hardware.measures_current and law.hardware.current_limit is not None
 
 
 def _next_sample(row: str, voltage: str) -> str:
@@ -148,9 +160,15 @@ def _limited_voltage(law: Law) -> list[str]:
     """Statements that limit the voltage."""
     lines = ["pmdc_real applied = asked;"]
     if law.hardware.current_limit is not None:
+        if law.hardware.delay:
+            lines += [
+                "/* by then the missing voltage has acted, too */",
+                "current += PMDC_MODEL_IV * state->missing;",
+                "ahead += PMDC_MODEL_WV * state->missing;",
+            ]
         lines += [
             "/* voltage with which the current peaks at its limit */",
-            "const pmdc_real drift = PMDC_MODEL_PI * current + PMDC_MODEL_PW * ahead;",
+            "const pmdc_real drift = PMDC_MODEL_PI * current + PMDC_MODEL_PW * ahead + PMDC_MODEL_PV * state->missing;",
             "applied = pmdc_clip(applied, (-PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_PV,",
             "                    (PMDC_CURRENT_LIMIT - drift) / PMDC_MODEL_PV);",
         ]
@@ -175,5 +193,7 @@ def _memory_update(law: Law) -> list[str]:
 def _estimated_current(law: Law) -> list[str]:
     """Statements that estimate the current at the next sample."""
     acting = "state->voltage" if law.hardware.delay else "applied"
+    if _corrects_its_prediction(law):
+        acting = f"({acting} + state->missing)"
     # some laws do not use `ahead`, and compilers warn of a variable that is set but not used
     return [f"state->current = {_next_sample('I', acting)};", "(void)ahead;"]

@@ -16,9 +16,7 @@ from .tuning import Tuning
 OVERSHOOT_TO_REPORT = 1.2
 SENSITIVITY_TO_REPORT = 1.1
 CURRENT_TO_REPORT = 1.02
-# Share of Kb by which it may be smaller than known, when magnets are hot; and share of L / R from which a sample is so
-# long that its current depends on the back-EMF more than on the current measured at its start
-KB_CHANGE_TO_SURVIVE, MEASURED_SHARE = 0.15, 0.25
+KB_CHANGE_TO_SURVIVE = 0.15  # share of Kb by which it may be smaller than known, when magnets are hot
 # Kt over Kb, or its inverse, from which one of them must be in another unit: in SI they differ by iron losses
 CONSTANTS_RATIO_TO_REPORT = 3.0
 
@@ -40,20 +38,18 @@ def remarks(result: Tuning, uncertainty: Uncertainty | None) -> Iterator[str]:
 
 def _current_limit_remarks(result: Tuning, limit: float) -> Iterator[str]:
     """Messages where the current exceeds its limit, and where that limit leaves no room for another Kb."""
-    motor, sample_time = result.motor, float(result.hardware.sample_time)
+    motor = result.motor
     if result.peak_current > CURRENT_TO_REPORT * limit:
         predicted = "that of the motor without its effects" if motor.effects else "what it predicts for one instant"
         yield (
             f"the current reaches {result.peak_current:.3g} A in simulation, beyond its limit of {limit:g} A, because"
             f" the controller limits {predicted}: choose a lower limit"
         )
-    # a sample much shorter than L / R starts from the measured current
-    share, time_constant = float(motor.R) * limit / abs(float(motor.Kb) * result.setpoint), float(motor.L / motor.R)
-    if share < KB_CHANGE_TO_SURVIVE and sample_time > time_constant * MEASURED_SHARE:
+    share = float(motor.R) * limit / abs(float(motor.Kb) * result.setpoint)
+    if share < KB_CHANGE_TO_SURVIVE and not result.hardware.measures_current:
         yield (
             f"the current limit relies on the back-EMF: with Kb {100 * share:.2g} % smaller, as of hot magnets, the"
-            " controller could not brake from the set point. Choose a larger limit, or a sample time far below L / R ="
-            f" {time_constant:.2g} s"
+            " controller could not brake from the set point. Measure the current, or choose a larger limit"
         )
 
 
