@@ -103,6 +103,11 @@ class Motor(eqx.Module):
         return self.L / self.R + self.J * self.R / (self.Kt * self.Kb)
 
     @property
+    def oscillation_time(self) -> Scalars:
+        """Inverse of the undamped natural frequency, s: the root of L J / (Kt Kb)."""
+        return jnp.sqrt(self.L * self.J / (self.Kt * self.Kb))
+
+    @property
     def states(self) -> tuple[str, ...]:
         """Names of the states that the effects add."""
         return tuple(sorted({name for effect in self.effects for name in effect.states}))

@@ -375,7 +375,7 @@ def test_a_loop_with_a_slow_sensor_or_backlash_reaches_its_set_point(name, param
     motor = Motor(**{n: jnp.asarray(x) for n, x in PAPER.items()}, effects=(effect,))
     gentle = PID(0.2, 8.0, 2e-4, 5e-4, 1.0, 0.02)
     law = Law.of(gentle, Hardware(1e-3, 30.0, 100.0, None, 1), motor)
-    response = run(motor, law, course(400), int(steps_within(motor, 1e-3, jnp.asarray(100.0))))
+    response = run(motor, law, course(400), int(steps_within(motor, jnp.asarray(1e-3), jnp.asarray(100.0), 1e-3)))
     assert float(response.speed[-1]) == pytest.approx(SETPOINT, abs=0.01)
     assert float(response.voltage[-1]) == pytest.approx(float(steady_state(motor, SETPOINT)[1]), abs=1e-3)
 

@@ -130,7 +130,7 @@ class LoopRequirements:
             max_sensitivity=self.max_sensitivity,
             noise=jnp.zeros(PART_COUNT * part_samples),
             part_samples=part_samples,
-            substeps=int(steps_within(motor, sample_time, jnp.asarray(max_current))),
+            substeps=int(steps_within(motor, jnp.asarray(sample_time), jnp.asarray(max_current), sample_time)),
         )
         return jax.tree.map(lambda x: jnp.asarray(x, float), task), [*limit_notes, *sampling_notes]
 

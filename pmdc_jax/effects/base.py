@@ -14,7 +14,7 @@ attributes, each of which does nothing unless the effect overrides it:
 - `states`, `initial_states` and `derivative`: states of its own, their initial values and derivatives
 - `repeats_after`: periods of its own states
 - `linear`: the linear effect that it is, or is close to, whose states then join the exact step
-- `fastest_rate`: the fastest rate that it adds to the motor
+- `longer_step` and `fastest_rate`: how long a step may be for one motor, and the fastest rate that it adds to it
 - `sensors`, `speed_delay` and `speed_before_sensor`: reported current and speed, and the speed behind a report
 
 A new effect is one class in this package, one row in its table `EFFECTS` and one in that of
@@ -106,7 +106,7 @@ class AbstractEffect(eqx.Module):
     # with it the motor is still a linear system with inputs, as long as no dry element changes direction and no teeth
     # touch or part
     affine: ClassVar[bool] = False
-    # the longest step in s that resolves the effect, or its changes of direction
+    # the longest step in s that resolves the effect, or its changes of direction, in any motor
     longest_step: ClassVar[float] = 1e-3
 
     def is_possible(self) -> bool:
@@ -178,6 +178,11 @@ class AbstractEffect(eqx.Module):
     def without_contact(self) -> AbstractEffect:
         """The effect while its teeth do not touch."""
         return self
+
+    def longer_step(self, motor: Motor) -> Scalars | None:
+        """The longest step in s that resolves it in this motor, if that may be longer than `longest_step`."""
+        del motor
+        return None
 
     def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars | None:
         """The fastest rate, 1/s, that it adds to the motor at a current in A; None if `longest_step` suffices."""

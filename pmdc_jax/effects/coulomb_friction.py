@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from .base import AbstractEffect, Grip, ParameterRange, Scalars, State
+
+if TYPE_CHECKING:
+    from ..motor import Motor
+
+# Radians of the motor's undamped oscillation in which a change of direction is resolved, to a few 1e-5 of the speed
+RESOLVED_ANGLE = 0.1
+
+
+def step_of_reversals(motor: Motor) -> Scalars:
+    """The longest step, s, that resolves how a motor with dry friction or drag changes direction."""
+    return RESOLVED_ANGLE * motor.oscillation_time
 
 
 class CoulombFriction(AbstractEffect):
@@ -30,6 +41,9 @@ class CoulombFriction(AbstractEffect):
     def grip(self, state: State) -> Grip:
         del state
         return Grip(self.torque_Nm, self.torque_Nm)
+
+    def longer_step(self, motor: Motor) -> Scalars:
+        return step_of_reversals(motor)
 
 
 class AsymmetricFriction(AbstractEffect):
@@ -63,3 +77,6 @@ class AsymmetricFriction(AbstractEffect):
     def grip(self, state: State) -> Grip:
         del state
         return Grip(self.backward_Nm, self.forward_Nm)
+
+    def longer_step(self, motor: Motor) -> Scalars:
+        return step_of_reversals(motor)

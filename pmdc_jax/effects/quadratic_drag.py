@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax.numpy as jnp
 
 from .base import AbstractEffect, ParameterRange, Scalars, State
+from .coulomb_friction import step_of_reversals
+
+if TYPE_CHECKING:
+    from ..motor import Motor
 
 
 class QuadraticDrag(AbstractEffect):
@@ -29,3 +33,6 @@ class QuadraticDrag(AbstractEffect):
 
     def torque(self, state: State) -> Scalars:
         return self.drag_Nms2_rad2 * state.speed * jnp.abs(state.speed)
+
+    def longer_step(self, motor: Motor) -> Scalars:
+        return step_of_reversals(motor)

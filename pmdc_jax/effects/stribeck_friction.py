@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax.numpy as jnp
 
 from .base import AbstractEffect, Grip, ParameterRange, Scalars, State
+from .coulomb_friction import step_of_reversals
+
+if TYPE_CHECKING:
+    from ..motor import Motor
+
+# Share of the time in which the fall from static to Coulomb friction would accelerate the motor by `speed_rad_s`
+RESOLVED_FALL = 1 / 4
 
 
 class StribeckFriction(AbstractEffect):
@@ -42,3 +49,7 @@ class StribeckFriction(AbstractEffect):
         slow = jnp.exp(-((state.speed * (1 / self.speed_rad_s)) ** 2))
         torque = self.coulomb_Nm + (self.static_Nm - self.coulomb_Nm) * slow
         return Grip(torque, torque)
+
+    def longer_step(self, motor: Motor) -> Scalars:
+        fall = jnp.maximum(self.static_Nm - self.coulomb_Nm, 0.0)
+        return 1 / (1 / step_of_reversals(motor) + fall / (RESOLVED_FALL * motor.J * self.speed_rad_s))

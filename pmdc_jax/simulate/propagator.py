@@ -230,22 +230,31 @@ def pick_grid(grids: Propagator, tape: Tape, grid: Int[Array | np.ndarray, "..."
 def steps_in_sample(motor: Motor, tape: Tape) -> int | Int[Array, ""]:
     """Number of equal steps in a sample of the tape."""
     current = jnp.max(jnp.abs(jnp.asarray(tape.measured)[:, 0]))
-    return steps_within(motor, tape.longest, current)
+    return steps_within(motor, jnp.max(jnp.asarray(tape.sample_time)), current, tape.longest)
 
 
-def steps_within(motor: Motor, seconds: float, current: Scalars) -> int | Int[Array, ""]:
+def steps_within(motor: Motor, seconds: Scalars, current: Scalars, longest: float) -> int | Int[Array, ""]:
     """Number of equal steps in this time, at most `MAX_STEPS`, so that none is longer than the effects allow at
-    currents up to `current` in A."""
-    allowed = [e.longest_step for e in motor.effects if e.holds or e.contact_state or not e.affine]
-    if not allowed:
+    currents up to `current` in A; `seconds` is at most `longest`, for which programs are compiled."""
+    resolved = [e for e in motor.effects if e.holds or e.contact_state or not e.affine]
+    if not resolved:
         return 1
-    least = min(max(round(seconds / min(allowed)), 1), MAX_STEPS)
+    step = min(e.longest_step for e in resolved)
     rates = [rate for e in motor.effects if (rate := e.fastest_rate(motor, current)) is not None]
-    if not rates:
-        return least
+    if not rates and longest <= step:
+        return 1
+    least = jnp.clip(jnp.round(seconds / step), 1, MAX_STEPS)
+    longer = [step for e in resolved if (step := e.longer_step(motor)) is not None]
     # the median of a population: an outlier that needs far more steps would slow down all of it
-    needed = jnp.ceil(jnp.median(reduce(jnp.maximum, rates)) * seconds / MAX_RATE_TIMES_STEP)
-    return jnp.clip(jnp.nan_to_num(needed, nan=MAX_STEPS), least, MAX_STEPS).astype(int)
+    if len(longer) == len(resolved):
+        needed = seconds / jnp.median(reduce(jnp.minimum, longer))
+        # a power of two, which a slightly different motor of a fit needs, too
+        needed = 2 ** jnp.ceil(jnp.log2(jnp.nan_to_num(needed, nan=MAX_STEPS)))
+        least = jnp.clip(needed, 1, least)
+    if rates:
+        needed = jnp.ceil(jnp.median(reduce(jnp.maximum, rates)) * seconds / MAX_RATE_TIMES_STEP)
+        least = jnp.clip(jnp.nan_to_num(needed, nan=MAX_STEPS), least, MAX_STEPS)
+    return least.astype(int)
 
 
 def linear_states(motor: Motor) -> list[str]:

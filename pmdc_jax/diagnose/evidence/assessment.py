@@ -25,6 +25,8 @@ FALSE_ALARM = 0.01
 MODEL_FORM_SHARE = 0.1
 # The same if the rest is a curve over an effect's own variable
 OWN_MODEL_FORM_SHARE = 0.5
+# Viscous friction, over that of the motor without effects, that has all but vanished
+VANISHED_VISCOUS_SHARE = 0.1
 # Least share of the gain of the clearest signal with which a candidate is worth a trial
 TRIAL_SHARE = 0.3
 # Least share of the gain of the clearest signal with which a curve describes what is left
@@ -61,6 +63,7 @@ class Assessment(NamedTuple):
     # squared white residuals of the motor without effects, less those of the model
     explained: float
     explained_unfiltered: float  # the same for the unfiltered misfit, `Fit.fitness`
+    viscous_share: float = 1.0  # viscous friction over that of the motor without effects
 
     @property
     def clearest(self) -> Signal:
@@ -116,11 +119,13 @@ class Assessment(NamedTuple):
         return self._belongs_to(model) or bool(own_curve and within)
 
     def _calls_for_negative_friction(self, model: Model) -> bool:
-        """Whether a torque over speed is left and viscous friction is next to zero, its bound: the model's effects then
-        depend on the speed in another way than what is missing."""
+        """Whether a torque over speed is left and viscous friction is next to zero, its bound, or all but vanished and
+        the torque is too large for model-form error: the model's effects then depend on the speed in another way than
+        what is missing."""
         clearest = self.clearest.term
         over_speed = isinstance(clearest, Curve) and (clearest.equation, clearest.variable) == ("mechanical", "speed")
-        return over_speed and "f" in model.at_bound | model.undetermined
+        vanished = self.viscous_share < VANISHED_VISCOUS_SHARE and self.unexplained > MODEL_FORM_SHARE
+        return over_speed and (vanished or "f" in model.at_bound | model.undetermined)
 
     def is_sensor_error(self) -> bool:
         """Whether the clearest signal is an error of a sensor that no effect of the library has."""

@@ -117,7 +117,10 @@ class StepwiseSelection:
             base, fitted = (self.comparison.fitted(m, evidence.white) for m in (self.base, model))
             explained = base.squares - fitted.squares
         explained_unfiltered = self.base.fit.fitness - model.fit.fitness
-        return Assessment(evidence, candidate_signals, curve_signals, p_value, explained, explained_unfiltered)
+        viscous_share = float(model.motor.f / self.base.motor.f)
+        return Assessment(
+            evidence, candidate_signals, curve_signals, p_value, explained, explained_unfiltered, viscous_share
+        )
 
     def _with_refined_runs(self, model: Model) -> Model:
         """The model with the samples of an uneven clock shifted along its own motion, and with runs that begin with a
@@ -151,11 +154,13 @@ class StepwiseSelection:
         return assessment.is_negligible(smaller) and not assessment.is_unrelated_to(smaller)
 
     def _at_better_optimum(self, model: Model) -> Model:
-        """The model just accepted, or one with the same effects found around it that leaves far less."""
+        """The model just accepted, or one found around it that leaves far less, without an effect that is not needed
+        there."""
         better = self.refits.searched_around(model)
-        if better is not model:
-            self.superseded.add(model)
-        return better
+        if better is model:
+            return model
+        self.superseded.add(model)
+        return self._without_needless(better)
 
     def _step(self, current: Model) -> Model | None:
         """The next model: of several kinds of proposals the first that is better and accepted; None if there is none.
