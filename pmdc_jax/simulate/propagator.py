@@ -239,11 +239,11 @@ def steps_within(motor: Motor, seconds: Scalars, current: Scalars, longest: floa
     resolved = [e for e in motor.effects if e.holds or e.contact_state or not e.affine]
     if not resolved:
         return 1
-    step = min(e.longest_step for e in resolved)
+    always_resolves = min(e.longest_step for e in resolved)
     rates = [rate for e in motor.effects if (rate := e.fastest_rate(motor, current)) is not None]
-    if not rates and longest <= step:
+    if not rates and longest <= always_resolves:
         return 1
-    least = jnp.clip(jnp.round(seconds / step), 1, MAX_STEPS)
+    least = jnp.clip(jnp.round(seconds / always_resolves), 1, MAX_STEPS)
     longer = [step for e in resolved if (step := e.longer_step(motor)) is not None]
     # the median of a population: an outlier that needs far more steps would slow down all of it
     if len(longer) == len(resolved):

@@ -59,8 +59,8 @@ class Tape(eqx.Module):
     angle_known: Bool[Samples, " runs"]
     # angle in rad over each sample by the measured speed, where the simulated rotor is to follow it; else NaN
     turn: Float[Samples, "blocks samples"]
-    # longest sample time in s, rounded up to 1 ms times a power of two: it decides into how many steps a sample is
-    # divided, for which programs are compiled
+    # longest sample time in s, rounded up to 1 ms times a power of two: it decides whether samples are divided into
+    # steps, for which programs are compiled
     longest: float = eqx.field(static=True)
     # change of the drive over each sample; None if all drives are held
     rise: Float[Samples, "blocks samples"] | None = None
