@@ -45,7 +45,7 @@ from pmdc_jax.identify.rotor_angle import with_rotor_angle
 from pmdc_jax.identify.search.binary_ga import BinaryGA
 from pmdc_jax.identify.search.bounds import effect_bounds
 from pmdc_jax.identify.search.evolution import METHODS, SearchResult, global_search
-from pmdc_jax.identify.solve import _distinct, solve
+from pmdc_jax.identify.solve import _distinct, _times_found, solve
 from pmdc_jax.identify.uncertainty.covariance import information, long_run_variance
 from pmdc_jax.motor import PARAMETERS
 from pmdc_jax.motor_file import Uncertainty
@@ -576,6 +576,28 @@ def test_white_residuals_need_no_filter(runs):
     with jax.enable_x64(True):
         plain = solve(prepare(runs, []), "cma_es", 0).fitted
         assert _last_fit(plain) is plain
+
+
+@pytest.mark.parametrize(
+    ("best", "other", "moved", "found"),
+    [
+        (1.0, 1.00005, 0.5, 2),
+        (1.0, 1.01, 1e-3, 1),
+        (8.0, 8.004, 0.5, 2),
+        (8.0, 8.1, 0.02, 2),
+        (8.0, 8.1, 0.5, 1),
+        (8.0, 8.5, 0.02, 1),
+    ],
+)
+def test_optima_of_a_rotor_that_sticks_in_a_fluctuating_torque_count_as_one(best, other, moved, found):
+    """Near each other in all parameters and little worse; in white noise, `best` about 1, only at the same fitness."""
+    ranges = Mock(spec=Parameters, lower=np.array([-5.0, 2.0]), upper=np.array([5.0, 2.0]))
+    problem = Mock(spec=Problem, perfect_fitness=1.0, parameters=ranges)
+    ends = [
+        Mock(spec=Optimum, fitness=fitness, unknowns=Mock(coordinates=np.array([x, 2.0])))
+        for fitness, x in ((best, 0.0), (other, moved))
+    ]
+    assert _times_found(ends, problem) == found
 
 
 def test_one_start_of_the_refinement_has_a_medium_inductance():

@@ -46,15 +46,15 @@ class Comparison:
         suppresses whatever changes slowly. Where the criterion will exceed the least by more than `margin`, and
         `HOPELESS_EXCESS`, the fit is given up.
         """
-        least_unfiltered = min(m.fit.fitness for m in models)
+        best = min(models, key=lambda m: m.fit.fitness)
         fitted, least = [], np.inf
         for model in sorted(models, key=lambda m: m.fit.fitness):
-            if model.fit.fitness < DECISIVE_RATIO * least_unfiltered:
-                largest = _largest_squares(model.prepared, least, margin)
-                fitted.append(self.fitted(model, white, largest))
-                least = min(least, fitted[-1].criterion)
-            else:
+            if is_decisively_better(best, model):
                 fitted.append(Fitted(model, np.inf, np.inf))
+                continue
+            largest = _largest_squares(model.prepared, least, margin)
+            fitted.append(self.fitted(model, white, largest))
+            least = min(least, fitted[-1].criterion)
         return sorted(fitted, key=lambda f: f.criterion)
 
     def fitted(self, model: Model, white: Whitener, give_up_above: float = np.inf) -> Fitted:
