@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -73,9 +74,9 @@ def exact_steps(m: dict[str, float], run: Recording, start) -> np.ndarray:
     return np.array(states)
 
 
-def simulated_alone(m: Motor, run: Recording, start=None, **changes) -> np.ndarray:
-    """Free run of one recording by the package, (samples, 2); `changes` of its tape."""
-    tape = dataclasses.replace(Tape.from_recordings([run], unloaded=True), **changes)
+def simulated_alone(m: Motor, run: Recording, start=None, before: Sequence[Recording] = ()) -> np.ndarray:
+    """Free run of one recording by the package, (samples, 2); on one tape with those it is `before`, if any."""
+    tape = Tape.from_recordings([run, *before], unloaded=True)
     if start is not None:
         tape = dataclasses.replace(tape, initial=np.array([start]))
     outputs = free_run(m, tape)
@@ -281,7 +282,7 @@ def test_runs_on_one_tape_match_runs_simulated_alone(x64):
         loaded = Recording(run.name, run.time, run.voltage, run.current, run.speed, run.load + offset)
         together = np.stack([tape.samples_of(k, outputs[:, c], len(run)) for c in range(2)], 1)
         # the slowest run determines for all into how many steps a sample is divided
-        separate = simulated_alone(m, loaded, longest=tape.longest)
+        separate = simulated_alone(m, loaded, before=[recording("slowest", 10, 5e-3)])
         np.testing.assert_allclose(together, separate, rtol=1e-7, atol=1e-7)
 
 
