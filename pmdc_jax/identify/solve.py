@@ -39,9 +39,11 @@ from .search.evolution import SearchResult, global_search
 STARTS = 4
 # Two refinements found the same optimum if their fitness agrees to this share.
 FITNESS_TOLERANCE = 1e-4
-# ... where the model lacks something: refinements then end further from the optimum. Where a rotor sticks in a torque
-# that fluctuates, there are many, at the second of these shares with all coordinates within this one of their ranges.
-POOR_FIT_TOLERANCE, STICKING_TOLERANCE, STICKING_SHARE = 1e-3, 0.03, 5e-3
+# ... where the model lacks something: refinements then end further from the optimum
+POOR_FIT_TOLERANCE = 1e-3
+# ... and where, besides, all coordinates agree to the second share of their ranges: a rotor that sticks in a torque
+# that fluctuates has many optima near each other
+STICKING_TOLERANCE, STICKING_SHARE = 0.03, 5e-3
 # A mean square of the residuals above this many noise variances asks for another search, up to this many in all.
 POOR_FIT = 1.5
 MAX_SEARCHES = 5

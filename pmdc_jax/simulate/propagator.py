@@ -243,7 +243,8 @@ def steps_within(motor: Motor, seconds: Scalars, current: Scalars, longest: floa
     rates = [rate for e in motor.effects if (rate := e.fastest_rate(motor, current)) is not None]
     if not rates and longest <= always_resolves:
         return 1
-    least = jnp.clip(jnp.round(seconds / always_resolves), 1, MAX_STEPS)
+    # rounded up, but for rounding errors
+    least = jnp.clip(jnp.ceil(seconds / always_resolves - 1e-6), 1, MAX_STEPS)
     longer = [step for e in resolved if (step := e.longer_step(motor)) is not None]
     # the median of a population: an outlier that needs far more steps would slow down all of it
     if len(longer) == len(resolved):

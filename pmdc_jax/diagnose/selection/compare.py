@@ -46,10 +46,10 @@ class Comparison:
         suppresses whatever changes slowly. Where the criterion will exceed the least by more than `margin`, and
         `HOPELESS_EXCESS`, the fit is given up.
         """
-        best = min(models, key=lambda m: m.fit.fitness)
         fitted, least = [], np.inf
-        for model in sorted(models, key=lambda m: m.fit.fitness):
-            if is_decisively_better(best, model):
+        by_fitness = sorted(models, key=lambda m: m.fit.fitness)
+        for model in by_fitness:
+            if is_decisively_better(by_fitness[0], model):
                 fitted.append(Fitted(model, np.inf, np.inf))
                 continue
             largest = _largest_squares(model.prepared, least, margin)
