@@ -165,6 +165,55 @@ def test_an_interpolated_voltage_keeps_its_mean_and_first_moment_in_every_even_s
         np.testing.assert_allclose(then[:, c], want, atol=1e-4 * np.ptp(want))
 
 
+def moved(state: np.ndarray, voltage: float, slope: float, load: float, seconds: float) -> np.ndarray:
+    """Current, speed and angle after this time, with a voltage that changes by `slope` in V/s."""
+    A = np.zeros((6, 6))  # of current, speed, voltage, load, slope and angle
+    A[:4, :4] = state_matrix()
+    A[2, 4] = A[5, 1] = 1.0
+    return (expm(A * seconds) @ [state[0], state[1], voltage, load, slope, state[2]])[[0, 1, 5]]
+
+
+@pytest.mark.parametrize("first_order_hold", [False, True])
+def test_mean_speeds_between_uneven_stamps_are_exact_for_a_linear_motor(first_order_hold):
+    """A mean begins at the last known angle."""
+    rng = np.random.default_rng(26)
+    run = record(stamps("walk", 60, rng), rng, 0 * NOISE)
+    true = np.zeros((len(run), 3))
+    for k, seconds in enumerate(np.diff(run.time)):
+        slope = first_order_hold * (run.voltage[k + 1] - run.voltage[k]) / seconds
+        true[k + 1] = moved(true[k], run.voltage[k], slope, run.load[k], seconds)
+    angle = np.where(np.isin(np.arange(len(run)), [7, 20, 21]), np.nan, true[:, 2])
+    even = on_even_clock(attrs.evolve(run, speed=None, angle=angle))
+    mean, rise = mean_and_rise_of_pieces(even, pieces_of(even, first_order_hold))
+    seen, step = np.zeros((len(even), 3)), even.sample_time
+    for k in range(len(even) - 1):
+        seen[k + 1] = moved(seen[k], mean[k] - rise[k] / 2, rise[k] / step, even.load[k], step)
+    found = simulated_at_stamps(Motor(**MOTOR), Drive(), even, seen[:, :2], first_order_hold, mean_speed=True)
+    np.testing.assert_allclose(found[:, 0], true[:, 0], atol=1e-9 * np.ptp(true[:, 0]))
+    assert np.flatnonzero(np.isnan(found[:, 1])).tolist() == [0, 7, 20, 21]
+    np.testing.assert_allclose(found[:, 1], even.recorded.speed, atol=1e-9 * np.ptp(true[:, 1]))
+
+
+@pytest.mark.slow
+def test_a_motor_is_identified_from_encoder_counts_at_uneven_stamps():
+    """With a fluctuating torque: taken as instantaneous speeds, the counts would give an L that is 15 % off."""
+    rng, count = np.random.default_rng(27), 4000
+    time, voltage = 4 * stamps("walk", count, rng), np.repeat(rng.uniform(-15, 15, count // 40), 40)
+    torque, states = np.zeros(count), np.zeros((count, 3))
+    for k, seconds in enumerate(np.diff(time)):
+        keep = np.exp(-seconds / 0.1)
+        torque[k + 1] = keep * torque[k] + 0.005 * np.sqrt(1 - keep**2) * rng.normal()
+        states[k + 1] = moved(states[k], voltage[k], 0.0, torque[k], seconds)
+    step = 2 * np.pi / 4096
+    current = states[:, 0] + NOISE[0] * rng.normal(size=count)
+    run = Recording("counts", time, voltage, current, angle=step * np.floor(states[:, 2] / step))
+    found = pmdc_jax.identify([run], unloaded=True, tie=[("Kt", "Kb")])
+    for name in ("R", "L", "Kb", "J"):
+        estimate = found.parameters[name]
+        assert abs(estimate.value - MOTOR[name]) < 3 * estimate.stderr, name
+        assert estimate.stderr < 0.02 * MOTOR[name], name
+
+
 def test_pieces_cover_every_even_sample_once():
     rng = np.random.default_rng(24)
     even = on_even_clock(record(stamps("walk", 200, rng), rng))

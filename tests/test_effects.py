@@ -499,10 +499,10 @@ HAS_LONGER_STEP = [n for n, e in EFFECTS.items() if e.longer_step is not Abstrac
 
 
 @pytest.mark.parametrize("name", HAS_LONGER_STEP)
-@pytest.mark.parametrize(("inertia", "steps"), [(5, 8), (100, 2)])
-def test_slow_samples_of_a_heavy_rotor_take_fewer_steps(x64, name, inertia, steps):
+@pytest.mark.parametrize(("inertia", "inductance", "steps"), [(5, 1, 8), (5, 20, 2)])
+def test_slow_samples_of_a_slow_motor_take_fewer_steps(x64, name, inertia, inductance, steps):
     """Of 10 ms, instead of ten: current and speed are those at samples of 0.5 ms, and the rotor still reverses."""
-    motor = with_effect(name, J=inertia * PAPER["J"])
+    motor = with_effect(name, J=inertia * PAPER["J"], L=inductance * PAPER["L"])
     slow = recordings(1e-2)
     fine = [
         Recording(r.name, 5e-4 * np.arange(20 * len(r)), **{c: np.repeat(getattr(r, c), 20) for c in COLUMNS})
@@ -512,9 +512,9 @@ def test_slow_samples_of_a_heavy_rotor_take_fewer_steps(x64, name, inertia, step
     expected = [outputs[::20] for outputs in simulated(motor, fine)]
     assert any((np.diff(np.sign(outputs[:, 1])) != 0).any() for outputs in expected)
     largest, rms = relative_errors(simulated(motor, slow), expected)
-    # of a sample in which it reverses, and of all: a tenth of the noise of good sensors
-    assert largest < 3e-4
-    assert rms < 2e-5
+    # of a sample in which speed or current reverses, and of all: less than a tenth of the noise of good sensors
+    assert largest < 1e-3
+    assert rms < 5e-5
 
 
 def test_a_strongly_saturated_inductance_is_nearly_as_accurate(x64):

@@ -445,7 +445,7 @@ def test_uneven_runs_of_one_clock_share_a_sample_time():
 
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_speed_is_computed_from_the_angle(wrapped):
-    """From even samples the mean speed over each, from uneven ones the instantaneous speed."""
+    """The mean speeds between samples; on an even clock in place of an uneven one, the instantaneous speed."""
     time = 1e-3 * np.arange(400)
     stamps = time + 2e-4 * np.sin(np.arange(400))
 
@@ -458,10 +458,16 @@ def test_speed_is_computed_from_the_angle(wrapped):
     even = on_even_clock(Recording("r", time, np.ones(400), angle=measured(time)))
     assert even.averaging == OVER_LAST and np.isnan(even.speed[0])
     np.testing.assert_allclose(even.speed[1:], np.diff(angle(time)) / 1e-3, rtol=1e-9)
-    uneven = on_even_clock(Recording("r", stamps, np.ones(400), angle=measured(stamps))).recorded
-    assert uneven.averaging is None
-    speed = 30 + 20 * np.cos(20 * stamps)
-    np.testing.assert_allclose(uneven.speed[2:-2], speed[2:-2], rtol=1e-4)
+    resampled = on_even_clock(Recording("r", stamps, np.ones(400), angle=measured(stamps)))
+    uneven = resampled.recorded
+    assert uneven.averaging == OVER_LAST and np.isnan(uneven.speed[0])
+    np.testing.assert_allclose(uneven.speed[1:], np.diff(angle(stamps)) / np.diff(stamps), rtol=1e-9)
+    assert resampled.averaging is None
+    speed = 30 + 20 * np.cos(20 * resampled.time)
+    np.testing.assert_allclose(resampled.speed[2:-2], speed[2:-2], rtol=1e-3)
+    again = on_even_clock(uneven)
+    np.testing.assert_array_equal(again.recorded.speed, uneven.speed)
+    np.testing.assert_array_equal(again.speed, resampled.speed)
 
 
 def test_missing_angles_give_missing_speeds():

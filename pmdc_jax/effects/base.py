@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 
 Scalars = Float[Array | np.ndarray, "*#batch"]
 
+# The step in s that resolves most effects in any motor
+LONGEST_STEP = 1e-3
+
 
 class State(NamedTuple):
     """Armature current in A, shaft speed in rad/s, and the states that effects add, by name."""
@@ -107,7 +110,7 @@ class AbstractEffect(eqx.Module):
     # touch or part
     affine: ClassVar[bool] = False
     # the longest step in s that resolves the effect, or its changes of direction, in any motor
-    longest_step: ClassVar[float] = 1e-3
+    longest_step: ClassVar[float] = LONGEST_STEP
 
     def is_possible(self) -> bool:
         """Whether the combination of its parameters is plausible; each by itself is within its range."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import jax.numpy as jnp
 
 from .base import AbstractEffect, Grip, ParameterRange, Scalars, State
+from .steps import step_of_currents
 
 if TYPE_CHECKING:
     from ..motor import Motor
@@ -36,6 +37,9 @@ class BrushVoltageDrop(AbstractEffect):
         del state
         return Grip(self.voltage_V, self.voltage_V)
 
+    def longer_step(self, motor: Motor) -> Scalars:
+        return step_of_currents(motor)
+
 
 class GradualBrushDrop(AbstractEffect):
     """Brush drop that sets in gradually: v_b = voltage_V tanh(i / onset_A), a form of `BrushVoltageDrop`.
@@ -58,6 +62,9 @@ class GradualBrushDrop(AbstractEffect):
 
     def voltage_drop(self, state: State) -> Scalars:
         return self.voltage_V * jnp.tanh(state.current / self.onset_A)
+
+    def longer_step(self, motor: Motor) -> Scalars:
+        return step_of_currents(motor)
 
     def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars:
         del current

@@ -5,17 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from .base import AbstractEffect, Grip, ParameterRange, Scalars, State
+from .steps import step_of_reversals
 
 if TYPE_CHECKING:
     from ..motor import Motor
-
-# Radians of the motor's undamped oscillation in which a change of direction is resolved, to a few 1e-5 of the speed
-RESOLVED_ANGLE = 0.1
-
-
-def step_of_reversals(motor: Motor) -> Scalars:
-    """The longest step, s, that resolves how a motor with dry friction or drag changes direction."""
-    return RESOLVED_ANGLE * motor.oscillation_time
 
 
 class CoulombFriction(AbstractEffect):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import jax.numpy as jnp
 
 from .base import AbstractEffect, ParameterRange, Scalars, State
-from .coulomb_friction import step_of_reversals
+from .steps import step_of_reversals
 
 if TYPE_CHECKING:
     from ..motor import Motor

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import equinox as eqx
 
 from .base import AbstractEffect, ParameterRange, Scalars, State
+from .steps import step_of_currents
 
 if TYPE_CHECKING:
     from ..motor import Motor
@@ -49,3 +50,6 @@ class ResistanceHeating(AbstractEffect):
         rise = state.extra["resistance_rise"]
         loss = motor.R * state.current**2
         return {"resistance_rise": (self.rise_per_W * loss - rise) * (1 / self.time_constant_s)}
+
+    def longer_step(self, motor: Motor) -> Scalars:
+        return step_of_currents(motor)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import equinox as eqx
 
 from .base import AbstractEffect, ParameterRange, Scalars, State
+from .steps import step_of_currents
 
 if TYPE_CHECKING:
     from ..motor import Motor
@@ -42,6 +43,9 @@ class TorqueConstantSaturation(AbstractEffect):
         flux = 1 / (1 + self.per_A2 * state.current**2)
         constants = motor.Kt * flux, motor.Kb * (1 - self.emf_share * (1 - flux))
         return eqx.tree_at(lambda m: (m.Kt, m.Kb), motor, constants)
+
+    def longer_step(self, motor: Motor) -> Scalars:
+        return step_of_currents(motor)
 
 
 class InductanceSaturation(AbstractEffect):

@@ -1,4 +1,4 @@
-"""Unwrapping of shaft angles that were recorded modulo one turn."""
+"""Shaft angles: unwrapping those that were recorded modulo one turn, and the speeds that they give."""
 
 from __future__ import annotations
 
@@ -28,3 +28,11 @@ def unwrapped(angle: Samples) -> tuple[Samples, Int[np.ndarray, " wraps"]]:
     going_on = np.full_like(angle, np.nan)
     going_on[known] = np.unwrap(angle[known])
     return going_on, wraps
+
+
+def mean_speeds(time: Samples, angle: Samples) -> Samples:
+    """The mean speed, rad/s, from the last known angle in rad to each one; NaN at the first and where none is known."""
+    known = np.flatnonzero(~np.isnan(angle))
+    speed = np.full_like(angle, np.nan)
+    speed[known[1:]] = np.diff(angle[known]) / np.diff(time[known])
+    return speed

@@ -5,9 +5,8 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from ..recordings.angle import unwrapped
+from ..recordings.angle import mean_speeds, unwrapped
 from ..recordings.clock import GAP, is_even
-from ..recordings.readings import reading_interval
 from ..recordings.recording import OVER_LAST, Recording
 
 # An even clock is good enough if this share of the samples has ticks of their own, relative to the best clock
@@ -20,30 +19,26 @@ def on_even_clock(recording: Recording) -> Recording:
     Evenly sampled recordings keep their samples; if only the angle was measured, their speed is its mean over every
     sample. Otherwise voltage, torque and load, which hold between samples, are averaged over each of its intervals, so
     that no volt-second is lost. Current and speed are interpolated linearly; inside gaps, and past the end, they are
-    missing (NaN). The record is kept as `resampled_from`. A rotor that stands still throughout is taken as held,
-    because its speed tells nothing.
+    missing (NaN). The record is kept as `resampled_from`, where speeds from angles are means. A rotor that stands still
+    throughout is taken as held, because its speed tells nothing.
     """
     if recording.stands_still:
         recording = attrs.evolve(recording, speed=None, angle=None, held=True)
-    time, even = recording.time, is_even(recording.time)
-    if recording.speed is None and recording.angle is not None:
+    time, even, instantaneous = recording.time, is_even(recording.time), recording.speed
+    if recording.angle is not None and (recording.speed is None or recording.averaging):
         angle, _ = unwrapped(recording.angle)
-        if even:
-            interval = reading_interval(~np.isnan(angle))
-            speed = np.full_like(angle, np.nan)
-            speed[interval:] = (angle[interval:] - angle[:-interval]) / (interval * recording.sample_time)
-            recording = attrs.evolve(recording, speed=speed, averaging=OVER_LAST)
-        else:
-            recording = attrs.evolve(recording, speed=_spline_derivative(angle, time))
+        recording = attrs.evolve(recording, speed=mean_speeds(time, angle), averaging=OVER_LAST)
+        instantaneous = None if even else _spline_derivative(angle, time)
     if even:
         return attrs.evolve(recording, time=np.linspace(time[0], time[-1], len(time)))
     clock = _resampling_clock(time)
     driving = {"voltage": recording.voltage, "load": recording.load, "torque": recording.torque}
-    simulated = {"current": recording.current, "speed": recording.speed}
+    simulated = {"current": recording.current, "speed": instantaneous}
     return attrs.evolve(
         recording,
         time=clock,
         angle=None,
+        averaging=None,
         temperature=None,
         resampled_from=recording,
         **{k: _interval_means(time, x, clock) for k, x in driving.items() if x is not None},

@@ -19,6 +19,7 @@ ORDER = 10
 HALVINGS = 20
 # Below this size of a number a series is more accurate than a quotient
 SERIES_LIMIT = 3e-3
+SERIES_TERMS = 5
 
 
 def product(a: Float[Array, "n n *#batch"], b: Float[Array, "n m *#batch"]) -> Float[Array, "n m ..."]:
@@ -72,12 +73,12 @@ def _doubling(count: int) -> tuple[Float[np.ndarray, " functions"], Float[np.nda
 
 
 def scalar_phi(z: ArrayLike, k: int) -> np.ndarray:
-    """phi_k(z) = sum_j z^j / (j + k)! of each number, real or complex, for k up to 2."""
+    """phi_k(z) = sum_j z^j / (j + k)! of each number, real or complex."""
     z = np.asarray(z)
     if k == 0:
         return np.exp(z)
     small = np.abs(z) < SERIES_LIMIT
     safe = np.where(small, 1.0, z)
-    series = (1 + z / 3 * (1 + z / 4 * (1 + z / 5))) / 2
-    first = np.where(small, 1 + z * series, np.expm1(safe) / safe)
-    return first if k == 1 else np.where(small, series, (first - 1) / safe)
+    rise = np.expm1(safe) if k == 1 else scalar_phi(safe, k - 1) - 1 / factorial(k - 1)
+    series = sum(z**j / factorial(j + k) for j in range(SERIES_TERMS))
+    return np.where(small, series, rise / safe)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..effects.base import LONGEST_STEP
 from ..motor import Drive
 from ..recordings.readings import reading_interval
 from ..recordings.recording import OVER_LAST
@@ -59,8 +60,8 @@ class Tape(eqx.Module):
     angle_known: Bool[Samples, " runs"]
     # angle in rad over each sample by the measured speed, where the simulated rotor is to follow it; else NaN
     turn: Float[Samples, "blocks samples"]
-    # longest sample time in s, rounded up to 1 ms times a power of two: it decides whether samples are divided into
-    # steps, for which programs are compiled
+    # bound of the sample times in s: 1 ms where none is longer, else infinite. It decides whether programs are compiled
+    # that divide samples into steps
     longest: float = eqx.field(static=True)
     # change of the drive over each sample; None if all drives are held
     rise: Float[Samples, "blocks samples"] | None = None
@@ -115,7 +116,7 @@ class Tape(eqx.Module):
             angle=padded(_first(r.angle) for r in recordings),
             angle_known=padded(r.angle is not None for r in recordings),
             reading=None if timing.reading is None else np.asarray(timing.reading),
-            longest=2.0 ** math.ceil(math.log2(sample_times.max() / 1e-3) - 1e-6) * 1e-3,
+            longest=LONGEST_STEP if sample_times.max() <= (1 + 1e-6) * LONGEST_STEP else math.inf,
         )
 
     @property

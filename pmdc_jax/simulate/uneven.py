@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..motor import Drive, Motor
-from .between_samples import mean_and_rise_of_pieces, pieces_of
+from ..recordings.angle import mean_speeds
+from .between_samples import Pieces, mean_and_rise_of_pieces, pieces_of
 from .exponential import scalar_phi
 
 if TYPE_CHECKING:
@@ -25,20 +26,35 @@ def simulated_at_stamps(
     even: Recording,
     simulated: Float[np.ndarray, "samples 2"],
     first_order_hold: bool = False,
+    mean_speed: bool = False,
 ) -> Float[np.ndarray, "recorded 2"]:
-    """Current A and speed rad/s at the time stamps of a record, from those at the samples of its `even` clock.
+    """Current A and speed rad/s at the time stamps of a record, from those at the samples of its `even` clock; instead
+    of that speed the `mean_speeds` from one known angle to the next, if asked for.
 
     Exact for the linear motor, including the difference between the recorded drive and the straight line in its place.
     The effects are taken to contribute a constant voltage and torque within an even sample, but for a voltage that
     changes its sign with the drive.
     """
-    pieces = pieces_of(even, first_order_hold)
-    time, begins, length, index, value, slope, loads = pieces
+    record, pieces = even.recorded, pieces_of(even, first_order_hold)
+    reached, integral = _motion_in_pieces(motor, drive, even, simulated, pieces)
+    stamps = np.searchsorted(pieces.time, record.time)
+    outputs = reached[stamps]
+    if mean_speed and record.angle is not None:
+        angle = np.append(0.0, np.cumsum(integral[:-1, 1]))[stamps]
+        outputs[:, 1] = mean_speeds(record.time, np.where(np.isnan(record.angle), np.nan, angle))
+    return outputs
+
+
+def _motion_in_pieces(
+    motor: Motor, drive: Drive, even: Recording, simulated: Float[np.ndarray, "samples 2"], pieces: Pieces
+) -> tuple[Float[np.ndarray, "pieces 2"], Float[np.ndarray, "pieces 2"]]:
+    """Current A and speed rad/s at the start of each piece, and their integrals over it."""
+    _, begins, length, index, value, slope, loads = pieces
     mean, rise = mean_and_rise_of_pieces(even, pieces)
     step, line_start, line_slope = even.sample_time, mean - rise / 2, rise / even.sample_time
     A, B = map(np.asarray, motor.state_space(drive))
     load = np.zeros(len(even)) if even.load is None else even.load
-    transition, constant, growing = _phi_responses(A, np.concatenate([[step], begins, length]))
+    transition, constant, growing, cubic = _phi_responses(A, np.concatenate([[step], begins, length]))
     # by which time: that of an even sample, from its start to that of a piece, and from there to the end of the piece
     whole, to_start, within = slice(0, 1), slice(1, len(index) + 1), slice(len(index) + 1, None)
 
@@ -54,14 +70,18 @@ def simulated_at_stamps(
     # then from sample to sample
     difference = value - line_start[index] - rise[index] * begins / step
     rate = np.outer(difference, B[:, 0]) + np.outer(loads - load[index], B[:, 1])
-    rate[:, 0] += _at_reversals(rate_by_effects[:, 0], mean, index, value)
+    reversing = _at_reversals(rate_by_effects[:, 0], mean, index, value)
+    rate[:, 0] += reversing
     response = _times(constant[within], rate)
     response += _times(growing[within], np.outer(slope - line_slope[index], B[:, 0]))
     in_sample, at_end = _through_pieces(index, transition[within], response, len(even))
     carried_over = np.append(np.zeros((1, 2)), _accumulated(transition[0], at_end)[:-1], 0)
     carried_over = _times(transition[to_start], carried_over[index])
     reached = moved(to_start, index) + _times(constant[to_start], rate_by_effects[index]) + in_sample + carried_over
-    return reached[np.searchsorted(time, even.recorded.time)]
+    rate = reached @ A.T + np.outer(value, B[:, 0]) + np.outer(loads, B[:, 1]) + rate_by_effects[index]
+    rate[:, 0] += reversing
+    integral = reached * length[:, None] + _times(growing[within], rate)
+    return reached, integral + _times(cubic[within], np.outer(slope, B[:, 0]))
 
 
 def _at_reversals(
@@ -115,8 +135,8 @@ def _times(matrices: Float[np.ndarray, "#n 2 2"], x: Float[np.ndarray, "n 2"]) -
 
 
 def _phi_responses(A: Float[np.ndarray, "2 2"], length: np.ndarray) -> list[np.ndarray]:
-    """Response over each length of time h to an initial state, to a constant rate, and to a rate that grows from zero
-    by 1/s: phi_0, h phi_1 and h^2 phi_2 of A h, each (lengths, 2, 2).
+    """Response over each length of time h to an initial state, to a constant rate, and to rates that grow from zero as
+    t and as t^2 / 2: h^k phi_k of A h, each (lengths, 2, 2). Each is the integral of the one before it.
 
     By Newton's interpolation on the eigenvalues, because there are many lengths and one matrix.
 
@@ -127,7 +147,7 @@ def _phi_responses(A: Float[np.ndarray, "2 2"], length: np.ndarray) -> list[np.n
         other = one * (1 + MIN_EIGENVALUE_GAP)
     distance = (one - other) or 1.0
     responses = []
-    for k in range(3):
+    for k in range(4):
         at_one, at_other = scalar_phi(one * length, k), scalar_phi(other * length, k)
         slope = (at_one - at_other) / distance
         whole = at_one[:, None, None] * np.eye(2) + slope[:, None, None] * (A - one * np.eye(2))

@@ -73,13 +73,17 @@ def _shifted(prepared: Prepared, fit: Fit) -> Prepared:
         if not run.has_even_clock:
             now = tape.samples_of(k, plain.simulated, len(run))
             d_now = tape.samples_of(k, jacobian, len(run))
-            first_order_hold = prepared.timing.first_order_hold
             at_stamps = partial(
-                simulated_at_stamps, drive=tape.drive_of(k), even=run, first_order_hold=first_order_hold
+                simulated_at_stamps,
+                drive=tape.drive_of(k),
+                even=run,
+                first_order_hold=prepared.timing.first_order_hold,
+                mean_speed=run.recorded.averaging is not None,
             )
             then, d_then = _with_derivatives(at_stamps, problem.parameters, fit, now, d_now)
             nearest = _nearest(run)
-            tape.set_samples_of(k, slope, d_then[nearest] - d_now)
+            # a mean speed is missing at the first sample and has no derivative
+            tape.set_samples_of(k, slope, np.nan_to_num(d_then[nearest] - d_now))
             run = _at_even_samples(run, nearest, now - then[nearest])
         runs.append(run)
     laid, begins = Tape.from_recordings(runs), np.asarray(tape.begins)
