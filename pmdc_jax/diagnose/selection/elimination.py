@@ -87,14 +87,14 @@ class BackwardElimination:
     def _is_as_good(self, simpler: Model, model: Model) -> bool:
         """Whether a simpler form is as good as the richer one, chosen when another effect may have been missing.
 
-        Its criterion is worse by less than `BIC_MARGIN` and what neither explains; or, by its own filter, nothing
-        significant is left, and the unfiltered squares are hardly larger.
+        Its criterion is worse by less than `BIC_MARGIN`; or the unfiltered squares are hardly larger, and it is worse by
+        less than `BIC_MARGIN` and what neither explains, or leaves nothing significant by its own filter.
         """
         rich, simple = (self.comparison.fitted(m, self.comparison.filter_of(model)).criterion for m in (model, simpler))
+        if simple < rich + BIC_MARGIN:
+            return True
+        if simpler.fit.fitness >= MAX_MISFIT_GROWTH * model.fit.fitness:
+            return False
         assessment = self.assess(model)
         unexplained = assessment.clearest.gain if assessment.p_value < FALSE_ALARM else 0.0
-        margin = BIC_MARGIN + unexplained
-        if simple < rich + margin:
-            return True
-        hardly_more = simpler.fit.fitness < MAX_MISFIT_GROWTH * model.fit.fitness
-        return bool(hardly_more and self.assess(simpler).p_value >= FALSE_ALARM)
+        return bool(simple < rich + BIC_MARGIN + unexplained or self.assess(simpler).p_value >= FALSE_ALARM)
