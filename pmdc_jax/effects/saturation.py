@@ -5,12 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from .base import AbstractEffect, ParameterRange, Scalars, State
-from .steps import step_of_currents
+from .steps import step_of_currents, step_of_reversals
 
 if TYPE_CHECKING:
     from ..motor import Motor
+
+
+# Share of L / R, at small currents, that a step with a varying inductance may take
+RESOLVED_DECAY = 1 / 8
 
 
 class TorqueConstantSaturation(AbstractEffect):
@@ -69,6 +74,9 @@ class InductanceSaturation(AbstractEffect):
 
     def parameters(self, motor: Motor, state: State) -> Motor:
         return eqx.tree_at(lambda m: m.L, motor, motor.L * (1 / (1 + self.per_A2 * state.current**2)))
+
+    def longer_step(self, motor: Motor) -> Scalars:
+        return jnp.minimum(step_of_reversals(motor), RESOLVED_DECAY * motor.L / motor.R)
 
     def fastest_rate(self, motor: Motor, current: Scalars) -> Scalars:
         return motor.R * (1 / motor.L) * self.per_A2 * current**2

@@ -11,7 +11,7 @@ from .base import Scalars
 if TYPE_CHECKING:
     from ..motor import Motor
 
-# Radians of the motor's undamped oscillation in which a change of direction is resolved, to a few 1e-5 of the speed
+# Radians of the motor's undamped oscillation in which a change of direction is resolved, to 1e-4 of the speed
 RESOLVED_ANGLE = 0.1
 
 

@@ -87,8 +87,8 @@ class BackwardElimination:
     def _is_as_good(self, simpler: Model, model: Model) -> bool:
         """Whether a simpler form is as good as the richer one, chosen when another effect may have been missing.
 
-        Its criterion is worse by less than `BIC_MARGIN`; or the unfiltered squares are hardly larger, and it is worse by
-        less than `BIC_MARGIN` and what neither explains, or leaves nothing significant by its own filter.
+        Its criterion is worse by less than `BIC_MARGIN`; or the unfiltered squares are hardly larger, and it is worse
+        by less than `BIC_MARGIN` and what neither explains, or leaves nothing significant by its own filter.
         """
         rich, simple = (self.comparison.fitted(m, self.comparison.filter_of(model)).criterion for m in (model, simpler))
         if simple < rich + BIC_MARGIN:
