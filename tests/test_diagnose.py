@@ -41,7 +41,14 @@ from pmdc_jax.diagnose.selection.refits import Refits
 from pmdc_jax.diagnose.selection.rivals import _better_by_own_filter
 from pmdc_jax.diagnose.selection.shortlist import most_promising, shortlist
 from pmdc_jax.diagnose.selection.starts import Starts, common_phase
-from pmdc_jax.effects import EFFECTS, GradualBrushDrop, ResistanceHeating, ShaftCompliance
+from pmdc_jax.effects import (
+    EFFECTS,
+    GearBacklash,
+    GradualBrushDrop,
+    ResistanceHeating,
+    ShaftCompliance,
+    StribeckFriction,
+)
 from pmdc_jax.identify.fit.fitted_runs import FittedRuns
 from pmdc_jax.identify.fit.polish import fit_at
 from pmdc_jax.identify.fit.refine import Optimum
@@ -396,17 +403,15 @@ def test_only_periods_that_the_samples_resolve_are_tried():
     assert tried("", SCALES._replace(travel=0.0)) == []
 
 
-@pytest.mark.parametrize("simple", [s for s, form in FULLER.items() if form.to_simple])
-def test_a_simple_form_starts_within_its_ranges(simple):
-    """Even if the fit of the richer one has only a peak."""
-    rich = FULLER[simple].effect
-    sizes = dict(zip(EFFECTS[rich].ranges, (1e-10, 0.3, 20.0), strict=False))
-    effect = EFFECTS[rich](**{field: np.asarray(x) for field, x in sizes.items()})
-    values = FULLER[simple].to_simple(effect)
-    assert values.keys() == EFFECTS[simple].ranges.keys()
-    for field, r in EFFECTS[simple].ranges.items():
-        assert r.lower < values[field] < r.upper
-        assert abs(values[field]) > 0.1 * sizes[list(sizes)[1]]
+def test_coulomb_friction_from_a_peak_alone_is_not_lost():
+    peak = StribeckFriction(np.asarray(1e-10), np.asarray(0.3), np.asarray(20.0))
+    assert FULLER["coulomb_friction"].to_simple(peak) == {"torque_Nm": pytest.approx(0.15)}
+
+
+def test_a_shaft_from_a_gear_is_that_of_the_gear():
+    values = {"stiffness_Nm_rad": 20.0, "damping_Nms_rad": 1e-3, "load_share": 0.6}
+    gear = GearBacklash(**{field: np.asarray(x) for field, x in {"gap_rad": 0.01, **values}.items()})
+    assert FULLER["shaft_compliance"].to_simple(gear) == values
 
 
 SIMILAR = [(old, new) for old in TRIALS for new in TRIALS[old].alike]

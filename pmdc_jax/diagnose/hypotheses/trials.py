@@ -6,7 +6,15 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from ...effects import EFFECTS, CoulombFriction, ShaftCompliance, SpeedSensorDelay, SpeedSensorLag, StribeckFriction
+from ...effects import (
+    EFFECTS,
+    CoulombFriction,
+    GearBacklash,
+    ShaftCompliance,
+    SpeedSensorDelay,
+    SpeedSensorLag,
+    StribeckFriction,
+)
 from .candidates import (
     Candidate,
     MakeCandidates,
@@ -42,7 +50,7 @@ class Fuller(NamedTuple):
     from_simple: Callable[[Any, Scales], Values]
     extra: tuple[str, ...]  # the fields that make it fuller
     # start values of the simple form from the fit of the fuller one, which may have been found without it
-    to_simple: Callable[[Any], Values] | None = None
+    to_simple: Callable[[Any], Values]
 
 
 class Trial(NamedTuple):
@@ -84,6 +92,10 @@ def _backlash_from_shaft(shaft: ShaftCompliance, scales: Scales) -> Values:
     return {"gap_rad": GAP_TO_TWIST * scales.torque / values["stiffness_Nm_rad"], **values}
 
 
+def _shaft_from_backlash(gear: GearBacklash) -> Values:
+    return {field: float(getattr(gear, field)) for field in ShaftCompliance.ranges}
+
+
 def _coulomb_from_stribeck(friction: StribeckFriction) -> Values:
     """Coulomb friction midway between both levels: a peak as wide as the range of speeds hides the Coulomb level."""
     return {"torque_Nm": float(friction.coulomb_Nm + friction.static_Nm) / 2}
@@ -111,7 +123,9 @@ TRIALS: Mapping[str, Trial] = {
     "torque_ripple": Trial(periodic_candidates("amplitude", lambda s: 1.0, {"emf_share": 0.0}, {"emf_share": 1.0})),
     "constant_load": Trial(amplitude_candidates("torque_Nm", lambda s: s.torque, signed=True)),
     "shaft_compliance": Trial(
-        compliance_candidates, starts=_shaft_starts, fuller=Fuller("gear_backlash", _backlash_from_shaft, ("gap_rad",))
+        compliance_candidates,
+        starts=_shaft_starts,
+        fuller=Fuller("gear_backlash", _backlash_from_shaft, ("gap_rad",), _shaft_from_backlash),
     ),
     "gear_backlash": Trial(no_candidates, starts=_backlash_starts, factors=BACKLASH_FACTORS),
     "brush_voltage_drop": Trial(amplitude_candidates("voltage_V", lambda s: s.voltage)),

@@ -40,7 +40,7 @@ class BackwardElimination:
                 return self.reduced(smaller)
         for effect in model.effects:
             for simple in self._simpler_forms(effect):
-                [simpler] = self.refits.with_replacements(model, white, [(effect, simple)])
+                simpler = self.refits.with_simple_form(model, white, effect, simple)
                 if simpler is None or not simpler.is_possible:
                     continue
                 if self.is_new(simpler) and self._is_as_good(simpler, model):
@@ -53,7 +53,7 @@ class BackwardElimination:
     def _simpler_forms(self, effect: str) -> list[str]:
         """The simpler effects that may replace one: contained ones that were fitted before, and that of which it is
         fuller."""
-        of_fuller = {s for s, form in FULLER.items() if form.effect == effect and form.to_simple}
+        of_fuller = {simple for simple, fuller in FULLER.items() if fuller.effect == effect}
         return sorted(CONTAINS.get(effect, set()) & self.refits.starts.first_values.keys() | of_fuller)
 
     def _simple_form_with_another(self, simpler: Model, model: Model, rich: str) -> Model | None:

@@ -126,6 +126,22 @@ class Refits:
                 max_misfit = MAX_FULLER_MISFIT * current.fit.fitness
         return effects, lambda: self._best_of_starts(effects, starts, white, max_misfit)
 
+    def with_simple_form(self, current: Model, white: Whitener, effect: str, simple: str) -> Model | None:
+        """The current model with a simpler form of one of its effects, fitted again from what the fuller form found if
+        that beats a stored fit."""
+        if simple not in FULLER or FULLER[simple].effect != effect:
+            return self.with_replacements(current, white, [(effect, simple)])[0]
+        effects = (*(e for e in current.effects if e != effect), simple)
+        prepared, start = self.starts.from_fuller_form(current, simple, effects)
+        self._report_trial(current, [effects])
+
+        def refit() -> Model:
+            return refit_from(prepared, start, white)
+
+        simpler = self._stored_or_fitted(effects, current, refit)
+        assert simpler is not None
+        return self._or_again(simpler, current, start, refit)
+
     def with_global_search(self, current: Model, effect: str) -> Model:
         """The current model with one more effect, by a new global search; or the stored fit of the set, if better."""
         effects = (*current.effects, effect)
@@ -198,13 +214,18 @@ class Refits:
 
         smaller = self._stored_or_fitted(rest, model, refit)
         assert smaller is not None
-        key = frozenset(rest)
-        if (key, model) not in self.refitted_from:
-            self.refitted_from.add((key, model))
-            at_start = fit_at(prepared.problem, start).fitness
-            if at_start < (1 - MIN_IMPROVEMENT) * smaller.fit.fitness:
-                return self._stored_or_better(key, model, refit)
-        return smaller
+        return self._or_again(smaller, model, start, refit)
+
+    def _or_again(self, stored: Model, current: Model, start: Optimum, refit: Refit) -> Model:
+        """A stored fit; or the better of it and a new one from the current model, if that starts better."""
+        key = frozenset(stored.effects)
+        if (key, current) in self.refitted_from:
+            return stored
+        self.refitted_from.add((key, current))
+        at_start = fit_at(stored.problem, start).fitness
+        if at_start < (1 - MIN_IMPROVEMENT) * stored.fit.fitness:
+            return self._stored_or_better(key, current, refit)
+        return stored
 
     def _stored_or_fitted(self, effects: Sequence[str], current: Model, refit: Refit) -> Model | None:
         """The stored fit of a set; if there is none, a new one from the current model, which is then stored."""

@@ -65,6 +65,12 @@ class Starts:
         values = fuller.from_simple(current.motor.effect_named(effect), self.scales)
         return self.from_model(current, effects, {fuller.effect: values})
 
+    def from_fuller_form(self, current: Model, simple: str, effects: tuple[str, ...]) -> Start:
+        """The start with the simple form of an effect, from the fit of the fuller one."""
+        fuller = FULLER[simple]
+        values = fuller.to_simple(current.motor.effect_named(fuller.effect))
+        return self.from_model(current, effects, {simple: values})
+
     def values_from_replaced(self, current: Model, old: str, new: str) -> dict[str, Values]:
         """Start values, from the fit of the old effect, of one that resembles it or of a simple form that has none from
         an earlier refit."""
