@@ -11,6 +11,7 @@ import pmdc_jax
 from pmdc_jax.effects import BrushVoltageDrop
 from pmdc_jax.errors import InputError
 from pmdc_jax.motor import Drive, Motor
+from pmdc_jax.recordings.angle import angle_of_counts
 from pmdc_jax.recordings.clock import evenly_stamped, is_even
 from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate import on_even_clock
@@ -212,6 +213,33 @@ def test_a_motor_is_identified_from_encoder_counts_at_uneven_stamps():
         estimate = found.parameters[name]
         assert abs(estimate.value - MOTOR[name]) < 3 * estimate.stderr, name
         assert estimate.stderr < 0.02 * MOTOR[name], name
+
+
+def counted(time: np.ndarray, rng: np.random.Generator, count: float, digits: int) -> np.ndarray:
+    """A speed in counts of an encoder over each interval, with time stamps rounded to so many digits."""
+    angle = np.cumsum(np.repeat(rng.uniform(-150, 150, len(time) // 50), 50) * np.diff(time, prepend=0.0))
+    counts = np.diff(np.floor(angle / count), prepend=0.0)
+    return counts * count / np.diff(np.round(time, digits), prepend=np.nan)
+
+
+@pytest.mark.parametrize("digits", [9, 6])
+def test_counts_over_uneven_intervals_are_an_angle(digits):
+    rng = np.random.default_rng(28)
+    time, count = stamps("jitter", 1000, rng), 2 * np.pi / 500
+    speed = np.nan_to_num(counted(time, rng, count, digits))
+    angle = angle_of_counts(np.round(time, digits), speed)
+    assert angle is not None
+    np.testing.assert_allclose(np.diff(angle), (speed * np.diff(np.round(time, digits), prepend=0.0))[1:], atol=1e-12)
+
+
+def test_other_speeds_at_uneven_stamps_are_no_counts():
+    """Without steps, with those of a converter, and as counts over the even intervals of another clock."""
+    rng = np.random.default_rng(29)
+    time, count = stamps("jitter", 1000, rng), 2 * np.pi / 500
+    speed = np.repeat(rng.uniform(-150, 150, 20), 50) + rng.normal(size=1000)
+    for other in (speed, np.round(speed), np.nan_to_num(counted(stamps("even", 1000, rng), rng, count, 9)), 0 * speed):
+        assert angle_of_counts(time, other) is None
+    assert angle_of_counts(time, np.where(np.arange(1000) == 7, np.nan, speed)) is None
 
 
 def test_pieces_cover_every_even_sample_once():

@@ -8,6 +8,7 @@ from numbers import Real
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import attrs
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,8 @@ from ..checks.slow_sensors import readings_only
 from ..effects import EFFECTS, AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS, PARAMETERS_OF_DRIVE, Drive
-from ..recordings.clock import evenly_stamped
+from ..recordings.angle import angle_of_counts
+from ..recordings.clock import evenly_stamped, is_even
 from ..recordings.readings import reading_interval
 from ..recordings.recording import NEEDED_TO_IDENTIFY, SIMULATED_OUTPUTS, Averaging, Finding, Recording
 from ..recordings.recording_file import Runs, named_apart, recordings_of, refuse_copies
@@ -155,7 +157,12 @@ def _laid_out(
     unloaded: bool,
 ) -> Prepared:
     """The recordings as a least-squares problem for the motor without effects, all of whose parameters are fitted."""
-    runs = [on_even_clock(evenly_stamped(r)) for r in recordings]
+    stamped = [evenly_stamped(r) for r in recordings]
+    recordings = [_with_counts_as_angle(r) for r in stamped]
+    counted = [r.name for r, before in zip(recordings, stamped, strict=True) if r is not before]
+    what = "the speed is counts of an encoder over each interval of an uneven clock: this is modelled"
+    findings += tuple(Finding(name, "speed", "note", what, "", "") for name in counted)
+    runs = [on_even_clock(r) for r in recordings]
     training = runs[: roles.count("train")]
     noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in SIMULATED_OUTPUTS])
     # hold-out runs are on the tape too, but only their own unknowns may be fitted to them
@@ -174,6 +181,14 @@ def _laid_out(
         problem,
         differentiated=tuple(r.speed is None and r.angle is not None for r in recordings),
     )
+
+
+def _with_counts_as_angle(run: Recording) -> Recording:
+    """The record of an uneven clock with its angle in place of a speed that is counts over each interval."""
+    if run.speed is None or run.angle is not None or is_even(run.time):
+        return run
+    angle = angle_of_counts(run.time, run.speed)
+    return run if angle is None else attrs.evolve(run, speed=None, angle=angle)
 
 
 def _check_columns(recordings: Sequence[Recording], roles: Sequence[Role]) -> None:

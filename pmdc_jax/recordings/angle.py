@@ -5,10 +5,15 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+from .resolution import quantum
+
 Samples = Float[np.ndarray, " samples"]
 
 # Largest span of a wrapped angle, turns
 ONE_TURN = 1.01
+# Counts are recognised by at least so many intervals with few of them: the more there are in one, the more the rounding
+# of its time stamps blurs their number
+MIN_COUNTED, FEW_COUNTS = 50, 8
 
 
 def unwrapped(angle: Samples) -> tuple[Samples, Int[np.ndarray, " wraps"]]:
@@ -36,3 +41,19 @@ def mean_speeds(time: Samples, angle: Samples) -> Samples:
     speed = np.full_like(angle, np.nan)
     speed[known[1:]] = np.diff(angle[known]) / np.diff(time[known])
     return speed
+
+
+def angle_of_counts(time: Samples, speed: Samples) -> Samples | None:
+    """The angle, rad, of which a speed is the mean over each interval of an uneven clock, in counts of an encoder; None
+    if it is no such mean. It begins at zero, and the first speed is lost."""
+    intervals = np.diff(time)
+    turned = speed[1:] * intervals
+    sizes = np.abs(turned[turned != 0])
+    few = sizes[sizes < FEW_COUNTS * np.min(sizes, initial=np.inf)]
+    if np.isnan(turned).any() or len(few) < MIN_COUNTED:
+        return None
+    count = quantum(few)
+    # a converter of the speed has steps of the speed itself
+    if not count or quantum(np.diff(np.unique(speed))) * np.median(intervals) > count / 2:
+        return None
+    return np.append(0.0, np.cumsum(turned))
