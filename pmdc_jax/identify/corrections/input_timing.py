@@ -134,13 +134,15 @@ class _Trials:
 def _likelier(trials: _Trials, proposed: Sequence[Timing]) -> list[Timing]:
     """The proposed timings that are clearly likelier than the assumed one; smooth voltages only if they are likelier
     than straight ones, too."""
-    likely = trials.likelier(proposed, negative_log_likelihood_within(trials.assumed))
+    assumed = negative_log_likelihood_within(trials.assumed)
+    likely = trials.likelier(proposed, assumed)
     first_order = trials.negative_log_likelihood(FIRST_ORDER_HOLD) if FIRST_ORDER_HOLD in likely else np.inf
     if SMOOTH in likely and not trials.likelier([SMOOTH], first_order):
         likely.remove(SMOOTH)
-    # of a slow difference the whitening filter takes most for noise
+    # of a slow difference the whitening filter takes most for noise: it may make smooth voltages no likelier
     if SMOOTH in proposed and not likely and not leaves_only_noise(trials.assumed):
-        likely = [SMOOTH] if trials.is_right(SMOOTH) else []
+        is_as_likely = trials.negative_log_likelihood(SMOOTH) < assumed + MIN_LOG_LIKELIHOOD_GAIN
+        likely = [SMOOTH] if is_as_likely and trials.is_right(SMOOTH) else []
     return [t if t.smooth is None else trials.with_fitted_rate(t) for t in likely]
 
 
