@@ -19,9 +19,11 @@ from benchmarks import virtual_bench as vb
 from experiments.bench import recording
 from pmdc_jax import InputError, Recording, diagnose, simulate
 from pmdc_jax.diagnose.evidence.assessment import FALSE_ALARM, Assessment
+from pmdc_jax.diagnose.evidence.moments import dispersion_by_moments
 from pmdc_jax.diagnose.evidence.quantisation import ROUNDING_DRAWS, rounding_errors
 from pmdc_jax.diagnose.evidence.regression import Block, gather_evidence
-from pmdc_jax.diagnose.evidence.rows import _batches
+from pmdc_jax.diagnose.evidence.rows import Rows, _batches
+from pmdc_jax.diagnose.evidence.screen import Findings
 from pmdc_jax.diagnose.evidence.signals import Screen, Signal, gain_common_to_waves, log_p_value
 from pmdc_jax.diagnose.experiment import difference_between
 from pmdc_jax.diagnose.hypotheses.candidates import Scales
@@ -53,7 +55,7 @@ from pmdc_jax.identify.fit.fitted_runs import FittedRuns
 from pmdc_jax.identify.fit.polish import fit_at
 from pmdc_jax.identify.fit.refine import Optimum
 from pmdc_jax.identify.identification import Estimate, Identification
-from pmdc_jax.identify.noise.noise_model import Series, fit_whitener
+from pmdc_jax.identify.noise.noise_model import Series, fit_whitener, scaling_whitener
 from pmdc_jax.identify.noise.spectral_lines import common_line, spectrum
 from pmdc_jax.identify.prepare import prepare
 from pmdc_jax.identify.problem import Unknowns
@@ -331,8 +333,7 @@ def test_what_an_uneven_clock_may_leave_is_no_evidence(monkeypatch, least_gain, 
     """Its samples are simulated only approximately."""
     clear = Mock(spec=Signal, gain=40.0, log_p=-20.0)
     found = Mock(spec=Screen, candidates=[1], curves=[], least_gain=least_gain)
-    monkeypatch.setattr(naming, "screen", lambda model, library: found)
-    monkeypatch.setattr(naming, "signals", lambda screen: ([clear], []))
+    monkeypatch.setattr(naming, "screen", lambda model, library: Findings(found, [clear], [], clear.log_p))
     selection = StepwiseSelection.__new__(StepwiseSelection)
     selection.base = Mock(spec=Model, effects=(), is_exact=False, fit=Mock(fitness=1.0), motor=Mock(f=1.0))
     selection.library = Mock(spec=Library)
@@ -401,6 +402,29 @@ def test_only_periods_that_the_samples_resolve_are_tried():
     short = SCALES._replace(travel=0.1 * 2 * np.pi)
     assert min(c.columns[0]["periods"] for c in tried("", short)) == 10
     assert tried("", SCALES._replace(travel=0.0)) == []
+
+
+@pytest.mark.parametrize(
+    ("there", "effect", "least", "most"), [(1.0, 0.0, 1.0, 1.3), (5.0, 0.0, 13.0, 21.0), (1.0, 50.0, 1.0, 1.3)]
+)
+def test_gains_where_errors_are_large_are_worth_less(there, effect, least, most):
+    """By their square over the mean square of all (25 / 1.48), but not those of an effect that explains them."""
+    rng, count = np.random.default_rng(31), 20_000
+    acts = np.arange(count) % 50 == 0
+    noise = rng.normal(size=(count, 2)) * np.where(acts, there, 1.0)[:, None]
+    shared, own = rng.normal(size=(2, count, 2, 1))
+    column = np.stack([acts, np.zeros(count)], 1)[..., None]
+
+    def series(values):
+        return Series(values, np.ones(count, bool), (1e-3, (0, 1)))
+
+    residual = series(noise + effect * column[..., 0] * rng.normal())
+    fit = RunSeries(series(shared), series(own), residual, series(noise))
+    rows = Rows(fit, np.zeros((count, 2, 2)), column, np.zeros((count, 2, 0)))
+    white = scaling_whitener([series(noise)])
+    evidence = gather_evidence([rows.white(0, white)], parameters=1, run_unknowns=1, timing_errors=(0.01, 0.03))
+    block = Block((evidence.first_column,), per_run=False)
+    assert least <= dispersion_by_moments(block, [rows], white, evidence) < most
 
 
 def test_coulomb_friction_from_a_peak_alone_is_not_lost():

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -45,12 +44,6 @@ NEGLIGIBLE = 2e-3
 INEXACT = 1e-4
 # The first for models whose fit is never exact because when teeth meet, or a rotor slips, is unpredictable
 NEGLIGIBLE_INEXACT = 1e-2
-
-
-def familywise_p_value(candidate_signals: Sequence[Signal], curve_signals: Sequence[Signal], count: int) -> float:
-    """P-value of the strongest evidence if nothing were missing, Bonferroni-corrected for `count` blocks."""
-    smallest = min(s.log_p for s in (*candidate_signals, *curve_signals))
-    return float(min(1.0, np.exp(smallest + np.log(count))))
 
 
 class Assessment(NamedTuple):

@@ -38,6 +38,7 @@ class Regression(NamedTuple):
 
     squares: float  # sum of the squared white residuals that are left
     parameter_changes: Float[np.ndarray, " parameters"]  # of the motor's search coordinates
+    late_readings: Float[np.ndarray, " outputs"]  # by how many samples each output is read late
     coefficients: list[Float[np.ndarray, "*runs columns"]]  # of every block
     errors: list[Float[np.ndarray, "*runs columns"]]  # their standard errors
 
@@ -90,8 +91,8 @@ class Evidence(NamedTuple):
                 first_shared += width
                 coefficients.append(solution.shared[part, 0])
                 errors.append(solution.shared_errors[part])
-        changes = solution.shared[: self.parameters, 0]
-        return Regression(float(solution.squares[0]), changes, coefficients, errors)
+        changes, late = np.split(solution.shared[: self.first_column, 0], [self.parameters])
+        return Regression(float(solution.squares[0]), changes, late, coefficients, errors)
 
     def _solve(self, blocks: Sequence[Block], targets: Sequence[int], min_eigenvalue: float) -> _Solution:
         """Least squares of the `targets`, which are columns, on what `regress` has."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import chain
 from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ...simulate import UNKNOWNS_PER_RUN
 from ..hypotheses.curves import Curve, curves_along
 from ..hypotheses.library import Library
 from ..model import Model
+from .moments import log_p_of_strongest
 from .quantisation import ROUNDING_DRAWS
 from .regression import Block, Evidence, consecutive_blocks, gather_evidence
 from .rows import TIMING_ERRORS, Rows, gather_rows
@@ -23,7 +25,16 @@ from .signals import Screen, Signal, signals
 UNEVEN_SHARE = 0.005
 
 
-def screen(model: Model, library: Library) -> Screen:
+class Findings(NamedTuple):
+    """The evidence against a model, and what stands out in it."""
+
+    screen: Screen
+    candidate_signals: list[Signal]  # the most significant first
+    curve_signals: list[Signal]  # the most significant first
+    log_p: float  # natural logarithm of the p-value of the strongest of them
+
+
+def screen(model: Model, library: Library) -> Findings:
     """Gather the evidence against a model.
 
     The whitening filter is fitted to what the clearest candidate or curve leaves of the residuals. One fitted to the
@@ -54,7 +65,10 @@ def screen(model: Model, library: Library) -> Screen:
     evidence = _evidence(rows, white)
     is_uneven = not all(run.has_even_clock for run in model.prepared.training)
     least_gain = UNEVEN_SHARE * evidence.regress().squares if is_uneven else 0.0
-    return plain._replace(evidence=evidence, white=white, least_gain=least_gain)
+    found = plain._replace(evidence=evidence, white=white, least_gain=least_gain)
+    candidate_signals, curve_signals = signals(found)
+    log_p = log_p_of_strongest([*candidate_signals, *curve_signals], rows, white, evidence)
+    return Findings(found, candidate_signals, curve_signals, log_p)
 
 
 def share_beyond(plain: Screen, blocks: Sequence[Block]) -> float:

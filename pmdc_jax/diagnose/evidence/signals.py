@@ -84,6 +84,7 @@ class Signal(NamedTuple):
     log_p: float  # natural logarithm of the p-value of such a gain by noise
     term: Candidate | Curve
     block: Block
+    beyond_noise: float = 0.0  # the gain less what slow noise, rounding and common waves may have of it, for `log_p`
 
     @property
     def candidate(self) -> Candidate | None:
@@ -145,8 +146,8 @@ def _signal(screen: Screen, term: Candidate | Curve, block: Block, gain: float, 
     """The signal of one block, its p-value corrected for rounding, slow noise and the gain that is `common`."""
     dispersion = dispersion_by_noise(screen, block, _is_slow_torque(term), _is_voltage(term))
     degrees_of_freedom = screen.evidence.degrees_of_freedom(block)
-    log_p = log_p_value(max(gain - common, 0.0) / dispersion, degrees_of_freedom)
-    return Signal(gain, log_p, term, block)
+    beyond_noise = max(gain - common, 0.0) / dispersion
+    return Signal(gain, log_p_value(beyond_noise, degrees_of_freedom), term, block, beyond_noise)
 
 
 def _gain_of_curve(screen: Screen, curve: Curve, block: Block) -> float:

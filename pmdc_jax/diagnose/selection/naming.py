@@ -21,11 +21,11 @@ from ...identify.noise.spectral_lines import Line
 from ...identify.solve import Solved
 from ...progress import ReportProgress
 from ..diagnosis import VaryingParameter
-from ..evidence.assessment import FALSE_ALARM, REFIT_ONLY, Assessment, familywise_p_value, has_axes_of
+from ..evidence.assessment import FALSE_ALARM, REFIT_ONLY, Assessment, has_axes_of
 from ..evidence.constancy import varying_parameter
 from ..evidence.periodic import line_of
 from ..evidence.screen import screen, share_beyond
-from ..evidence.signals import Screen, signals
+from ..evidence.signals import Screen
 from ..hypotheses.effect_relations import are_rivals
 from ..hypotheses.library import Library
 from ..model import MAX_EFFECTS, Model, final_fit, model_of
@@ -105,11 +105,10 @@ class StepwiseSelection:
 
     def _assess(self, model: Model) -> Assessment:
         """The evidence against a model."""
-        evidence = screen(model, self.library)
-        candidate_signals, curve_signals = signals(evidence)
+        evidence, candidate_signals, curve_signals, log_p = screen(model, self.library)
         count = len(evidence.candidates) + len(evidence.curves)
         count *= MAX_EFFECTS if model.effects else 1
-        p_value = familywise_p_value(candidate_signals, curve_signals, count)
+        p_value = float(min(1.0, count * np.exp(log_p)))  # Bonferroni-corrected
         if model.is_exact or max(s.gain for s in (*candidate_signals, *curve_signals)) < evidence.least_gain:
             p_value = 1.0
         explained = 0.0
