@@ -138,7 +138,10 @@ def prepare(
     _check_options(tie, known)
     findings = check(cleaned)
     _raise_errors(findings)
-    prepared = _laid_out(cleaned, roles, findings, tie, known, unloaded).with_effects(effects)
+    stamped = [evenly_stamped(run) for run in cleaned]
+    counted = [_with_counts_as_angle(run) for run in stamped]
+    findings += tuple(_counted_note(run) for run, before in zip(counted, stamped, strict=True) if run is not before)
+    prepared = _laid_out(counted, roles, findings, tie, known, unloaded).with_effects(effects)
     if not prepared.problem.parameters.names:
         raise InputError(
             "--known",
@@ -157,11 +160,6 @@ def _laid_out(
     unloaded: bool,
 ) -> Prepared:
     """The recordings as a least-squares problem for the motor without effects, all of whose parameters are fitted."""
-    stamped = [evenly_stamped(r) for r in recordings]
-    recordings = [_with_counts_as_angle(r) for r in stamped]
-    counted = [r.name for r, before in zip(recordings, stamped, strict=True) if r is not before]
-    what = "the speed is counts of an encoder over each interval of an uneven clock: this is modelled"
-    findings += tuple(Finding(name, "speed", "note", what, "", "") for name in counted)
     runs = [on_even_clock(r) for r in recordings]
     training = runs[: roles.count("train")]
     noise = np.array([white_noise(_signals(training, c)) or 1.0 for c in SIMULATED_OUTPUTS])
@@ -189,6 +187,11 @@ def _with_counts_as_angle(run: Recording) -> Recording:
         return run
     angle = angle_of_counts(run.time, run.speed)
     return run if angle is None else attrs.evolve(run, speed=None, angle=angle)
+
+
+def _counted_note(run: Recording) -> Finding:
+    what = "the speed is counts of an encoder over each interval of an uneven clock: this is modelled"
+    return Finding(run.name, "speed", "note", what, "", "")
 
 
 def _check_columns(recordings: Sequence[Recording], roles: Sequence[Role]) -> None:
