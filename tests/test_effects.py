@@ -496,15 +496,22 @@ def test_slow_sampling_is_as_accurate(x64, name):
 
 COLUMNS = ("voltage", "current", "speed", "load")
 HAS_LONGER_STEP = [n for n, e in EFFECTS.items() if e.longer_step is not AbstractEffect.longer_step]
+OF_SPEED = [n for n in HAS_LONGER_STEP if EFFECTS[n].variable == "speed"]
 # effects, by how much inertia and inductance are larger, and steps in 10 ms
-SLOW_MOTORS = [
-    *((name, *case) for name in HAS_LONGER_STEP for case in ((5, 1, 8), (5, 20, 2)) if name != "inductance_saturation"),
+HEAVY_ROTORS = [(name, *case) for name in OF_SPEED for case in ((5, 1, 8), (100, 1, 2))]
+SLOW_WINDINGS = [
+    *((name, 5, 20, 2) for name in HAS_LONGER_STEP if name != "inductance_saturation"),
     ("inductance_saturation", 5, 20, 4),
+    *((name, 5, 1, 8) for name in HAS_LONGER_STEP if name not in (*OF_SPEED, "inductance_saturation")),
 ]
+# in a sample in which speed or current reverses, and of all: a tenth of the noise of good sensors; more where current
+# and speed change as slowly as each other, but still less than that noise
+HEAVY_ERRORS, SLOW_ERRORS = (3e-4, 2e-5), (1e-3, 1e-4)
+SLOW_MOTORS = [*((*case, HEAVY_ERRORS) for case in HEAVY_ROTORS), *((*case, SLOW_ERRORS) for case in SLOW_WINDINGS)]
 
 
-@pytest.mark.parametrize(("name", "inertia", "inductance", "steps"), SLOW_MOTORS)
-def test_slow_samples_of_a_slow_motor_take_fewer_steps(x64, name, inertia, inductance, steps):
+@pytest.mark.parametrize(("name", "inertia", "inductance", "steps", "errors"), SLOW_MOTORS)
+def test_slow_samples_of_a_slow_motor_take_fewer_steps(x64, name, inertia, inductance, steps, errors):
     """Of 10 ms, instead of ten or more: current and speed are those at samples of 0.5 ms, and the rotor reverses."""
     motor = with_effect(name, J=inertia * PAPER["J"], L=inductance * PAPER["L"])
     slow = recordings(1e-2)
@@ -516,9 +523,8 @@ def test_slow_samples_of_a_slow_motor_take_fewer_steps(x64, name, inertia, induc
     expected = [outputs[::20] for outputs in simulated(motor, fine)]
     assert any((np.diff(np.sign(outputs[:, 1])) != 0).any() for outputs in expected)
     largest, rms = relative_errors(simulated(motor, slow), expected)
-    # of a sample in which speed or current reverses, and of all: less than a tenth of the noise of good sensors
-    assert largest < 1e-3
-    assert rms < 1e-4
+    assert largest < errors[0]
+    assert rms < errors[1]
 
 
 def test_a_strongly_saturated_inductance_is_nearly_as_accurate(x64):
