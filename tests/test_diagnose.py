@@ -14,6 +14,7 @@ from attrs import evolve
 from linear_motor import PAPER
 from scipy import stats
 from scipy.linalg import block_diag
+from scipy.signal import lfilter
 
 from benchmarks import virtual_bench as vb
 from experiments.bench import recording
@@ -671,6 +672,36 @@ def test_filtered_residuals_are_white():
         for lag in range(1, 40):
             correlation = rows[lag:].T @ rows[:-lag] / len(rows)
             assert np.abs(correlation).max() < 5 / np.sqrt(len(rows)), lag
+
+
+def test_runs_of_different_colours_have_filters_of_their_own():
+    known, kind = np.ones(4000, bool), (1e-3, (0, 1))
+    plain = np.random.default_rng(3).normal(size=(4000, 2))
+    series = [Series(values, known, kind) for values in (plain, coloured(0, 4000, 1.0), coloured(1, 4000, 1.0))]
+    white = fit_whitener(series)
+    for k, s in enumerate(series):
+        rows = white(k, s).reshape(-1, 2)
+        for lag in range(1, 40):
+            correlation = rows[lag:].T @ rows[:-lag] / len(rows)
+            assert np.abs(correlation).max() < 5 / np.sqrt(len(rows)), (k, lag)
+    assert not len(white.filters[0])
+    alike = fit_whitener(series[1:])
+    np.testing.assert_array_equal(*alike.filters)
+
+
+def test_slow_noise_far_below_that_of_a_sensor_is_whitened():
+    """Hardly correlated from sample to sample, but for a hundred samples: a tenth of the power."""
+    rng, known = np.random.default_rng(4), np.ones(6000, bool)
+    slow = lfilter([1.0], [1.0, -0.99], rng.normal(size=6000))
+    values = rng.normal(size=(6000, 2)) + np.array([0.3, 0.0]) * (slow / slow.std())[:, None]
+    series = Series(values, known, (1e-3, (0, 1)))
+    white = fit_whitener([series])
+
+    def slow_power(rows: np.ndarray) -> float:
+        return float(np.mean(np.abs(np.fft.rfft(rows[:, 0])[1:16]) ** 2) / len(rows) / np.var(rows[:, 0]))
+
+    assert slow_power(values) > 8
+    assert slow_power(white(0, series).reshape(-1, 2)) < 2
 
 
 def test_the_filter_omits_rows_that_need_missing_samples():

@@ -1217,3 +1217,36 @@ def test_a_hold_out_may_begin_at_any_angle(share_of_period):
             float(jnp.square(evaluation.residuals).sum()) for evaluation in (end, evaluate(problem, exact))
         )
     assert fitted < 1.01 * least
+
+
+def test_outliers_become_missing(runs, found):
+    """Single readings off by 60 times the noise, most of them less than what the motor does."""
+    rng, spoilt, rows = np.random.default_rng(8), [], {}
+    for run in runs:
+        for name, noise in (("current", NOISE.current_A), ("speed", NOISE.speed_rad_s)):
+            signal = getattr(run, name).copy()
+            rows[run.name, name] = np.sort(rng.choice(np.arange(15, SAMPLES, 10), 5, replace=False))
+            signal[rows[run.name, name]] += 60 * noise * rng.choice([-1, 1], 5)
+            run = attrs.evolve(run, **{name: signal})
+        spoilt.append(run)
+    mended = identify(spoilt)
+    for name in PARAMETERS:
+        clean, estimate = found.parameters[name], mended.parameters[name]
+        assert abs(estimate.value - clean.value) < 0.5 * clean.stderr, name
+        assert estimate.stderr == pytest.approx(clean.stderr, rel=0.1), name
+    told = "\n".join(mended.messages)
+    assert all(f"{run}, {name}: 5 single readings" in told for run, name in rows)
+
+
+@pytest.mark.slow
+def test_errors_next_to_steps_of_the_voltage_are_no_outliers():
+    """A voltage that acts now sooner, now later leaves large errors of single currents."""
+    rng = np.random.default_rng(9)
+    excitation = vb.prbs(rng, 2.0, 1e-3, hold=10e-3)
+    fine, parts = [np.repeat(x, 20) for x in excitation[1:]], 20
+    late = np.repeat(rng.integers(0, 5, len(excitation.time)), parts)
+    acting = vb.Excitation(5e-5 * np.arange(len(late)), fine[0][np.maximum(np.arange(len(late)) - late, 0)], fine[1])
+    columns = vb.record(PAPER, acting, rng, NOISE)
+    columns = {name: x[::parts] for name, x in columns.items()} | {"voltage_V": excitation.voltage}
+    found = identify([recording("late", columns)], tie=[("Kt", "Kb")])
+    assert not [message for message in found.messages if "single reading" in message]

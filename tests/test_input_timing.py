@@ -354,3 +354,44 @@ def test_the_timing_of_a_voltage_is_found_beside_brushes(tenths, effects):
         drop, L = found.parameters["brush_voltage_drop.voltage_V"], found.parameters["L"]
         assert abs(drop.value - 0.6) < 3 * drop.stderr < 0.02
         assert abs(L.value - truth["L"]) < 3 * L.stderr < 0.01 * truth["L"]
+
+
+@pytest.mark.parametrize(
+    ("late", "told"),
+    [(0.04, r"acts 0\.0(39|4|41) of a sample later"), (-0.04, r"acts 0\.0(39|4|41) of a sample earlier"), (0.0, None)],
+)
+def test_a_slight_lateness_is_found(late, told):
+    """A bridge that switches a few hundredths of a sample late leaves nothing but noise with a wrong inductance, many
+    standard errors off."""
+    rng, runs = np.random.default_rng(29), []
+    for seed, torque in ((41, 0.0), (42, 0.06), (43, 0.0)):
+        run = run_by_sines(seed, 2500)
+        run = attrs.evolve(run, voltage=np.repeat(run.voltage[::7], 7)[: len(run)])
+        run = attrs.evolve(run, load=torque * np.repeat(rng.uniform(0, 1, 25), 100))
+        outputs = outputs_with_late_voltage(run, late)
+        current, speed = (outputs + [0.02, 0.2] * rng.standard_normal(outputs.shape)).T
+        runs.append(Recording(run.name, run.time, run.voltage, current, speed, load=run.load))
+    found = identify(runs)
+    reported = [text for text in found.messages if text.startswith("the voltage")]
+    assert len(reported) == (told is not None)
+    assert all(re.search(told, text) for text in reported), reported
+    for name in PARAMETERS:
+        estimate = found.parameters[name]
+        assert abs(estimate.value - TRUE[name]) < 3 * estimate.stderr, name
+    assert found.parameters["L"].stderr < 0.01 * TRUE["L"]
+
+
+def outputs_with_late_voltage(run: Recording, late: float) -> np.ndarray:
+    """Current and speed at the samples if each voltage acts so many samples after its own."""
+    fine = 50  # parts of a sample
+    rows = np.arange(fine * len(run))
+    at = np.clip((rows - round(late * fine)) // fine, 0, len(run) - 1)
+    inside = attrs.evolve(
+        run,
+        time=STEP / fine * rows,
+        voltage=run.voltage[at],
+        load=np.repeat(run.load, fine),
+        speed=np.zeros(len(rows)),
+        current=None,
+    )
+    return outputs_by_scipy(inside, straight=False, step=STEP / fine)[::fine, :2]

@@ -22,7 +22,7 @@ MAX_LOAD_SPREAD = 0.2
 MIN_INITIAL_RISE = 0.02
 # Units of what drives a motor
 UNITS = {"voltage": "V", "current": "A", "torque": "N m"}
-HUM_UNITS = {"current": "A", "speed": "rad/s"}
+OUTPUT_UNITS = {"current": "A", "speed": "rad/s"}
 # Spans over which a speed may be averaged
 AVERAGING_SPANS = {
     OVER_LAST: "the last sample interval",
@@ -46,13 +46,18 @@ def messages_of(
 def _corrections(prepared: Prepared) -> list[str]:
     """What the sensors and the recorder did to the signals, as far as it is modelled."""
     messages = [
+        f"{run}, {output}: {count} single reading{'s are' if count > 1 else ' is'} up to {largest:.3g} "
+        f"{OUTPUT_UNITS[output]} off, unlike those beside: treated as missing"
+        for (run, output), (count, largest) in prepared.outliers.items()
+    ]
+    messages += [
         f"{run.name}: the recorded {run.drive} has {prepared.input_noise[run.name]:.3g} {UNITS[run.drive]} of sensor "
         "noise that did not reach the motor: it was removed"
         for run in prepared.runs
         if run.name in prepared.input_noise
     ]
     messages += [
-        f"the sensor of the {output} picks up mains hum of {amplitude:.3g} {HUM_UNITS[output]}: it was removed"
+        f"the sensor of the {output} picks up mains hum of {amplitude:.3g} {OUTPUT_UNITS[output]}: it was removed"
         for output, amplitude in prepared.mains_hum.items()
     ]
     acts = "steps between samples" if prepared.stepped else _timing_words(prepared.timing)

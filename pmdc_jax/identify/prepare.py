@@ -50,6 +50,8 @@ class Prepared(NamedTuple):
     # which runs have a speed computed from their angle
     differentiated: tuple[bool, ...] = ()
     # results of the corrections (see `corrections`):
+    # outliers treated as missing, by names of run and output: how many, and how far off the farthest, A or rad/s
+    outliers: Mapping[tuple[str, str], tuple[int, float]] = MappingProxyType({})
     # standard deviation of the noise removed from the drive, by name of the run
     input_noise: Mapping[str, float] = MappingProxyType({})
     # largest amplitude of the mains hum removed from an output, by name of the output

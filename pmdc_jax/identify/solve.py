@@ -18,6 +18,7 @@ from .corrections.initial_temperature import with_initial_temperatures
 from .corrections.input_noise import without_input_noise
 from .corrections.input_timing import negative_log_likelihood_within, other_timings
 from .corrections.mains_hum import without_mains_hum
+from .corrections.outliers import without_outliers
 from .corrections.reading_time import with_fitted_reading
 from .corrections.retiming import with_timing
 from .corrections.speed_averaging import with_averaging, with_evident_averaging
@@ -86,6 +87,7 @@ def solve(
 
 # Applied in this order: uneven sampling hides everything else, and a mean is recognised by the sensor's own noise
 CORRECTIONS: tuple[Callable[[FittedRuns], FittedRuns], ...] = (
+    without_outliers,
     with_even_clock,
     without_mains_hum,
     without_input_noise,

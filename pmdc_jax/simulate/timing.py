@@ -15,7 +15,9 @@ class Timing(NamedTuple):
     first_order_hold: bool = False  # linear from sample to sample
     # with a first-order hold, R / L in 1/s, or zero if it is unknown, if they are on smooth curves between jumps
     smooth: float | None = None
-    moves_load: bool = False  # whether the recorded loads have the same timing
+    # by how many whole samples the recorded loads act earlier, if they change when the voltages do and not at their
+    # own samples
+    load_ahead: int | None = None
     current_mean: bool = False  # whether the recorded currents are means over the last sample
 
     @property

@@ -45,6 +45,8 @@ MAX_FROM_MEAN = 0.2
 MIN_LEAD = 0.3
 # ... nor, for one run, of less than so many standard errors
 MIN_LEAD_ERRORS = 5.0
+# ... nor a slight lead of less than so many
+MIN_SLIGHT_ERRORS = 3.0
 
 
 def other_timings(fitted: FittedRuns) -> list[Timing]:
@@ -56,10 +58,10 @@ def other_timings(fitted: FittedRuns) -> list[Timing]:
     if not all(prepared.problem.samples > 0) or not any(r.drive == "voltage" for r in prepared.runs):
         return []  # without a current, or without a speed, only a delay would show
     trials = _Trials(fitted)
-    proposed = [*_at_samples(fitted), *_by_electrical_equation(trials)]
+    proposed = [*_at_samples(fitted), *(_by_electrical_equation(trials) or _slight_lead(trials))]
     plausible, score = _likelier(trials, proposed), trials.negative_log_likelihood
     if any(run.load is not None for run in prepared.training):
-        plausible = [t if t.reading else min(t, t._replace(moves_load=True), key=score) for t in plausible]
+        plausible = [trials.with_load(timing) for timing in plausible]
     # where everything is a mean, voltages on straight lines are as good, and simpler
     likely = [timing for timing in plausible if not timing.current_mean]
     means = [timing for timing in plausible if timing.current_mean]
@@ -101,6 +103,13 @@ class _Trials:
         """Those with a negative log-likelihood clearly below a value."""
         limit = than - MIN_LOG_LIKELIHOOD_GAIN
         return [timing for timing in timings if self.negative_log_likelihood(timing) < limit]
+
+    def with_load(self, timing: Timing) -> Timing:
+        """The timing with loads that change when the voltages do, if that is clearly likelier: those recorded beside
+        them, or beside the reading."""
+        moved = [timing._replace(load_ahead=ahead) for ahead in {timing.ahead, 0}]
+        likelier = self.likelier(moved, self.negative_log_likelihood(timing))
+        return min(likelier, key=self.negative_log_likelihood, default=timing)
 
     def is_right(self, timing: Timing) -> bool:
         """Whether nothing but noise is left with this timing, and not because the current alone was late."""
@@ -192,6 +201,20 @@ def _hidden(trials: _Trials, equation: ElectricalEquation) -> list[Timing]:
     return [timing for timing in hidden if trials.is_right(timing)]
 
 
+def _slight_lead(trials: _Trials) -> list[Timing]:
+    """The right timing with a lead of a few hundredths of a sample, as of a bridge that switches at its own instants:
+    too little for the electrical equation, but the inductance would make up for it."""
+    prepared, fit = trials.assumed
+    change = _half_sample_earlier(prepared, fit)
+    (lead,), (error,) = _amplitudes(prepared.problem, fit, [change])
+    if abs(lead) < MIN_SLIGHT_ERRORS * error:
+        return []
+    late = with_timing(prepared, Timing(-MARGIN)).problem
+    fit_late = fit_at(late, fit.optimum)
+    (later,), _ = _amplitudes(late, fit_late, [change_by_reading(late, fit_late)])
+    return [timing for timing in _between_samples(float(later) - MARGIN) if trials.is_right(timing)]
+
+
 def _current_seems_mean(problem: Problem, fit: Fit) -> bool:
     """Whether the current was read half a sample late, as the mean of a slow one is."""
     late, _ = _lateness_of_current(problem, fit)
@@ -239,16 +262,20 @@ def _apparent_leads(prepared: Prepared, fit: Fit) -> tuple[float, float]:
     """How much earlier than assumed the voltages seem to act, in half samples, in all runs together and, if clearly, in
     one of them at most: regression of the residuals on the change that half a sample makes in the outputs, less the
     part that the parameters could explain.
-
-    Half a sample earlier is a held mean of the voltages at a sample and the next, which reuses compiled programs.
     """
-    means = with_timing(prepared, FIRST_ORDER_HOLD).problem
-    means = replace(means, tape=replace(means.tape, rise=None))
-    change = fit_at(means, fit.optimum).evaluation.simulated - fit.evaluation.simulated
+    change = _half_sample_earlier(prepared, fit)
     (lead,), _ = _amplitudes(prepared.problem, fit, [change])
     blocks = [prepared.problem.tape.blocks_of(run) for run in prepared.training_indices]
     leads, errors = _amplitudes(prepared.problem, fit, [change * b[:, None, None] for b in blocks])
     return float(lead), float(np.max(leads[leads > MIN_LEAD_ERRORS * errors], initial=0.0))
+
+
+def _half_sample_earlier(prepared: Prepared, fit: Fit) -> Float[Array, "blocks 2 samples"]:
+    """The change of the outputs if the voltages act half a sample earlier: as held means of those at a sample and the
+    next, which reuses compiled programs."""
+    means = with_timing(prepared, FIRST_ORDER_HOLD).problem
+    means = replace(means, tape=replace(means.tape, rise=None))
+    return fit_at(means, fit.optimum).evaluation.simulated - fit.evaluation.simulated
 
 
 def _amplitudes(
@@ -259,12 +286,14 @@ def _amplitudes(
     scale = problem.tape.weight / fit.noise[:, None] * problem.fitted_blocks[:, None, None]
     scaled = [change * scale for change in changes]
     normal = [
-        np.asarray(normal_matrix(fit.evaluation._replace(residuals=change), problem.tape, problem.fitted_runs))
-        for change in scaled
+        np.asarray(normal_matrix(fit.evaluation._replace(residuals=column), problem.tape, problem.fitted_runs))
+        for column in [*scaled, fit.evaluation.residuals]
     ]
-    slopes = np.stack([matrix[:-1, -1] for matrix in normal])
+    *slopes, gradient = (matrix[:-1, -1] for matrix in normal)
+    slopes = np.stack(slopes)
     inverse = np.linalg.pinv(normal[0][:-1, :-1], hermitian=True)
     products = np.array([[float(jnp.sum(a * b)) for b in scaled] for a in scaled])
     covariance = np.linalg.pinv(products - slopes @ inverse @ slopes.T, hermitian=True)
-    along = np.array([-float(jnp.sum(fit.evaluation.residuals * change)) for change in scaled])
-    return covariance @ along, np.sqrt(np.diag(covariance))
+    along = np.array([float(jnp.sum(fit.evaluation.residuals * change)) for change in scaled])
+    # whitened fits have a gradient here
+    return covariance @ (slopes @ inverse @ gradient - along), np.sqrt(np.diag(covariance))

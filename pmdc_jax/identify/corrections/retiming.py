@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import attrs
 import numpy as np
+from jaxtyping import Float, Int
 
 from ...recordings.recording import Recording
 from ...simulate import Tape, Timing, on_even_clock
@@ -36,15 +37,26 @@ def _retimed(run: Recording, k: int, tape: Tape, timing: Timing) -> Recording:
 
     Voltages of an even clock, held or straight, are taken from the tape, where their noise may have been removed.
     """
+    recorded = run.recorded
     if run.drive != "voltage":
-        return run.recorded
-    even = run.has_even_clock
-    voltage = tape.samples_of(k, tape.drive_at(0.0), len(run)) if even else run.recorded.voltage
-    run, last = run.recorded, len(run.recorded) - 1
-    rows = np.clip(np.arange(len(run)) + timing.ahead, 0, last)
-    run = attrs.evolve(run, voltage=np.asarray(voltage)[rows])
-    if not timing.moves_load or run.load is None:
-        return run
-    # a load varies slowly enough to be held at its means instead of going straight
-    ahead = np.minimum(rows + 1, last) if timing.first_order_hold else rows
-    return attrs.evolve(run, load=(run.load[rows] + run.load[ahead]) / 2)
+        return recorded
+    voltage = tape.samples_of(k, tape.drive_at(0.0), len(run)) if run.has_even_clock else recorded.voltage
+    voltage = np.asarray(voltage)[_rows_ahead(len(recorded), timing.ahead)]
+    load = None if recorded.load is None else _mean_load(recorded.load, timing)
+    return attrs.evolve(recorded, voltage=voltage, load=load)
+
+
+def _mean_load(load: Float[np.ndarray, " samples"], timing: Timing) -> Float[np.ndarray, " samples"]:
+    """The means of a load from one change of the voltages to the next: it varies slowly enough to be held at them."""
+    ahead = timing.load_ahead
+    if ahead is None:  # at its own samples: some time passes until the next one, the reading
+        at, later, share = 0, -1, timing.reading or 0.0
+    else:
+        at, later, share = ahead, ahead + 1, 0.5 * timing.first_order_hold
+    first, second = (load[_rows_ahead(len(load), k)] for k in (at, later))
+    return first + share * (second - first)
+
+
+def _rows_ahead(samples: int, ahead: int) -> Int[np.ndarray, " samples"]:
+    """The rows so many samples ahead of each, within the run."""
+    return np.clip(np.arange(samples) + ahead, 0, samples - 1)

@@ -11,6 +11,7 @@ Introduction to Multiple Time Series Analysis" (2005), sections 3.2 and 4.3.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +20,11 @@ from jaxtyping import Bool, Float
 
 from .whitening import band_matrix, with_history
 
-# Orders that are tried, none above `CHUNK`; the Bayesian information criterion chooses.
-ORDERS = (1, 2, 4, 8, 12, 20, 30)
-# Rows at least for each coefficient of an output: with fewer a filter would follow the noise of this very record
+# Filters that are tried, by the last lags, none above `CHUNK`, of groups of lags with the same coefficients: each lag
+# alone, up to several orders, or few groups for slow noise far below that of a sensor. The Bayesian information
+# criterion chooses.
+FILTERS = (*(range(1, order + 1) for order in (1, 2, 4, 8, 12, 20, 30)), (30,), (1, 30), (1, 4, 12, 30))
+# Rows at least for each coefficient of an output
 MIN_ROWS_PER_COEFFICIENT = 20
 # Noise of different runs is equal if its logarithm differs by less
 MAX_LOG_NOISE_SPREAD = 0.2
@@ -36,12 +39,12 @@ class Series(NamedTuple):
 
     values: Rows
     known: Bool[np.ndarray, " samples"]  # where all outputs were measured
-    kind: tuple[float, tuple[int, ...]]  # sample time and outputs: runs of a kind share a filter
+    kind: tuple[float, tuple[int, ...]]  # sample time and outputs: runs of a kind may share a filter
 
 
 @frozen(eq=False)  # compared by identity
 class Whitener:
-    """For each run a filter, shared by runs of a kind, and the matrix that scales its output to unit variance.
+    """For each run a filter, which runs of a kind may share, and the matrix that scales its output to unit variance.
 
     It filters in NumPy; `Whitening` is what a fit compiles of it.
     """
@@ -69,10 +72,9 @@ def fit_whitener(residuals: Sequence[Series]) -> Whitener:
 
     **Arguments**: `residuals`, one `Series` per run, `values` (samples, outputs).
     """
-    by_kind = {}
-    for kind in dict.fromkeys(series.kind for series in residuals):
-        by_kind[kind] = _autoregression([s for s in residuals if s.kind == kind])
-    filters = [by_kind[series.kind] for series in residuals]
+    kinds = dict.fromkeys(series.kind for series in residuals)
+    by_kind = {kind: iter(_filters([s for s in residuals if s.kind == kind])) for kind in kinds}
+    filters = [next(by_kind[series.kind]) for series in residuals]
     scales = _scales(residuals, filters)
     slow = [_slow_power(_filtered(series, A, S)) for series, A, S in zip(residuals, filters, scales, strict=True)]
     return Whitener(filters, [S / np.sqrt(s) for S, s in zip(scales, slow, strict=True)])
@@ -115,37 +117,89 @@ def _scales(
     return scales
 
 
-def _autoregression(residuals: Sequence[Series]) -> Float[np.ndarray, "order outputs outputs"]:
-    """Coefficients A_k of r(t) = sum_k A_k r(t - k) + white noise, of the order with the lowest Bayesian
-    information criterion.
-
-    Each run is weighted by the inverse of its variance, because noise may differ between runs.
-    """
+def _filters(residuals: Sequence[Series]) -> list[Float[np.ndarray, "order outputs outputs"]]:
+    """The filters of runs of a kind, coefficients A_k of r(t) = sum_k A_k r(t - k) + white noise: one filter for all
+    runs, or one for each where their colours differ, as the Bayesian information criterion decides."""
     outputs = residuals[0].values.shape[1]
     # of a record with gaps, few samples follow on many without one
-    usable = [n for n in ORDERS if _count_rows(residuals, n) >= MIN_ROWS_PER_COEFFICIENT * n * outputs]
-    if not usable:
-        return np.zeros((0, outputs, outputs))
-    longest = usable[-1]
+    lags = [lags for lags in FILTERS if _count_rows(residuals, lags[-1]) >= _least_rows(lags, outputs)]
+    if not lags:
+        return [np.zeros((0, outputs, outputs))] * len(residuals)
+    longest = max(ends[-1] for ends in lags)
     lagged = [_lagged(series, longest) for series in residuals]
     rms = np.sqrt(np.mean(np.square(np.concatenate(lagged)), axis=0))[:outputs] + 1e-300
-    size, rows = outputs * (longest + 1), sum(len(x) for x in lagged)
-    gram = np.zeros((size, size))
-    for x in filter(len, lagged):
-        scaled = x / np.tile(rms, longest + 1)
-        gram += scaled.T @ scaled / (np.mean(np.square(scaled)) + 1e-300)
-    best = rows * np.linalg.slogdet(gram[:outputs, :outputs] / rows)[1]
-    chosen = np.zeros((0, outputs, outputs))
-    for order in usable:
-        now, past = slice(0, outputs), slice(outputs, outputs * (order + 1))
-        ridge = 1e-9 * np.trace(gram[past, past]) * np.eye(order * outputs) / (order * outputs)
-        coefficients = np.linalg.solve(gram[past, past] + ridge, gram[past, now])
-        innovations = (gram[now, now] - gram[now, past] @ coefficients) / rows
-        bic = rows * np.linalg.slogdet(innovations)[1] + order * outputs**2 * np.log(rows)
-        if bic < best:
-            best = bic
-            chosen = coefficients.reshape(order, outputs, outputs).transpose(0, 2, 1)
-    return chosen * rms[:, None] / rms
+    runs = [_Products.of(x / np.tile(rms, longest + 1), outputs) for x in lagged]
+    long = [k for k, run in enumerate(runs) if run.rows >= _least_rows(lags[0], outputs)]
+    shared = _autoregression([runs[k] for k in long] or runs, lags)
+    own = {k: _autoregression([runs[k]], lags) for k in long}
+    differ = sum(of_run.criterion for of_run in own.values()) < shared.criterion
+    chosen = [own.get(k, shared) if differ else shared for k in range(len(runs))]
+    return [A.reshape(-1, outputs, outputs).transpose(0, 2, 1) * rms[:, None] / rms for A, _ in chosen]
+
+
+class _Products(NamedTuple):
+    """Sums of the products of the residuals of a run, and of those before them, over the variance of that run, because
+    noise may differ between runs."""
+
+    sums: Float[np.ndarray, "columns columns"]
+    rows: int
+    outputs: int
+
+    @classmethod
+    def of(cls, lagged: Float[np.ndarray, "rows columns"], outputs: int) -> _Products:
+        variance = np.mean(np.square(lagged)) + 1e-300 if len(lagged) else 1.0
+        return cls(lagged.T @ lagged / variance, len(lagged), outputs)
+
+    def misfit(self, A: Float[np.ndarray, "lags outputs"]) -> float:
+        """Twice the negative log-likelihood of coefficients, up to a constant."""
+        errors = np.concatenate([np.eye(self.outputs), -A])
+        sums = self.sums[: len(errors), : len(errors)]
+        return self.rows * float(np.linalg.slogdet(errors.T @ sums @ errors / self.rows)[1])
+
+
+class _Autoregression(NamedTuple):
+    """Coefficients by lag and output, for each output, and their Bayesian information criterion."""
+
+    coefficients: Float[np.ndarray, "lags outputs"]
+    criterion: float
+
+
+def _autoregression(runs: Sequence[_Products], filters: Sequence[Sequence[int]]) -> _Autoregression:
+    """The autoregression that some runs share, of the filter with the lowest criterion.
+
+    **Arguments**: `filters`, as of `FILTERS`.
+    """
+    outputs, rows = runs[0].outputs, sum(run.rows for run in runs)
+    sums = np.sum([run.sums for run in runs], axis=0)
+    past = sums[outputs:, :outputs]
+    none = np.zeros((0, outputs))
+    tried = [_Autoregression(none, _criterion(runs, none, 0))]
+    for lags in filters:
+        if rows < _least_rows(lags, outputs):
+            continue
+        groups = np.kron(_groups(lags), np.eye(outputs))
+        products = groups.T @ sums[outputs : outputs + len(groups), outputs : outputs + len(groups)] @ groups
+        ridge = 1e-9 * np.trace(products) * np.eye(len(products)) / len(products)
+        A = groups @ np.linalg.solve(products + ridge, groups.T @ past[: len(groups)])
+        tried.append(_Autoregression(A, _criterion(runs, A, len(lags))))
+    return min(tried, key=attrgetter("criterion"))
+
+
+def _criterion(runs: Sequence[_Products], A: Float[np.ndarray, "lags outputs"], groups: int) -> float:
+    """The Bayesian information criterion of coefficients that are alike in groups of lags."""
+    rows = sum(run.rows for run in runs)
+    return sum(run.misfit(A) for run in runs if run.rows) + groups * A.shape[1] ** 2 * float(np.log(rows))
+
+
+def _groups(lags: Sequence[int]) -> Float[np.ndarray, "lags groups"]:
+    """Which lags are in which group: each from the end of the one before to its own."""
+    group = np.searchsorted(lags, np.arange(lags[-1]) + 1)
+    return np.eye(len(lags))[group]
+
+
+def _least_rows(lags: Sequence[int], outputs: int) -> int:
+    """Fewest rows from which a filter is fitted: with fewer it would follow the noise of this very record."""
+    return MIN_ROWS_PER_COEFFICIENT * lags[-1] * outputs
 
 
 def _count_rows(residuals: Sequence[Series], order: int) -> int:
