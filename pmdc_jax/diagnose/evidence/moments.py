@@ -17,8 +17,8 @@ from .regression import Block, Evidence, Regression
 from .rows import Rows
 from .signals import Signal, log_p_value
 
-# Samples whose errors count as one
-MOMENT = 4
+# Samples whose errors count as one: those of the same few samples, or while a motor answers to them
+MOMENTS = (4, 64)
 # Least share of a block's gain that counts as that of other moments
 MIN_OTHER_SHARE = 0.1
 # Logarithm of a p-value from which on evidence is looked at
@@ -50,19 +50,25 @@ def dispersion_by_moments(block: Block, rows: Sequence[Rows], white: Whitener, e
     sample properties", Journal of Econometrics 29 (1985), doi:10.1016/0304-4076(85)90158-7.
     """
     alone, beside = evidence.regress(), evidence.regress([block])
-    scores, squares = [], []
+    products = []
     for k, run in enumerate(rows):
         before = _white_rest(run, k, white, evidence, alone, None)
         after = _white_rest(run, k, white, evidence, beside, block)
         explained = before - after
-        starts = np.arange(0, len(after), MOMENT * run.fit.residual.values.shape[1])
-        scores.append(np.add.reduceat(explained * after, starts))
-        squares.append(np.add.reduceat(explained**2, starts))
-    score, share = np.concatenate(scores), np.concatenate(squares)
+        outputs = run.fit.residual.values.shape[1]
+        products.append(np.stack([explained * after, explained**2]).reshape(2, -1, outputs).sum(2))
+    return max(1.0, *(_dispersion(products, samples) for samples in MOMENTS))
+
+
+def _dispersion(products: Sequence[Float[np.ndarray, "2 samples"]], samples: int) -> float:
+    """The dispersion by moments of so many samples; `products` of each run, of what a block explains with the errors
+    and with itself."""
+    of_moments = [np.add.reduceat(run, np.arange(0, run.shape[1], samples), axis=1) for run in products]
+    score, share = np.concatenate(of_moments, axis=1)
     if not (gain := float(share.sum())):
         return 1.0
     without = np.maximum(1 - share / gain, MIN_OTHER_SHARE)
-    return max(float(np.square(score / without).sum()) / gain, 1.0)
+    return float(np.square(score / without).sum()) / gain
 
 
 def _white_rest(
