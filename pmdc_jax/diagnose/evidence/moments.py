@@ -60,7 +60,7 @@ def dispersion_by_moments(block: Block, rows: Sequence[Rows], white: Whitener, e
     return max(1.0, *(_dispersion(products, samples) for samples in MOMENTS))
 
 
-def _dispersion(products: Sequence[Float[np.ndarray, "2 samples"]], samples: int) -> float:
+def _dispersion(products: Sequence[Float[np.ndarray, "2 _"]], samples: int) -> float:
     """The dispersion by moments of so many samples; `products` of each run, of what a block explains with the errors
     and with itself."""
     of_moments = [np.add.reduceat(run, np.arange(0, run.shape[1], samples), axis=1) for run in products]
