@@ -75,12 +75,8 @@ def _white_rest(
     run: Rows, k: int, white: Whitener, evidence: Evidence, fit: Regression, block: Block | None
 ) -> Float[np.ndarray, " rows"]:
     """The whitened residuals of a run less all that is fitted with a block, or without any."""
-    shared, own, residual, _ = run.fit
-    rest = residual.values - shared.values @ fit.parameter_changes - run.late @ fit.late_readings
-    if block is not None:
-        columns = np.array(block.columns) - evidence.first_column
-        coefficients = fit.coefficients[0][k] if block.per_run else fit.coefficients[0]
-        rest = rest - run.columns[..., columns] @ coefficients
+    _, own, residual, _ = run.fit
+    rest = run.without(k, fit, block, evidence.first_column) - run.late @ fit.late_readings
     together = np.concatenate([rest[..., None], own.values], -1)
     rest, *unknowns = white(k, Series(together, residual.known, residual.kind)).T
     return rest - np.array(unknowns).T @ np.linalg.lstsq(np.array(unknowns).T, rest)[0]

@@ -23,6 +23,7 @@ from ..hypotheses.change import Change, columns_at_once
 from ..model import Model, RunSeries, series_of_runs
 from ..response import Trajectory, respond
 from .quantisation import converter_steps, rounding_errors
+from .regression import Block, Regression
 
 # Samples that are whitened at once, to limit the memory
 CHUNK = 2048
@@ -39,6 +40,20 @@ class Rows(NamedTuple):
     late: Float[np.ndarray, "samples outputs 2"]
     columns: Float[np.ndarray, "samples outputs columns"]
     rounding: Float[np.ndarray, "samples outputs draws"]
+
+    def without(
+        self, run: int, fit: Regression, block: Block | None, first: int
+    ) -> Float[np.ndarray, "samples outputs"]:
+        """The residuals less what a regression explains by the parameters and by a block.
+
+        **Arguments**: `first` column of what may be missing.
+        """
+        shared, _, residual, _ = self.fit
+        rest = residual.values - shared.values @ fit.parameter_changes
+        if block is None:
+            return rest
+        coefficients = fit.coefficients[0][run] if block.per_run else fit.coefficients[0]
+        return rest - self.columns[..., np.array(block.columns) - first] @ coefficients
 
     def white(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
         """Whitened rows, `CHUNK` samples at a time; columns in the order that `gather_evidence` expects."""

@@ -101,15 +101,11 @@ def _without_clearest(plain: Screen, rows: Sequence[Rows]) -> list[Series]:
         (s for s in (*candidate_signals, *curve_signals) if s.candidate or _is_definite(s)), key=attrgetter("log_p")
     ).block
     best = plain.evidence.regress([clearest])
-    columns = np.array(clearest.columns) - plain.evidence.first_column
     series = []
-    for k, (fit, _, X, _) in enumerate(rows):
-        coefficients = best.coefficients[0][k] if clearest.per_run else best.coefficients[0]
-        known = fit.residual.known
+    for k, run in enumerate(rows):
         # late readings are noise, and stay
-        rest = fit.residual.values - fit.shared.values @ best.parameter_changes
-        rest = rest - X[..., columns] @ coefficients
-        own = fit.own.values
+        rest = run.without(k, best, clearest, plain.evidence.first_column)
+        known, own = run.fit.residual.known, run.fit.own.values
         unknowns = np.linalg.lstsq(own[known].reshape(-1, own.shape[-1]), rest[known].ravel())[0]
-        series.append(fit.residual._replace(values=rest - own @ unknowns))
+        series.append(run.fit.residual._replace(values=rest - own @ unknowns))
     return series

@@ -45,8 +45,8 @@ MAX_FROM_MEAN = 0.2
 MIN_LEAD = 0.3
 # ... nor, for one run, of less than so many standard errors
 MIN_LEAD_ERRORS = 5.0
-# ... nor a slight lead of less than so many
-MIN_SLIGHT_ERRORS = 3.0
+# ... nor a slight lead of less than so many, or if the squares are larger than so many times those of noise
+MIN_SLIGHT_ERRORS, MAX_SLIGHT_SQUARES = 3.0, 3.0
 
 
 def other_timings(fitted: FittedRuns) -> list[Timing]:
@@ -205,6 +205,8 @@ def _slight_lead(trials: _Trials) -> list[Timing]:
     """The right timing with a lead of a few hundredths of a sample, as of a bridge that switches at its own instants:
     too little for the electrical equation, but the inductance would make up for it."""
     prepared, fit = trials.assumed
+    if fit.fitness > MAX_SLIGHT_SQUARES * prepared.problem.perfect_fitness:
+        return []
     change = _half_sample_earlier(prepared, fit)
     (lead,), (error,) = _amplitudes(prepared.problem, fit, [change])
     if abs(lead) < MIN_SLIGHT_ERRORS * error:
