@@ -12,7 +12,7 @@ from pmdc_jax.effects import BrushVoltageDrop
 from pmdc_jax.errors import InputError
 from pmdc_jax.motor import Drive, Motor
 from pmdc_jax.recordings.angle import angle_of_counts
-from pmdc_jax.recordings.clock import evenly_stamped, is_even, with_lost_rows
+from pmdc_jax.recordings.clock import evenly_stamped, is_even
 from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate import on_even_clock
 from pmdc_jax.simulate.between_samples import mean_and_rise_of_pieces, pieces_of
@@ -261,49 +261,6 @@ def test_jittered_stamps_of_even_samples_are_replaced_by_even_ones(seed):
     corrected = evenly_stamped(stamped)
     assert is_even(corrected.time)
     assert corrected.time[-1] == pytest.approx(STEP * 1999, abs=STEP / 10)
-
-
-def test_lost_rows_are_missing_samples_of_an_even_clock():
-    rng = np.random.default_rng(12)
-    whole = record(stamps("even", 3000, rng), rng)
-    lost = np.sort(rng.choice(np.arange(1, 2999), 30, replace=False))
-    columns = {name: np.delete(x, lost) for name, x in whole.columns().items()}
-    columns["time"] = np.round(columns["time"], 6)
-    filled = with_lost_rows(Recording("lost", **columns))
-    np.testing.assert_allclose(filled.time, whole.time, atol=1e-9)
-    for name in ("current", "speed"):
-        expected = getattr(whole, name).copy()
-        expected[lost] = np.nan
-        np.testing.assert_array_equal(getattr(filled, name), expected)
-    kept = np.delete(np.arange(3000), lost)
-    before = kept[np.searchsorted(kept, np.arange(3000), "right") - 1]
-    np.testing.assert_array_equal(filled.voltage, whole.voltage[before])
-    np.testing.assert_array_equal(filled.load, whole.load[before])
-    assert with_lost_rows(whole) is whole
-
-
-@pytest.mark.parametrize("change", ["jitter", "many lost", "angle"])
-def test_other_uneven_stamps_stay(change):
-    rng = np.random.default_rng(13)
-    run = record(stamps("jitter" if change == "jitter" else "even", 3000, rng), rng)
-    kept = np.sort(rng.choice(3000, 2900 if change == "many lost" else 2980, replace=False))
-    columns = {name: x[kept] for name, x in run.columns().items()}
-    if change == "angle":
-        columns["angle"] = STEP * np.cumsum(columns.pop("speed"))
-    run = Recording(change, **columns)
-    assert with_lost_rows(run) is run
-
-
-def test_a_motor_is_identified_although_rows_were_lost():
-    rng, runs = np.random.default_rng(14), []
-    for name in "abc":
-        run = record(stamps("even", 3000, rng), rng)
-        kept = rng.random(3000) > 0.01
-        runs.append(Recording(name, **{quantity: x[kept] for quantity, x in run.columns().items()}))
-    found = pmdc_jax.identify(runs)
-    for name, true in MOTOR.items():
-        estimate = found.parameters[name]
-        assert abs(estimate.value - true) < 3 * estimate.stderr, name
 
 
 def test_a_long_gap_is_refused():

@@ -21,7 +21,7 @@ from ..effects import EFFECTS, AbstractEffect
 from ..errors import InputError
 from ..motor import PARAMETERS, PARAMETERS_OF_DRIVE, Drive
 from ..recordings.angle import angle_of_counts
-from ..recordings.clock import evenly_stamped, is_even, with_lost_rows
+from ..recordings.clock import evenly_stamped, is_even
 from ..recordings.readings import reading_interval
 from ..recordings.recording import NEEDED_TO_IDENTIFY, SIMULATED_OUTPUTS, Averaging, Finding, Recording
 from ..recordings.recording_file import Runs, named_apart, recordings_of, refuse_copies
@@ -143,9 +143,7 @@ def prepare(
     stamped = [evenly_stamped(run) for run in cleaned]
     counted = [_with_counts_as_angle(run) for run in stamped]
     findings += tuple(_counted_note(run) for run, before in zip(counted, stamped, strict=True) if run is not before)
-    prepared = _laid_out(list(map(with_lost_rows, counted)), roles, findings, tie, known, unloaded).with_effects(
-        effects
-    )
+    prepared = _laid_out(counted, roles, findings, tie, known, unloaded).with_effects(effects)
     if not prepared.problem.parameters.names:
         raise InputError(
             "--known",

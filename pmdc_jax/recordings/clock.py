@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 from jaxtyping import Float
 
-from .recording import SIMULATED_OUTPUTS, Recording
+from .recording import Recording
 
 Samples = Float[np.ndarray, " samples"]
 
@@ -19,8 +19,6 @@ Samples = Float[np.ndarray, " samples"]
 GAP = 3.0 * (1 + 1e-9)
 # Largest distance of a time stamp from an even clock, in steps, that is taken for rounding of the stamps
 ROUNDING = 0.02
-# Largest share of the samples of an even clock that may have been lost
-MAX_LOST = 0.02
 # Largest distance, in steps, of the stamp of a sample that may have been taken evenly
 MAX_LATENESS = 3.0
 # Samples on either side over which a slope is taken
@@ -45,25 +43,6 @@ def evenly_stamped(recording: Recording) -> Recording:
         return recording
     even, _ = _fit_even_clock(recording.time)
     return attrs.evolve(recording, time=even)
-
-
-def with_lost_rows(recording: Recording) -> Recording:
-    """An even record from which a logger lost a few rows, with these rows: what drives the motor goes on, and its
-    outputs are missing. Other records, and angles, are unchanged."""
-    time = recording.time
-    steps = np.rint(np.diff(time) / recording.sample_time).astype(int)
-    ticks = np.append(0, np.cumsum(steps))
-    count = int(ticks[-1]) + 1
-    if recording.angle is not None or np.any(steps < 1) or not 0 < count - len(time) <= MAX_LOST * count:
-        return recording
-    step, begin = np.polyfit(ticks, time, 1)
-    if np.max(np.abs(time - begin - ticks * step)) > ROUNDING * step:
-        return recording
-    lost = np.isin(np.arange(count), ticks, invert=True)
-    going_on = {name: np.repeat(x, np.append(steps, 1)) for name, x in recording.columns().items() if name != "time"}
-    for name in going_on.keys() & {*SIMULATED_OUTPUTS} - {recording.drive}:
-        going_on[name] = np.where(lost, np.nan, going_on[name])
-    return attrs.evolve(recording, time=begin + step * np.arange(count), **going_on)
 
 
 def is_evenly_sampled(recording: Recording) -> bool:
