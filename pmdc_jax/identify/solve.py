@@ -85,7 +85,8 @@ def solve(
     return min(solutions, key=lambda solution: negative_log_likelihood_within(solution.fitted))
 
 
-# Applied in this order: uneven sampling hides everything else, and a mean is recognised by the sensor's own noise
+# Applied in this order: outliers spoil every fit, uneven sampling hides everything else, and a mean is recognised by
+# the sensor's own noise
 CORRECTIONS: tuple[Callable[[FittedRuns], FittedRuns], ...] = (
     without_outliers,
     with_even_clock,
