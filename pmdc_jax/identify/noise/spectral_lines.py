@@ -61,7 +61,7 @@ def spectrum(
 
 def common_line(spectra: Sequence[Spectrum]) -> Line | None:
     """The highest line that stands out at one frequency in more than half of the runs, if there is one."""
-    longest = max(spectra, key=lambda s: s.duration)
+    longest = max(spectra, key=lambda s: s.duration * s.residual.any())  # of runs without a periodic drive
     few = len(spectra) < 3
     least = MIN_HEIGHT * (FEW_RUNS_FACTOR if few else 1.0)
     best = None
