@@ -34,7 +34,7 @@ from pmdc_jax.diagnose.hypotheses.effect_relations import FULLER, are_rivals, is
 from pmdc_jax.diagnose.hypotheses.library import Library
 from pmdc_jax.diagnose.hypotheses.trials import TRIALS
 from pmdc_jax.diagnose.judgement import _by_evidence, implausible_effect, may_be_absent
-from pmdc_jax.diagnose.model import Model, RunSeries, model_of
+from pmdc_jax.diagnose.model import Model, model_of
 from pmdc_jax.diagnose.response import respond, sensor_changes, state_increments, trajectory_of
 from pmdc_jax.diagnose.selection import naming, proposals
 from pmdc_jax.diagnose.selection.compare import DECISIVE_RATIO, Comparison, Fitted
@@ -55,6 +55,7 @@ from pmdc_jax.effects import (
 from pmdc_jax.identify.fit.fitted_runs import FittedRuns
 from pmdc_jax.identify.fit.polish import fit_at
 from pmdc_jax.identify.fit.refine import Optimum
+from pmdc_jax.identify.fit.run_series import RunSeries
 from pmdc_jax.identify.identification import Estimate, Identification
 from pmdc_jax.identify.noise.noise_model import Series, fit_whitener, scaling_whitener
 from pmdc_jax.identify.noise.spectral_lines import common_line, spectrum
@@ -423,7 +424,7 @@ def test_gains_where_errors_are_large_are_worth_less(there, effect, least, most)
     fit = RunSeries(series(shared), series(own), residual, series(noise))
     rows = Rows(fit, np.zeros((count, 2, 2)), column, np.zeros((count, 2, 0)))
     white = scaling_whitener([series(noise)])
-    evidence = gather_evidence([rows.white(0, white)], parameters=1, run_unknowns=1, timing_errors=(0.01, 0.03))
+    evidence = gather_evidence([rows.filtered(0, white)], parameters=1, run_unknowns=1, timing_errors=(0.01, 0.03))
     block = Block((evidence.first_column,), per_run=False)
     assert least <= dispersion_by_moments(block, [rows], white, evidence) < most
 
@@ -805,6 +806,12 @@ def test_harmonics_of_a_periodic_drive_are_ignored():
     once = rng.normal(size=(8000, 1)).cumsum(0)
     assert common_line([spectrum(residuals, wave[:, None], 1e-3)] * 3) is None
     assert common_line([spectrum(residuals, once, 1e-3)] * 3) is not None
+
+
+def test_the_frequency_of_a_line_is_that_of_the_longest_run_without_a_periodic_drive():
+    *others, longest = spectra_with_oscillations([7.3] * 4)
+    line = common_line([*others, longest._replace(residual=np.zeros_like(longest.residual))])
+    assert line.low < 7.3 < line.high
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -13,7 +13,8 @@ from benchmarks import virtual_bench as vb
 from experiments.bench import recording
 from pmdc_jax import Motor, identify
 from pmdc_jax.identify.identification import Identification
-from pmdc_jax.identify.missing_friction import MissingFriction, _load_filter, _load_response, friction_messages
+from pmdc_jax.identify.load_response import load_filter, load_response
+from pmdc_jax.identify.missing_friction import MissingFriction, friction_messages
 from pmdc_jax.recordings.recording import Recording
 from pmdc_jax.simulate import Tape
 
@@ -81,7 +82,7 @@ def test_the_response_to_a_load_matches_scipy(x64):
     (run, _) = recorded(0.0, seed=1)
     motor = Motor(*(getattr(PAPER, name) for name in vb.SIX))
     load = np.sign(np.sin(7 * run.time))
-    found = _load_response(_load_filter(motor, Tape.from_recordings([run]), 0), load)
+    found = load_response(load_filter(motor, Tape.from_recordings([run]), 0), load)
     A, B = map(np.asarray, motor.state_space())
     system = (A, B[:, 1:], np.eye(2), np.zeros((2, 1)))
     _, expected, _ = lsim(system, load, run.time, interp=False)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import attrs
 import numpy as np
 
 from ..effects import AsymmetricFriction, CoulombFriction, InputDeadZone
 from ..identify.fit.fitted_runs import FittedRuns
 from ..identify.fit.gauss_newton import TRIAL_TOLERANCE
-from ..identify.fit.generalised_least_squares import last_fit, residuals_of, series_of, with_whitening
+from ..identify.fit.generalised_least_squares import last_fit, with_whitening
 from ..identify.fit.polish import Fit, fit_at, reweighted
 from ..identify.fit.refine import Optimum
-from ..identify.noise.noise_model import Series, Whitener
+from ..identify.noise.noise_model import Whitener
 from ..identify.prepare import Prepared
 from ..identify.problem import Problem
 from ..identify.rotor_angle import rotor_outputs, with_rotor_angle
@@ -214,29 +212,3 @@ def final_fit(model: Model, white: Whitener) -> FittedRuns:
     at_start = reweighted(model.problem, model.fit)
     unfiltered = polish_with_angle(model.prepared, model.fit.optimum, at_start=at_start)
     return last_fit(unfiltered, model.fit, white)
-
-
-class RunSeries(NamedTuple):
-    """One training run, in A and rad/s."""
-
-    shared: Series  # derivatives of the simulated outputs by the model's search coordinates
-    own: Series  # ... and by the run's own unknowns (initial state, load, ...)
-    residual: Series  # measured less simulated
-    simulated: Series
-
-
-def series_of_runs(model: Model) -> list[RunSeries]:
-    """The fit of every training run, in the order of time."""
-    evaluation, tape = model.fit.evaluation, model.problem.tape
-    J = np.asarray(evaluation.jacobian) * model.fit.noise[:, None, None]
-    count = model.problem.free.shape[0]
-    residuals = residuals_of(model.prepared, model.fit)
-    return [
-        RunSeries(
-            series_of(tape, run, J[..., :count]),
-            series_of(tape, run, J[..., count:]),
-            residual,
-            series_of(tape, run, np.asarray(evaluation.simulated)),
-        )
-        for run, residual in zip(model.prepared.training_indices, residuals, strict=True)
-    ]

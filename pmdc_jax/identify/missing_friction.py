@@ -9,18 +9,17 @@ the end of the fit, on rows filtered so that its residuals are white. No motor i
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import cont2discrete, lfilter, ss2tf
 
-from ..motor import Motor
 from ..recordings.recording import OVER_LAST
-from ..simulate import UNKNOWNS_PER_RUN, Tape
+from ..simulate import UNKNOWNS_PER_RUN
 from .fit.generalised_least_squares import residuals_of, series_of, series_of_samples
 from .fit.polish import Fit
 from .identification import Identification
+from .load_response import load_filter, load_response
 from .noise.noise_model import Series, Whitener, fit_whitener, scaling_whitener
 from .prepare import Prepared
 
@@ -32,9 +31,6 @@ MIN_BIAS = 2.0
 FRICTION = "coulomb_friction"
 # Least eigenvalue of a normalised normal matrix, over the largest, of a direction that the rows determine
 RANK_TOLERANCE = 1e-9
-
-# Numerators for current and speed, and the common denominator
-LoadFilter = tuple[Float[np.ndarray, "2 3"], Float[np.ndarray, "3"]]
 
 
 class MissingFriction(NamedTuple):
@@ -93,12 +89,12 @@ def _regression_columns(prepared: Prepared, fit: Fit) -> list[Series]:
     problem, tape = prepared.problem, prepared.problem.tape
     motor, count = problem.parameters(fit.coordinates), len(problem.free)
     of_grid = {tape.grid_of(run): run for run in prepared.training_indices}
-    filters = {grid: _load_filter(motor, tape, run) for grid, run in of_grid.items()}
+    filters = {grid: load_filter(motor, tape, run) for grid, run in of_grid.items()}
     J = np.asarray(fit.evaluation.jacobian) * fit.noise[:, None, None]
     rows = []
     for run, residual in zip(prepared.training_indices, residuals_of(prepared, fit), strict=True):
         speed = np.asarray(fit.evaluation.simulated)[tape.blocks_of(run), 1].ravel()
-        friction = _load_response(filters[tape.grid_of(run)], np.sign(speed))
+        friction = load_response(filters[tape.grid_of(run)], np.sign(speed))
         if (averaging := prepared.runs[run].averaging) is not None:
             friction[:, 1] = averaging.applied_to(friction[:, 1], tape.span_of(run))
         if prepared.runs[run].current_averaged:
@@ -109,20 +105,6 @@ def _regression_columns(prepared: Prepared, fit: Fit) -> list[Series]:
         sized = [c if c.ndim == 3 else c[..., None] for c in columns]
         rows.append(residual._replace(values=np.concatenate(sized, -1)))
     return rows
-
-
-def _load_filter(motor: Motor, tape: Tape, run: int) -> LoadFilter:
-    """Discrete transfer functions of the linear motor, from a load held between samples to current and speed."""
-    A, B = map(np.asarray, motor.state_space(tape.drive_of(run)))
-    continuous = (A, B[:, 1:], np.eye(2), np.zeros((2, 1)))
-    discrete: Any = cont2discrete(continuous, tape.sample_time_of(run), method="zoh")
-    numerators, denominator = ss2tf(*discrete[:4])
-    return numerators, np.asarray(denominator)
-
-
-def _load_response(of_load: LoadFilter, load: Float[np.ndarray, " samples"]) -> Float[np.ndarray, "samples 2"]:
-    numerators, denominator = of_load
-    return np.stack([lfilter(numerator, denominator, load) for numerator in numerators], 1)
 
 
 class _Regression(NamedTuple):

@@ -12,10 +12,10 @@ from ..recordings.recording_file import Runs
 from ..runtime.compiled import free_memory_maps
 from ..runtime.precision import double_precision
 from ..runtime.threads import one_blas_thread
-from .fit.generalised_least_squares import last_fit, residuals_of
+from .fit.generalised_least_squares import last_fit
+from .fit.slow_torque import whitener_of
 from .identification import Identification
 from .missing_friction import friction_messages, missing_friction
-from .noise.noise_model import fit_whitener
 from .parameters import effects_named
 from .prepare import prepare
 from .results import results_of
@@ -57,7 +57,7 @@ def identify(
     plain = solved.fitted
     report("estimating the uncertainty", plain.fit.fitness)
     friction = missing_friction(*plain)
-    white = fit_whitener(residuals_of(*plain))
+    white = whitener_of(*plain)
     result = results_of(solved._replace(fitted=last_fit(plain, plain.fit, white)))
     seconds = {**solved.seconds, "total": time.perf_counter() - began}
     residual_messages = (

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...identify.fit.run_series import series_of_runs
 from ...identify.noise.spectral_lines import Line, common_line, spectrum
-from ..model import Model, series_of_runs
+from ..model import Model
 
 
 def line_of(model: Model) -> Line | None:
     """The steady oscillation that a model leaves in most of the runs, if it leaves one."""
     spectra = []
-    for run, fit in zip(model.prepared.training, series_of_runs(model), strict=True):
+    for run, fit in zip(model.prepared.training, series_of_runs(model.prepared, model.fit), strict=True):
         # a current drives only where there is no voltage
         current = run.current if run.voltage is None else None
         drives = [x for x in (run.voltage, run.torque, run.load, current) if x is not None]

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ...identify.fit.run_series import RunSeries
 from ...recordings.recording import SIMULATED_OUTPUTS, Recording
 from ...recordings.resolution import quantum
-from ..model import RunSeries
 
 # Simulated readings, each with the converter's steps at another offset
 ROUNDING_DRAWS = 8

@@ -151,20 +151,22 @@ def gather_evidence(
     run_unknowns: int,
     timing_errors: Sequence[float] = (),
     rounding_errors: int = 0,
+    slow: int = 0,
 ) -> Evidence:
-    """Gather the evidence from white rows, those of each run in several pieces.
+    """Gather the evidence from filtered rows, those of each run in several pieces.
 
     **Arguments**: `runs`, the pieces of each run, with columns for the motor's `parameters`, the late readings, what
-    may be missing, the simulated `rounding_errors` of coarse converters, the residual, and last the `run_unknowns`; the
-    numbers are how many columns each has. `timing_errors`, the standard deviations to within which it is known
-    beforehand that each output is not read late.
+    may be missing, the simulated `rounding_errors` of coarse converters, the residual, the `run_unknowns`, and last
+    those that `slow` noise has with random coefficients of unit variance; the numbers are how many columns each has.
+    `timing_errors`, the standard deviations to within which it is known beforehand that each output is not read late.
     """
     products = []
     for pieces in runs:
         total = np.zeros(())
         for piece in pieces:
             total = total + piece.T @ piece
-        kept, nuisance = slice(0, -run_unknowns), slice(-run_unknowns, None)
+        total[np.diag_indices(len(total))] += np.append(np.zeros(len(total) - slow), np.ones(slow))
+        kept, nuisance = slice(0, -run_unknowns - slow), slice(-run_unknowns - slow, None)
         cross = total[nuisance, kept]
         projected = total[kept, kept] - cross.T @ _inverse(total[nuisance, nuisance]) @ cross
         distinct = np.diag(projected) > MIN_EIGENVALUE * np.diag(total)[kept]

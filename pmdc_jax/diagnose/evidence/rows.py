@@ -15,12 +15,13 @@ import numpy as np
 from jaxtyping import Array, Float, Float32
 
 from ...identify.fit.generalised_least_squares import series_of
+from ...identify.fit.run_series import RunSeries, series_of_runs
 from ...identify.noise.noise_model import Series, Whitener
 from ...motor import Motor
 from ...runtime.compiled import compiled
 from ...simulate import Tape
 from ..hypotheses.change import Change, columns_at_once
-from ..model import Model, RunSeries, series_of_runs
+from ..model import Model
 from ..response import Trajectory, respond
 from .quantisation import converter_steps, rounding_errors
 from .regression import Block, Regression
@@ -55,21 +56,22 @@ class Rows(NamedTuple):
         coefficients = fit.coefficients[0][run] if block.per_run else fit.coefficients[0]
         return rest - self.columns[..., np.array(block.columns) - first] @ coefficients
 
-    def white(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
-        """Whitened rows, `CHUNK` samples at a time; columns in the order that `gather_evidence` expects."""
+    def filtered(self, run: int, whiten: Whitener) -> Iterator[Float[np.ndarray, "rows _"]]:
+        """Filtered rows, `CHUNK` samples at a time; columns in the order that `gather_evidence` expects."""
         shared, own, residual, _ = self.fit
-        columns = (shared.values, self.late, self.columns, self.rounding, residual.values[..., None], own.values)
+        slow = () if whiten.slow is None else (whiten.slow[run],)
+        columns = (shared.values, self.late, self.columns, self.rounding, residual.values[..., None], own.values, *slow)
         back = len(whiten.filters[run])
         for first in range(back, len(residual.values), CHUNK):
             part = slice(first - back, first + CHUNK)
             values = np.concatenate([x[part] for x in columns], axis=-1)
-            yield whiten(run, Series(values, residual.known[part], residual.kind))
+            yield whiten.filtered(run, Series(values, residual.known[part], residual.kind))
 
 
 def gather_rows(model: Model, bare: Motor, trajectory: Trajectory, changes: Iterable[Change], count: int) -> list[Rows]:
     """The rows of every training run, from `changes` with `count` columns in all, which the motor without effects,
     `bare`, propagates."""
-    tape, fits = model.problem.tape, series_of_runs(model)
+    tape, fits = model.problem.tape, series_of_runs(model.prepared, model.fit)
     rows_of_runs = []
     for k, (fit, run) in enumerate(zip(fits, model.prepared.training, strict=True)):
         columns = np.empty((*fit.residual.values.shape, count), np.float32)

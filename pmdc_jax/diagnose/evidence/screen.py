@@ -9,7 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...identify.noise.noise_model import Series, Whitener, fit_whitener, scaling_whitener
+from ...identify.fit.run_series import RunSeries
+from ...identify.fit.slow_torque import whitener_of_runs
+from ...identify.noise.noise_model import Whitener, scaling_whitener
 from ...simulate import UNKNOWNS_PER_RUN
 from ..hypotheses.curves import Curve, curves_along
 from ..hypotheses.library import Library
@@ -61,7 +63,7 @@ def screen(model: Model, library: Library) -> Findings:
         coulomb_torque=model.coulomb_torque,
         sensor_floors=library.sensor_floors,
     )
-    white = fit_whitener(_without_clearest(plain, rows))
+    white = whitener_of_runs(model.prepared, library.bare, _without_clearest(plain, rows))
     evidence = _evidence(rows, white)
     is_uneven = not all(run.has_even_clock for run in model.prepared.training)
     least_gain = UNEVEN_SHARE * evidence.regress().squares if is_uneven else 0.0
@@ -78,13 +80,14 @@ def share_beyond(plain: Screen, blocks: Sequence[Block]) -> float:
 
 def _evidence(rows: Sequence[Rows], whiten: Whitener) -> Evidence:
     """The evidence from all rows, whitened by one filter."""
-    white = (run.white(k, whiten) for k, run in enumerate(rows))
+    filtered = (run.filtered(k, whiten) for k, run in enumerate(rows))
     return gather_evidence(
-        white,
+        filtered,
         parameters=rows[0].fit.shared.values.shape[-1],
         run_unknowns=UNKNOWNS_PER_RUN,
         timing_errors=TIMING_ERRORS,
         rounding_errors=ROUNDING_DRAWS,
+        slow=0 if whiten.slow is None else whiten.slow[0].shape[-1],
     )
 
 
@@ -94,18 +97,20 @@ def _is_definite(curve: Signal) -> bool:
     return not curve.term.per_run or curve.term.is_sensor_error
 
 
-def _without_clearest(plain: Screen, rows: Sequence[Rows]) -> list[Series]:
-    """The residuals of each run less the most significant candidate or shared curve, and all that is fitted with it."""
+def _without_clearest(plain: Screen, rows: Sequence[Rows]) -> list[RunSeries]:
+    """The fit of each run, its residuals less the most significant candidate or shared curve, and all that is fitted
+    with it."""
     candidate_signals, curve_signals = signals(plain)
     clearest = min(
         (s for s in (*candidate_signals, *curve_signals) if s.candidate or _is_definite(s)), key=attrgetter("log_p")
     ).block
     best = plain.evidence.regress([clearest])
-    series = []
+    fits = []
     for k, run in enumerate(rows):
         # late readings are noise, and stay
         rest = run.without(k, best, clearest, plain.evidence.first_column)
         known, own = run.fit.residual.known, run.fit.own.values
         unknowns = np.linalg.lstsq(own[known].reshape(-1, own.shape[-1]), rest[known].ravel())[0]
-        series.append(run.fit.residual._replace(values=rest - own @ unknowns))
-    return series
+        residual = run.fit.residual._replace(values=rest - own @ unknowns)
+        fits.append(run.fit._replace(residual=residual))
+    return fits

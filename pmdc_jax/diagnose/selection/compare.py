@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...identify.fit.gauss_newton import TRIAL_TOLERANCE, squares_of_outputs
-from ...identify.fit.generalised_least_squares import fit_whitened, residuals_of
-from ...identify.noise.noise_model import Whitener, fit_whitener
+from ...identify.fit.generalised_least_squares import fit_whitened
+from ...identify.fit.slow_torque import whitener_of
+from ...identify.noise.noise_model import Whitener
 from ...identify.prepare import Prepared
 from ..hypotheses.effect_relations import is_simpler_form
 from ..model import Model
@@ -76,7 +77,7 @@ class Comparison:
     def filter_of(self, model: Model) -> Whitener:
         """The filter that whitens the residuals of a model."""
         if model not in self._filters:
-            self._filters[model] = fit_whitener(residuals_of(model.prepared, model.fit))
+            self._filters[model] = whitener_of(model.prepared, model.fit)
         return self._filters[model]
 
 

@@ -10,11 +10,12 @@ import numpy as np
 from ...effects import EFFECTS
 from ...identify.fit.fitted_runs import FittedRuns
 from ...identify.fit.gauss_newton import TRIAL_TOLERANCE
-from ...identify.fit.generalised_least_squares import residuals_of, with_whitening
+from ...identify.fit.generalised_least_squares import with_whitening
 from ...identify.fit.polish import fit_at, polish
 from ...identify.fit.refine import Optimum
 from ...identify.fit.run_unknowns import best_backlash_start
-from ...identify.noise.noise_model import Whitener, fit_whitener
+from ...identify.fit.slow_torque import whitener_of
+from ...identify.noise.noise_model import Whitener
 from ...identify.prepare import Prepared
 from ...identify.solve import POOR_FIT, Solved, search_and_refine
 from ...identify.uncertainty.covariance import information_of
@@ -320,7 +321,7 @@ def _short_refit(start: Start) -> Optimum:
 def _refit_with_population(prepared: Prepared, start: Optimum, factors: Mapping[str, float], seed: int) -> Model:
     """A refit; or a second one from the best of a population around where the first ended, if that point is better and
     so is the refit, by the whitening filter of the residuals at the start."""
-    white = fit_whitener(residuals_of(prepared, fit_at(prepared.problem, start)))
+    white = whitener_of(prepared, fit_at(prepared.problem, start))
     whitened = with_whitening(prepared, white).problem
 
     def whitened_misfit(model: Model) -> float:

@@ -9,6 +9,8 @@ of plain least squares.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -35,7 +37,7 @@ def last_fit(plain: FittedRuns, start: Fit, white: Whitener) -> FittedRuns:
     that the model lacks or a formula is only approximate: the filter then takes what is missing for noise. So it is
     with a sensor slower than the log: the other one would use nothing but its readings.
     """
-    if white.is_white or _is_exact(plain) or _is_sparse(plain.prepared):
+    if white.is_white or _is_exact(plain) or is_sparse(plain.prepared):
         return plain
     whitened = fit_whitened(plain.prepared, start, white)
     fitness = fit_at(plain.problem, whitened.fit.optimum).fitness  # without whitening
@@ -49,7 +51,7 @@ def _is_exact(fitted: FittedRuns) -> bool:
     return bool(np.all(fitted.fit.noise[measured] < 2 * least[measured]))
 
 
-def _is_sparse(prepared: Prepared) -> bool:
+def is_sparse(prepared: Prepared) -> bool:
     """Whether a training run has a sensor slower than the log."""
     tape = prepared.problem.tape
     return any(reading_interval(_known(tape, run)) > 1 for run in prepared.training_indices)
@@ -80,8 +82,23 @@ def with_whitening(prepared: Prepared, white: Whitener) -> Prepared:
         interval = reading_interval(_known(tape, run))
         filters[run], scales[run] = np.zeros((len(A) * interval, 2, 2)), np.zeros((2, 2))
         filters[run][interval - 1 :: interval, *both], scales[run][both] = A, S
-    whitening = Whitening.of([A[:CHUNK] for A in filters], scales, tape.weight, tape.run)
+    slow = None if white.slow is None else _on_tape(prepared, white.slow)
+    whitening = Whitening.of([A[:CHUNK] for A in filters], scales, tape.weight, tape.run, slow)
     return prepared.with_problem(whitening=whitening)
+
+
+def _on_tape(
+    prepared: Prepared, of_runs: Sequence[Float[np.ndarray, "_ _ waves"]]
+) -> Float[np.ndarray, "blocks 2 samples waves"]:
+    """Signals of the training runs, laid out like the tape."""
+    tape = prepared.problem.tape
+    signal = np.zeros((*tape.weight.shape, of_runs[0].shape[-1]))
+    for run, values in zip(prepared.training_indices, of_runs, strict=True):
+        both = np.zeros((len(values), 2, values.shape[-1]))
+        both[:, _measured_outputs(tape, run)] = values
+        blocks = tape.blocks_of(run)
+        signal[blocks] = np.moveaxis(both.reshape(int(blocks.sum()), -1, *both.shape[1:]), 1, 2)
+    return signal
 
 
 def residuals_of(prepared: Prepared, fit: Fit) -> list[Series]:

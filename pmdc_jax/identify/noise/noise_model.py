@@ -14,11 +14,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from attrs import frozen
+from attrs import evolve, frozen
 from jaxtyping import Bool, Float
 
 from .autoregression import LAGS, autoregressions, least_rows
-from .whitening import band_matrix, with_history
+from .whitening import band_matrix, root_of_slow, with_history
 
 # Fewest rows of a run that show its scale
 MIN_ROWS = 20
@@ -40,13 +40,16 @@ class Series(NamedTuple):
 
 @frozen(eq=False)  # compared by identity
 class Whitener:
-    """For each run a filter, which runs of a kind may share, and the matrix that scales its output to unit variance.
+    """For each run a filter, which runs of a kind may share, and the matrix that scales its output to unit variance;
+    and what slow noise may add, that no filter removes.
 
     It filters in NumPy; `Whitening` is what a fit compiles of it.
     """
 
     filters: list[Float[np.ndarray, "order outputs outputs"]]
     scales: list[Float[np.ndarray, "outputs outputs"]]
+    # of each run, signals that its slow noise has with random coefficients of unit variance
+    slow: list[Float[np.ndarray, "samples outputs waves"]] | None = None
 
     @property
     def is_white(self) -> bool:
@@ -55,25 +58,46 @@ class Whitener:
         for S in self.scales:
             sizes.setdefault(S.shape, []).append(np.sqrt(np.diag(np.linalg.inv(S @ S.T))))
         alike = all(np.ptp(np.log(of_kind), axis=0).max() < MAX_LOG_NOISE_SPREAD for of_kind in sizes.values())
-        return alike and not any(len(A) for A in self.filters)
+        return alike and self.slow is None and not any(len(A) for A in self.filters)
 
     def __call__(self, run: int, series: Series) -> Float[np.ndarray, "rows *columns"]:
-        """The filtered rows of a run, white if the series is its noise; the outputs of a sample follow one another."""
+        """The rows of a run, white if the series is its noise; the outputs of a sample follow one another."""
+        rows = self.filtered(run, series)
+        if self.slow is None:
+            return rows
+        slow = self.filtered(run, series._replace(values=self.slow[run]))
+        return rows - slow @ (root_of_slow(slow.T @ slow) @ (slow.T @ rows))
+
+    def filtered(self, run: int, series: Series) -> Float[np.ndarray, "rows *columns"]:
+        """The rows of a run, filtered and scaled, still with its slow noise."""
         rest = _filtered(series, self.filters[run], self.scales[run])
         return rest.reshape(-1, *rest.shape[2:])
 
+    def weighted(self, residuals: Sequence[Series]) -> Whitener:
+        """The same with the scale of each run such that its residuals have unit variance, and less weight where they
+        vary slowly."""
+        scales = []
+        for run, (series, S) in enumerate(zip(residuals, self.scales, strict=True)):
+            rows = self(run, series).reshape(-1, series.values.shape[1])
+            size = float(np.mean(rows**2)) if len(rows) >= MIN_ROWS else 0.0
+            scales.append(S / np.sqrt(size * _slow_power(rows / np.sqrt(size))) if size else S)
+        return evolve(self, scales=scales)
+
 
 def fit_whitener(residuals: Sequence[Series]) -> Whitener:
-    """Fit the filters to the residuals of all runs.
+    """Fit the filters to the residuals of all runs, the scale of each to its own.
 
     **Arguments**: `residuals`, one `Series` per run, `values` (samples, outputs).
     """
+    return fit_filters(residuals).weighted(residuals)
+
+
+def fit_filters(residuals: Sequence[Series]) -> Whitener:
+    """`fit_whitener` without less weight for what varies slowly."""
     kinds = dict.fromkeys(series.kind for series in residuals)
     by_kind = {kind: iter(_filters([s for s in residuals if s.kind == kind])) for kind in kinds}
     filters = [next(by_kind[series.kind]) for series in residuals]
-    scales = _scales(residuals, filters)
-    slow = [_slow_power(_filtered(series, A, S)) for series, A, S in zip(residuals, filters, scales, strict=True)]
-    return Whitener(filters, [S / np.sqrt(s) for S, s in zip(scales, slow, strict=True)])
+    return Whitener(filters, _scales(residuals, filters))
 
 
 def scaling_whitener(residuals: Sequence[Series]) -> Whitener:

@@ -7,6 +7,7 @@ their slow part, which is mostly noise.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -18,6 +19,25 @@ from ...recordings.readings import reading_interval
 
 # Samples that are filtered by one matrix product, and the longest order of a filter
 CHUNK = 32
+
+
+class Slow(eqx.Module):
+    """Slow noise that a short filter leaves: signals with random coefficients of unit variance.
+
+    With these as the columns of Z, it has the covariance 1 + Z Z' in a run. What makes it white is
+    1 - Z M Z', with M by `root_of_slow`.
+    """
+
+    waves: Float[Array, "blocks 2 samples waves"]
+    root: Float[Array, "runs waves waves"]
+
+    def removed(
+        self, white: Float[Array, "blocks 2 samples columns"], run: Int[Array | np.ndarray, " blocks"]
+    ) -> Float[Array, "blocks 2 samples columns"]:
+        """Filtered columns without what of them is likely to be slow noise."""
+        products = jnp.einsum("bosw,bosc->bwc", self.waves, white)
+        of_run = jax.ops.segment_sum(products, jnp.asarray(run), len(self.root))
+        return white - jnp.einsum("bosw,bwc->bosc", self.waves, (self.root @ of_run)[run])
 
 
 class Whitening(eqx.Module):
@@ -33,6 +53,7 @@ class Whitening(eqx.Module):
     bands: Float[Array, "runs white seen"]  # from a chunk and the one before to the whitened chunk
     # 1 where all samples that the filter takes from the run were measured, else 0
     usable: Float[Array, "blocks 2 samples"]
+    slow: Slow | None = None
 
     @classmethod
     def of(
@@ -41,9 +62,11 @@ class Whitening(eqx.Module):
         scales: Sequence[Float[np.ndarray, "2 2"]],
         weight: Float[Array | np.ndarray, "blocks 2 samples"],
         run: Int[Array | np.ndarray, " blocks"],
+        slow: Float[np.ndarray, "blocks 2 samples waves"] | None = None,
     ) -> Whitening:
         """From the coefficients A and the scale S of each run; `weight` is zero where nothing was measured, `run` is
-        the run of each block. Of a sensor slower than the log only the readings count."""
+        the run of each block. Of a sensor slower than the log only the readings count. `slow`, the signals that slow
+        noise has with random coefficients."""
         longest = [np.append(A, np.zeros((CHUNK - len(A), 2, 2)), axis=0) for A in filters]
         bands = np.stack([band_matrix(A, S) for A, S in zip(longest, scales, strict=True)])
         known = np.moveaxis(np.asarray(weight) > 0, 1, 2)
@@ -57,7 +80,12 @@ class Whitening(eqx.Module):
                 before = np.append(np.ones(len(A), bool), whole | ~begun)
                 whole = with_history(before, len(A))[len(A) :] & measured.any(1)
             usable[mine] = (whole[:, None] * counts).reshape(-1, *known.shape[1:])
-        return cls(jnp.asarray(bands), jnp.asarray(np.moveaxis(usable, 2, 1)))
+        filters_alone = cls(jnp.asarray(bands), jnp.asarray(np.moveaxis(usable, 2, 1)))
+        if slow is None:
+            return filters_alone
+        waves = filters_alone(jnp.asarray(slow), run)
+        products = jax.ops.segment_sum(jnp.einsum("bosv,bosw->bvw", waves, waves), jnp.asarray(run), len(filters))
+        return replace(filters_alone, slow=Slow(waves, jnp.asarray(root_of_slow(np.asarray(products)))))
 
     def __call__(
         self, signal: Float[Array, "blocks 2 samples columns"], run: Int[Array | np.ndarray, " blocks"]
@@ -79,7 +107,8 @@ class Whitening(eqx.Module):
         # block after block: all at once, every block would have its own copy of the bands, in four times the time
         white = jax.lax.map(of_block, (run, window))
         white = jnp.moveaxis(white.reshape(blocks, samples, outputs, columns), 2, 1)
-        return white * self.usable[..., None]
+        white = white * self.usable[..., None]
+        return white if self.slow is None else self.slow.removed(white, run)
 
 
 def band_matrix(
@@ -92,6 +121,13 @@ def band_matrix(
     for back, coefficients in enumerate([np.eye(outputs), *(-A)]):
         matrix[here, :, order + here - back] = S @ coefficients
     return matrix.reshape(CHUNK * outputs, -1)
+
+
+def root_of_slow(products: Float[np.ndarray, "*runs waves waves"]) -> Float[np.ndarray, "*runs waves waves"]:
+    """The matrix M with (1 - Z M Z')^2 = (1 + Z Z')^-1, from the products Z'Z."""
+    values, vectors = np.linalg.eigh(products)
+    stretch = np.sqrt(1 + np.maximum(values, 0.0))
+    return (vectors / (stretch * (1 + stretch))[..., None, :]) @ vectors.swapaxes(-2, -1)
 
 
 def with_history(known: Bool[np.ndarray, " samples"], order: int) -> Bool[np.ndarray, " samples"]:
