@@ -43,7 +43,7 @@ from pmdc_jax.identify.problem import Problem, Unknowns, _evaluated, evaluate, n
 from pmdc_jax.identify.results import results_of
 from pmdc_jax.identify.rotor_angle import with_rotor_angle
 from pmdc_jax.identify.search.binary_ga import BinaryGA
-from pmdc_jax.identify.search.bounds import effect_bounds
+from pmdc_jax.identify.search.bounds import crude_motor, effect_bounds
 from pmdc_jax.identify.search.evolution import METHODS, SearchResult, global_search
 from pmdc_jax.identify.solve import _distinct, _times_found, solve
 from pmdc_jax.identify.uncertainty.covariance import information, long_run_variance
@@ -946,6 +946,26 @@ def test_progress_is_reported(runs):
     assert 0 < shares[0] < shares[-1] <= 1
     assert fitness == sorted(fitness, reverse=True)
     assert any("refining" in what for what, _, _ in reports)
+
+
+def test_a_crude_motor_is_near_the_true_one(runs):
+    """From equations that are linear in the parameters; with a motor that has dry friction, too."""
+    rubbing = light_and_loaded(5, motor=replace(PAPER, coulomb_Nm=0.05))
+    for recordings, factor in ((runs, 1.3), (rubbing, 2.0)):
+        crude = crude_motor(recordings)
+        for name in ("R", "Kb", "Kt", "J"):
+            assert 1 / factor < crude[name] / getattr(PAPER, name) < factor, (name, crude)
+
+
+def test_a_crude_motor_is_what_the_recordings_tell(runs):
+    without_speed = [Recording(r.name, r.time, r.voltage, r.current, None) for r in runs]
+    assert set(crude_motor(without_speed)) == {"R", "Kb", "Kt"}
+    by_torque = [Recording(r.name, r.time, None, None, r.speed, load=r.load, torque=PAPER.Kt * r.current) for r in runs]
+    crude = crude_motor(by_torque)
+    assert crude["J"] == pytest.approx(PAPER.J, rel=0.05)
+    assert crude["f"] == pytest.approx(PAPER.f, rel=0.5)
+    gaps = [attrs.evolve(r, speed=np.where(np.arange(len(r)) % 7, r.speed, np.nan)) for r in by_torque]
+    assert crude_motor(gaps)["J"] == pytest.approx(crude["J"], rel=0.01)
 
 
 def test_bounds_of_effects_are_scaled_to_the_recordings(runs):

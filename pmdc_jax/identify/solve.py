@@ -34,7 +34,7 @@ from .parameters import Parameters
 from .prepare import Prepared
 from .problem import Evaluation, Problem, Unknowns
 from .rotor_angle import with_rotor_angle
-from .search.bounds import effect_bounds
+from .search.bounds import crude_motor, effect_bounds
 from .search.evolution import SearchResult, global_search
 
 STARTS = 4
@@ -121,13 +121,14 @@ def search_and_refine(
     searching = Tape.from_recordings(prepared.training, timing=prepared.timing)
     noise, parameters = np.asarray(problem.noise), _searched_parameters(prepared)
 
-    def run_search(seed: int) -> SearchResult:
-        return global_search(parameters, searching, noise, search, seed, progress=progress)
+    def run_search(seed: int, guess: Mapping[str, float] | None = None) -> SearchResult:
+        return global_search(parameters, searching, noise, search, seed, progress=progress, guess=guess)
 
     middle = (problem.parameters.lower + problem.parameters.upper) / 2
     # a refinement that stops at once, so that it is compiled on another core while the search runs
     compiled = submit(refine, problem, _start(problem.tape, middle), tolerance=1e3)
-    search_result = run_search(seed)
+    # other searches do without the guess, in case it is a wrong one
+    search_result = run_search(seed, crude_motor(prepared.training))
     search_ended = time.perf_counter()
     report("refining the best candidates", float(search_result.best[-1]))
     compiled.result()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from ...effects import AbstractEffect
 from ...recordings.recording import Recording
@@ -44,6 +45,14 @@ def search_bounds(recordings: Sequence[Recording]) -> dict[str, tuple[float, flo
         "J": (inertia / CRUDE_FACTOR**2, inertia * CRUDE_FACTOR**2),
         "f": (friction / CRUDE_FACTOR**3, friction * CRUDE_FACTOR / 3),
     }
+
+
+def crude_motor(recordings: Sequence[Recording]) -> dict[str, float]:
+    """R, L, Kb, Kt, J and f, as far as equations that are linear in them tell from the measured signals: where a search
+    may start. Noise and whatever the equations lack make it crude."""
+    R, Kb, L = _crude_armature(recordings)
+    crude = {"R": R, "Kb": Kb, "Kt": Kb, "L": L}
+    return {name: value for name, value in (crude | _crude_mechanics(recordings, Kb)).items() if value > 0}
 
 
 def effect_magnitudes(recordings: Sequence[Recording]) -> dict[str, float]:
@@ -119,6 +128,31 @@ def _crude_armature(recordings: Sequence[Recording]) -> tuple[float, float, floa
     ]
     Kb = float(np.median(volts_per_speed)) if volts_per_speed else TYPICAL_KB
     return (float(np.median(volts_per_ampere)) / 3 if volts_per_ampere else 1.0), Kb, 0.0
+
+
+def _crude_mechanics(recordings: Sequence[Recording], Kt: float) -> dict[str, float]:
+    """J and f by least squares on J w + f (integral of w) = (integral of Kt i - T_load) + constant of each run; nothing
+    where no run tells."""
+    rows = []
+    for run in recordings:
+        torque = Kt * run.current if run.torque is None and run.current is not None else run.torque
+        if torque is None or run.speed is None or run.held:
+            continue
+        driving = torque if run.load is None else torque - run.load
+        speed, driving = (_without_gaps(run.time, x) for x in (run.speed, driving))
+        columns = np.stack([speed, *(cumulative_trapezoid(x, run.time, initial=0.0) for x in (speed, driving))])
+        rows.append(columns - columns.mean(1, keepdims=True))
+    if not rows:
+        return {}
+    speed, angle, impulse = np.concatenate(rows, axis=1)
+    J, f = np.linalg.lstsq(np.stack([speed, angle], 1), impulse)[0]
+    return {"J": float(J), "f": float(f)}
+
+
+def _without_gaps(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """A signal with straight lines over its gaps, which are NaN."""
+    known = ~np.isnan(signal)
+    return np.interp(time, time[known], signal[known])
 
 
 class _Typical(NamedTuple):

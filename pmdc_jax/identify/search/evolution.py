@@ -97,6 +97,7 @@ def global_search(
     population: int | None = None,
     generations: int | None = None,
     progress: ReportProgress | None = None,
+    guess: Mapping[str, float] | None = None,
 ) -> SearchResult:
     """Search the bounds of `parameters` for motors that reproduce the tape.
 
@@ -106,7 +107,8 @@ def global_search(
     simulations count as infinitely bad.
 
     **Arguments**: `noise`, standard deviations of current (A) and speed (rad/s); `method`, a key of `METHODS`;
-    `population` and `generations`, by default the method's own; `progress`, called in every generation.
+    `population` and `generations`, by default the method's own; `progress`, called in every generation; `guess`, values
+    of some parameters in SI, with which the first candidate is tried.
     An interrupt from the keyboard ends the search with the candidates found so far.
 
     **Raises**: `InputError` on an unknown method, or a seed that is negative or does not fit into 63 bits.
@@ -121,6 +123,8 @@ def global_search(
     fitness_of = _Fitness(parameters, tape, noise)
 
     start = _scattered(seed, INITIAL_CANDIDATES if chosen.distribution else size, len(low))
+    if guess:
+        start[0] = _cube_of(parameters, guess)
     first = _Generation(start, fitness_of.scattered(start, size))
     later = _later_generations(Kind(method, size, len(low)), seed, first, fitness_of)
     evaluated = [first]
@@ -232,6 +236,16 @@ def _scattered(seed: int, size: int, dimensions: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     strata = np.stack([rng.permutation(size) for _ in range(dimensions)], axis=1)
     return (strata + rng.random(strata.shape)) / size
+
+
+def _cube_of(parameters: Parameters, guess: Mapping[str, float]) -> np.ndarray:
+    """The point of the unit cube with some values, within the bounds; all others in the middle."""
+    point = np.full(len(parameters.names), 0.5)
+    for k, name in enumerate(parameters.names):
+        if name in guess:
+            low, high = float(parameters.lower[k]), float(parameters.upper[k])
+            point[k] = np.clip((parameters.coordinate(k, guess[name]) - low) / (high - low), 0.0, 1.0)
+    return point
 
 
 def _collect(evaluated: Sequence[_Generation], low: np.ndarray, high: np.ndarray, interrupted: bool) -> SearchResult:
