@@ -7,8 +7,6 @@ from itertools import chain
 from operator import attrgetter
 from typing import NamedTuple
 
-import numpy as np
-
 from ...identify.fit.run_series import RunSeries
 from ...identify.fit.slow_torque import whitener_of_runs
 from ...identify.noise.noise_model import Whitener, scaling_whitener
@@ -105,12 +103,6 @@ def _without_clearest(plain: Screen, rows: Sequence[Rows]) -> list[RunSeries]:
         (s for s in (*candidate_signals, *curve_signals) if s.candidate or _is_definite(s)), key=attrgetter("log_p")
     ).block
     best = plain.evidence.regress([clearest])
-    fits = []
-    for k, run in enumerate(rows):
-        # late readings are noise, and stay
-        rest = run.without(k, best, clearest, plain.evidence.first_column)
-        known, own = run.fit.residual.known, run.fit.own.values
-        unknowns = np.linalg.lstsq(own[known].reshape(-1, own.shape[-1]), rest[known].ravel())[0]
-        residual = run.fit.residual._replace(values=rest - own @ unknowns)
-        fits.append(run.fit._replace(residual=residual))
-    return fits
+    # late readings are noise, and stay
+    rests = (run.without(k, best, clearest, plain.evidence.first_column) for k, run in enumerate(rows))
+    return [run.fit._replace(residual=run.fit.without_own(rest)) for run, rest in zip(rows, rests, strict=True)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ..noise.noise_model import Series
 from ..prepare import Prepared
@@ -19,6 +20,12 @@ class RunSeries(NamedTuple):
     own: Series  # ... and by the run's own unknowns (initial state, load, ...)
     residual: Series  # measured less simulated
     simulated: Series
+
+    def without_own(self, rest: Float[np.ndarray, "samples outputs"]) -> Series:
+        """What is left of the residuals, less what the run's own unknowns explain of it."""
+        known, own = self.residual.known, self.own.values
+        unknowns = np.linalg.lstsq(own[known].reshape(-1, own.shape[-1]), rest[known].ravel())[0]
+        return self.residual._replace(values=rest - own @ unknowns)
 
 
 def series_of_runs(prepared: Prepared, fit: Fit) -> list[RunSeries]:

@@ -33,6 +33,8 @@ from .run_series import RunSeries, series_of_runs
 WAVES = 30
 # Correlation times that are tried, over the longest run
 CORRELATION_TIMES = np.geomspace(0.003, 1.0, 8)
+# Most samples of all runs: longer ones are their own evidence of how their noise scatters, and would need gigabytes
+MAX_SAMPLES = 200_000
 
 Waves = Sequence[Float[np.ndarray, "_ _ waves"]]  # of each run: samples, outputs, waves
 
@@ -52,7 +54,7 @@ def whitener_of_runs(prepared: Prepared, motor: Motor, fits: Sequence[RunSeries]
     """
     residuals = [fit.residual for fit in fits]
     filters = fit_filters(residuals)
-    if is_sparse(prepared):
+    if is_sparse(prepared) or sum(len(series.values) for series in residuals) > MAX_SAMPLES:
         return filters.weighted(residuals)
     waves = [_responses(prepared, motor, run) for run in prepared.training_indices]
     durations = np.array([_duration(prepared, run) for run in prepared.training_indices])
@@ -124,10 +126,7 @@ def _deviance(noise: NoiseFit, fits: Sequence[RunSeries], white: Whitener) -> fl
 
 def _without_torque(fits: Sequence[RunSeries], waves: Waves, noise: NoiseFit) -> list[Series]:
     """The residuals less the likeliest torque, and all that is fitted with it."""
-    series = []
-    for fit, of_run, amplitudes in zip(fits, waves, noise.amplitudes, strict=True):
-        known, own = fit.residual.known, fit.own.values
-        rest = fit.residual.values - fit.shared.values @ noise.changes - of_run @ amplitudes
-        unknowns = np.linalg.lstsq(own[known].reshape(-1, own.shape[-1]), rest[known].ravel())[0]
-        series.append(fit.residual._replace(values=rest - own @ unknowns))
-    return series
+    return [
+        fit.without_own(fit.residual.values - fit.shared.values @ noise.changes - of_run @ amplitudes)
+        for fit, of_run, amplitudes in zip(fits, waves, noise.amplitudes, strict=True)
+    ]
