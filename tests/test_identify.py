@@ -30,7 +30,7 @@ from pmdc_jax.identify import problem as problems
 from pmdc_jax.identify.fit import polish as polishing
 from pmdc_jax.identify.fit.fitted_runs import FittedRuns
 from pmdc_jax.identify.fit.generalised_least_squares import last_fit, residuals_of, with_whitening
-from pmdc_jax.identify.fit.polish import FIRST_TO_GIVE_UP, fit_at, polish
+from pmdc_jax.identify.fit.polish import FIRST_TO_GIVE_UP, _still_held, _WeightedPoint, fit_at, polish
 from pmdc_jax.identify.fit.refine import Optimum, refine
 from pmdc_jax.identify.fit.run_unknowns import fit_run_unknowns
 from pmdc_jax.identify.identification import CONVERGED_DISTANCE, Identification
@@ -570,6 +570,19 @@ def test_whitening_of_torque_noise_reduces_standard_errors():
     initial = np.column_stack([own.current, own.speed])
     measured = [(run.current[0], run.speed[0]) for run in runs]
     np.testing.assert_allclose(initial, measured, atol=5 * NOISE.speed_rad_s)
+
+
+@pytest.mark.parametrize(
+    ("coordinate", "gradient"), [(-16.0, 1.0), (-16.0 + 1e-9, 1.0), (4.0, -1.0), (4.0 - 1e-9, -1.0)]
+)
+def test_a_coordinate_stays_at_its_bound_only_while_the_gradient_holds_it_there(coordinate, gradient):
+    """Rounding may have moved it from the bound a little."""
+    parameters = Mock(spec=Parameters, lower=np.array([-16.0]), upper=np.array([4.0]))
+    problem = Mock(spec=Problem, parameters=parameters)
+    for sign in (1, -1):
+        matrix = np.array([[1.0, sign * gradient], [sign * gradient, 1.0]])
+        point = Mock(spec=_WeightedPoint, unknowns=Mock(coordinates=np.array([coordinate])), matrix=matrix)
+        assert _still_held(problem, point, {0}) == ({0} if sign == 1 else set())
 
 
 def test_white_residuals_need_no_filter(runs):

@@ -79,6 +79,16 @@ def test_white_residuals_have_no_slow_noise(rows):
     assert not NoiseProducts.of(rows, OWN, SIGNALS).most_likely(shapes).variances.any()
 
 
+def test_coordinates_that_the_rows_cannot_tell_apart_stay_finite(rows):
+    """Such as R and L of an exact simulation in steps far above L / R, whose rows are scaled by next to nothing."""
+    huge = [1e12 * of_run for of_run in rows]
+    for of_run in huge:
+        of_run[:, -2] = of_run[:, -3]
+    found = NoiseProducts.of(huge, OWN, SIGNALS).most_likely([np.ones((2, SIGNALS))])
+    assert np.isfinite(found.deviance)
+    assert np.isfinite(found.changes).all()
+
+
 def test_slow_noise_is_whitened_by_the_root_of_its_covariance():
     """Both by the NumPy filter and by that of a fit: (1 + Z Z')^(-1/2), with a dense square root."""
     rng, samples = np.random.default_rng(3), 64

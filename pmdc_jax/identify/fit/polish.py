@@ -155,8 +155,10 @@ def _step_from(
 
 def _still_held(problem: Problem, best: _WeightedPoint, fixed: set[int]) -> set[int]:
     """The coordinates that stay at a bound, because the gradient does not point back inside."""
-    low, coordinates = np.asarray(problem.parameters.lower), np.asarray(best.unknowns.coordinates)
-    return {k for k in fixed if (best.matrix[k, -1] > 0) == (coordinates[k] <= low[k])}
+    # rounding may have moved them a little
+    middle = np.asarray(problem.parameters.lower + problem.parameters.upper) / 2
+    at_lower = np.asarray(best.unknowns.coordinates) < middle
+    return {k for k in fixed if (best.matrix[k, -1] > 0) == at_lower[k]}
 
 
 def _moved_within_bounds(problem: Problem, unknowns: Unknowns, step: np.ndarray) -> tuple[Unknowns, set[int]]:

@@ -20,8 +20,8 @@ from jaxtyping import Float
 VARIANCES = np.geomspace(1e-2, 1e8, 31)
 # Least gain of twice the log-likelihood by which there is such noise
 MIN_GAIN = 7.0
-# Precision of a coordinate before anything is measured: runs may not tell all of them
-PRIOR_PRECISION = 1e-4
+# Precision of a coordinate before anything is measured, and its least share of that of all: runs may not tell all
+PRIOR_PRECISION, MIN_PRECISION = 1e-4, 1e-12
 
 
 class NoiseFit(NamedTuple):
@@ -67,7 +67,8 @@ class NoiseProducts(NamedTuple):
         cross = self.cross * deviations[..., None]
         explained = np.linalg.solve(covariance, cross)
         left = self.rest - np.einsum("rai,raj->ij", cross, explained)
-        normal = left[:-1, :-1] + PRIOR_PRECISION * np.eye(len(left) - 1)
+        normal = left[:-1, :-1]
+        normal = normal + (PRIOR_PRECISION + MIN_PRECISION * np.trace(normal)) * np.eye(len(normal))
         changes = np.linalg.solve(normal, left[:-1, -1])
         variance = max(float(left[-1, -1] - left[-1, :-1] @ changes), 1e-300) / max(self.rows, 1)
         log_volume = np.linalg.slogdet(covariance)[1].sum() + np.linalg.slogdet(normal)[1]
